@@ -1,0 +1,106 @@
+"""The one form in which bad input is refused: argument, what was expected, what came, and the cure."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+
+def bad_argument(name: str, expected: str, got: object, cure: str) -> ValueError:
+    """Build the error for a bad argument.
+
+    Args:
+        name: The argument as the caller wrote it, e.g. `"num_particles"`.
+        expected: What is accepted, e.g. `"an int >= 1"`.
+        got: What came; its `repr` is shown, shortened to 80 characters.
+        cure: What to do about it, a full sentence.
+
+    Returns:
+        The exception, for the caller to raise.
+
+    >>> print(bad_argument("num_particles", "an int >= 1", 0, "Use at least one particle."))
+    num_particles: expected an int >= 1, got 0. Use at least one particle.
+    """
+    text = got if isinstance(got, str) and got.startswith(("shape ", "an array ", "a ", "'", "no ", "NaN")) else repr(got)
+    if len(text) > 80:
+        text = text[:77] + "..."
+    return ValueError(f"{name}: expected {expected}, got {text}. {cure}")
+
+
+def check_int(name: str, value: Any, minimum: int, cure: str) -> int:
+    """Return `value` as an int, or raise if it is not an integer (bools are not) or below `minimum`."""
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < minimum:
+        raise bad_argument(name, f"an int >= {minimum}", value, cure)
+    return int(value)
+
+
+def check_float(
+    name: str,
+    value: Any,
+    cure: str,
+    *,
+    above: float | None = None,
+    at_least: float | None = None,
+    at_most: float | None = None,
+) -> float:
+    """Return `value` as a finite float inside the stated bounds, or raise."""
+    expected = "a finite number"
+    if above is not None:
+        expected += f" > {above:g}"
+    if at_least is not None:
+        expected += f" >= {at_least:g}"
+    if at_most is not None:
+        expected += f" and <= {at_most:g}" if (above is not None or at_least is not None) else f" <= {at_most:g}"
+    number_like = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
+    if (
+        not number_like
+        or not np.isfinite(value)
+        or (above is not None and value <= above)
+        or (at_least is not None and value < at_least)
+        or (at_most is not None and value > at_most)
+    ):
+        raise bad_argument(name, expected, value, cure)
+    return float(value)
+
+
+def check_choice(name: str, value: Any, choices: tuple[str, ...], cure: str = "Choose one of these names.") -> str:
+    """Return `value` if it is one of `choices`, or raise with the list of them."""
+    if not isinstance(value, str) or value not in choices:
+        raise bad_argument(name, "one of " + ", ".join(repr(c) for c in choices), value, cure)
+    return value
+
+
+def check_array(
+    name: str,
+    value: Any,
+    shape: tuple[int | None, ...],
+    cure: str,
+    *,
+    dtype: Any = np.float64,
+    finite: bool = True,
+) -> NDArray[Any]:
+    """Return `value` as a fresh C-ordered array of `dtype`, or raise if its shape or content is wrong.
+
+    Args:
+        name: The argument as the caller wrote it.
+        value: Anything that numpy can read.
+        shape: Expected shape, None for a free axis.
+        cure: What to do about it.
+        dtype: Of the result.
+        finite: Refuse NaN and infinity.
+    """
+    wanted = "(" + ", ".join("n" if s is None else str(s) for s in shape) + ("," if len(shape) == 1 else "") + ")"
+    try:
+        array = np.array(value, dtype=dtype, order="C")
+    except (TypeError, ValueError) as error:
+        raise bad_argument(name, f"an array of shape {wanted}", value, cure) from error
+    if array.ndim != len(shape) or any(s is not None and s != n for s, n in zip(shape, array.shape, strict=True)):
+        raise bad_argument(name, f"an array of shape {wanted}", f"shape {array.shape}", cure)
+    if finite and array.size and not np.isfinite(array).all():
+        where = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
+        raise bad_argument(name, "finite numbers", f"NaN or infinity at index {where}", cure)
+    return array

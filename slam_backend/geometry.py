@@ -1,0 +1,90 @@
+"""Rigid motions of the plane: poses (x, y, theta) as arrays, theta in [-pi, pi), `p_a = R(theta) p_b + t`."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from slam_backend.errors import FloatArray
+
+
+def wrap_angle(angle: ArrayLike) -> Any:
+    """Map angles to [-pi, pi) [rad], elementwise.
+
+    >>> float(wrap_angle(np.pi)) == -np.pi
+    True
+    """
+    return (np.asarray(angle, dtype=np.float64) + np.pi) % (2.0 * np.pi) - np.pi
+
+
+def rotation(theta: ArrayLike) -> FloatArray:
+    """Return the rotation matrices (..., 2, 2) of angles (...) [rad]."""
+    theta = np.asarray(theta, dtype=np.float64)
+    c, s = np.cos(theta), np.sin(theta)
+    return np.stack([np.stack([c, -s], axis=-1), np.stack([s, c], axis=-1)], axis=-2)
+
+
+def compose(a_from_b: ArrayLike, b_from_c: ArrayLike) -> FloatArray:
+    """Chain two motions: `a_from_c`.
+
+    Args:
+        a_from_b: (..., 3) float64 [m, m, rad]. Pose of b in a.
+        b_from_c: (..., 3) float64 [m, m, rad]. Pose of c in b; shapes broadcast.
+
+    Returns:
+        (..., 3) pose of c in a.
+
+    >>> compose([1.0, 0.0, np.pi / 2], [2.0, 0.0, 0.0]).round(6).tolist()
+    [1.0, 2.0, 1.570796]
+    """
+    a, b = np.asarray(a_from_b, dtype=np.float64), np.asarray(b_from_c, dtype=np.float64)
+    c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
+    return np.stack(
+        [
+            a[..., 0] + c * b[..., 0] - s * b[..., 1],
+            a[..., 1] + s * b[..., 0] + c * b[..., 1],
+            wrap_angle(a[..., 2] + b[..., 2]),
+        ],
+        axis=-1,
+    )
+
+
+def inverse(a_from_b: ArrayLike) -> FloatArray:
+    """Turn a motion around: the pose (..., 3) of a in b from the pose (..., 3) of b in a."""
+    a = np.asarray(a_from_b, dtype=np.float64)
+    c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
+    return np.stack(
+        [-c * a[..., 0] - s * a[..., 1], s * a[..., 0] - c * a[..., 1], wrap_angle(-a[..., 2])],
+        axis=-1,
+    )
+
+
+def between(w_from_a: ArrayLike, w_from_b: ArrayLike) -> FloatArray:
+    """Return the pose (..., 3) of b seen from a: what an ideal odometer reads between two poses."""
+    return compose(inverse(w_from_a), w_from_b)
+
+
+def transform_points(a_from_b: ArrayLike, points_b: ArrayLike) -> FloatArray:
+    """Move points from frame b to frame a; heights, where there are any, stay.
+
+    Args:
+        a_from_b: (3,) float64 [m, m, rad]. One pose.
+        points_b: (..., 2) or (..., 3) float64 [m].
+
+    Returns:
+        A new array of the same shape, in frame a.
+    """
+    pose = np.asarray(a_from_b, dtype=np.float64)
+    points = np.array(points_b, dtype=np.float64)
+    x, y = points[..., 0].copy(), points[..., 1].copy()
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    points[..., 0] = c * x - s * y + pose[0]
+    points[..., 1] = s * x + c * y + pose[1]
+    return points
+
+
+def rotate_covariances(theta: float, covariances: FloatArray) -> FloatArray:
+    """Rotate (..., 3, 3) covariances of points about the vertical: R Sigma R^T (Eq. 16 as `ERRATA` corrects it)."""
+    full = np.eye(3)
+    full[:2, :2] = rotation(theta)
+    return np.asarray(full @ covariances @ full.T)

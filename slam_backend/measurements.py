@@ -1,0 +1,60 @@
+"""What one robot's camera reports in one step: points, descriptors and, if the sensor knows them, covariances."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_backend.errors import FloatArray, bad_argument, check_array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Measurements:
+    """The measurements z_t = (v_t, d_t) of one frame (Sec. 2.2).
+
+    Attributes:
+        points: (n, 3) float64 [m], camera frame (X right, Y down, Z ahead). Measured landmark positions (v_t).
+        descriptors: (n, d) float32 [-]. Appearance vectors (d_t); d is the same in all frames of a run.
+        covariances: None, or (n, 3, 3) float64 [m^2], camera frame. None: the camera model is evaluated at the
+            predicted point. Given: used as is.
+
+    Raises:
+        ValueError: If a shape is wrong, a number is not finite, or a covariance is not positive definite.
+    """
+
+    points: FloatArray
+    descriptors: NDArray[np.float32]
+    covariances: FloatArray | None = field(default=None)
+
+    def __post_init__(self) -> None:
+        cure = "Give one row per measured point."
+        points: Any = check_array("points", self.points, (None, 3), cure + " Drop points that are not finite.")
+        descriptors: Any = check_array(
+            "descriptors", self.descriptors, (len(points), None), cure, dtype=np.float32
+        )
+        object.__setattr__(self, "points", points)
+        object.__setattr__(self, "descriptors", descriptors)
+        if self.covariances is not None:
+            covariances: Any = check_array("covariances", self.covariances, (len(points), 3, 3), cure)
+            if not np.allclose(covariances, covariances.transpose(0, 2, 1), rtol=1e-6, atol=1e-12):
+                raise bad_argument("covariances", "symmetric matrices", "an asymmetric one", "Symmetrise them first.")
+            if len(points) and np.linalg.eigvalsh(covariances).min() <= 0.0:
+                raise bad_argument(
+                    "covariances",
+                    "positive definite matrices",
+                    "a smallest eigenvalue <= 0",
+                    "Give every direction some noise, or pass None to use the camera model.",
+                )
+            object.__setattr__(self, "covariances", covariances)
+        for array in (self.points, self.descriptors, self.covariances):
+            if array is not None:
+                array.setflags(write=False)
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    @classmethod
+    def empty(cls, descriptor_size: int = 64) -> "Measurements":
+        """Return a frame in which nothing was seen."""
+        return cls(np.empty((0, 3)), np.empty((0, descriptor_size), dtype=np.float32))

@@ -1,0 +1,61 @@
+"""The odometry motion model p(x_t | x_{t-1}, u_t) that a filter assumes (Eq. 4)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from slam_backend.errors import FloatArray, check_float
+from slam_backend.geometry import compose
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OdometryModel:
+    """Gaussian noise of an odometry reading u = (dx, dy, dtheta) in the robot's previous frame.
+
+    The variances of the three components are independent; each adds a part that grows with the motion to a floor.
+
+    Attributes:
+        sigma_along: Of dx, per metre travelled [m/m].
+        sigma_across: Of dy, per metre travelled [m/m].
+        sigma_heading: Of dtheta, per metre travelled [rad/m].
+        sigma_turn: Of dtheta, per radian turned [rad/rad].
+        floor_position: Of dx and dy, whatever the motion [m].
+        floor_heading: Of dtheta, whatever the motion [rad].
+    """
+
+    sigma_along: float = 0.05
+    sigma_across: float = 0.02
+    sigma_heading: float = np.pi / 90.0
+    sigma_turn: float = 0.02
+    floor_position: float = 1e-3
+    floor_heading: float = 1e-3
+
+    def __post_init__(self) -> None:
+        for name in ("sigma_along", "sigma_across", "sigma_heading", "sigma_turn", "floor_position", "floor_heading"):
+            check_float(f"motion.{name}", getattr(self, name), "Give a standard deviation.", at_least=0.0)
+
+    def sigmas(self, odometry: FloatArray) -> FloatArray:
+        """Return the standard deviations (3,) [m, m, rad] of an odometry reading (3,) [m, m, rad]."""
+        distance = float(np.hypot(odometry[0], odometry[1]))
+        turn = abs(float(odometry[2]))
+        return np.array(
+            [
+                np.hypot(self.sigma_along * distance, self.floor_position),
+                np.hypot(self.sigma_across * distance, self.floor_position),
+                np.sqrt((self.sigma_heading * distance) ** 2 + (self.sigma_turn * turn) ** 2 + self.floor_heading**2),
+            ]
+        )
+
+    def sample(self, poses: FloatArray, odometry: FloatArray, rng: np.random.Generator) -> FloatArray:
+        """Draw x_t^[m] ~ p(x_t | x_{t-1}^[m], u_t), each particle from its own past (Eq. 4).
+
+        Args:
+            poses: (M, 3) float64 [m, m, rad], map frame.
+            odometry: (3,) float64 [m, m, rad], previous robot frame.
+            rng: Source of the draws.
+
+        Returns:
+            (M, 3) new poses, map frame.
+        """
+        noise = rng.standard_normal((len(poses), 3)) * self.sigmas(odometry)
+        return compose(poses, odometry + noise)  # Eq. 4

@@ -1,0 +1,102 @@
+"""What filters and teams hand back: pose estimates, step reports, merge events. All frozen."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+from slam_backend.errors import FloatArray, IntArray
+
+if TYPE_CHECKING:
+    from slam_backend.alignment import Alignment
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseEstimate:
+    """A Gaussian summary of a robot's pose.
+
+    Attributes:
+        mean: (3,) float64 [m, m, rad].
+        covariance: (3, 3) float64 [m, m, rad].
+    """
+
+    mean: FloatArray
+    covariance: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StepReport:
+    """What one step of `FastSlam` did.
+
+    Attributes:
+        associations: Per robot (n_i,) int64. Id of the landmark to which the most probable particle gave each
+            measurement (the id of a new one if it made one); -1 = rejected.
+        created: Per robot (n_i,) int64. Id of the landmark that the measurement created in at least one particle; -1
+            if none did. A landmark stems from exactly one measurement.
+        num_new: Landmarks created by the most probable particle.
+        ess: Effective sample size after this step's weights, before resampling, in [1, M].
+        nis: Mean of the squared Mahalanobis innovations (3 degrees of freedom, ideal 3) over the measurements that
+            the most probable particle matched; NaN if it matched none.
+        resampled: Whether the particles were resampled.
+    """
+
+    associations: tuple[IntArray, ...]
+    created: tuple[IntArray, ...]
+    num_new: int
+    ess: float
+    nis: float
+    resampled: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MergeEvent:
+    """An attempt to align two groups' maps, a merge, or the undoing of one.
+
+    Attributes:
+        step: Number of the team's step (the first is 0).
+        kind: What happened.
+        robots_a: The group whose map frame stays.
+        robots_b: The other group.
+        alignment: `map` of group a from `map` of group b, as found; refused attempts carry the reason.
+    """
+
+    step: int
+    kind: Literal["attempt", "merge", "undo"]
+    robots_a: tuple[int, ...]
+    robots_b: tuple[int, ...]
+    alignment: "Alignment"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Renaming:
+    """How landmark ids of two groups became ids of their joint map.
+
+    Attributes:
+        robots_a: Group a before the merge; its landmark ids stay.
+        robots_b: Group b before the merge.
+        ids_b: (k, 2) int64. Rows (id in b's map, id in the joint map); fused landmarks carry the id of a.
+    """
+
+    robots_a: tuple[int, ...]
+    robots_b: tuple[int, ...]
+    ids_b: IntArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TeamReport:
+    """What one step of `TeamSlam` did.
+
+    Attributes:
+        step: Number of this step (the first is 0).
+        associations: Per robot (n_i,) int64, as in `StepReport`, ids in the map of the robot's group BEFORE this
+            step's merges.
+        created: Per robot (n_i,) int64, as in `StepReport`, ids likewise.
+        groups: The groups after this step.
+        events: This step's attempts and merges, in order.
+        renamings: One for each merge of this step, in order; apply them after `created`.
+    """
+
+    step: int
+    associations: tuple[IntArray, ...]
+    created: tuple[IntArray, ...]
+    groups: tuple[tuple[int, ...], ...]
+    events: tuple[MergeEvent, ...]
+    renamings: tuple[Renaming, ...]

@@ -1,0 +1,1 @@
+"""The command line, runs and replays, and the training of exploration policies."""
