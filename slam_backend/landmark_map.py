@@ -1,0 +1,179 @@
+"""A map of landmarks: positions with covariances, descriptors, counts and ids, in one frame."""
+
+import zipfile
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from slam_backend.errors import FloatArray, IntArray, bad_argument, check_array
+from slam_backend.geometry import rotate_covariances, transform_points
+
+FORMAT = "vslam landmark map"
+FORMAT_VERSION = 1
+# What numpy and zipfile raise on files that are truncated, damaged or of another kind.
+UNREADABLE = (OSError, ValueError, KeyError, EOFError, TypeError, NotImplementedError, zipfile.BadZipFile, zlib.error)
+FIELDS = ("means", "covariances", "descriptors", "counts", "ids")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LandmarkMap:
+    """The landmarks l_k = (mu_k, Sigma_k, d_k) of one map (Sec. 3.2), all in the same frame.
+
+    The arrays are read-only copies of what was given.
+
+    Attributes:
+        means: (N, 3) float64 [m]. Positions (mu).
+        covariances: (N, 3, 3) float64 [m^2]. Symmetric, positive semi-definite (Sigma).
+        descriptors: (N, d) float32 [-]. Appearance vectors (d_k), of unit length if matches are gated by distance.
+        counts: (N,) int64. How many measurements each landmark is made of; by default one each.
+        ids: (N,) int64. Stable names, unique and >= 0; by default 0 .. N - 1.
+
+    Raises:
+        ValueError: If a shape is wrong, a number is not finite, a covariance is not symmetric positive semi-definite,
+            a count is below 1, or ids repeat.
+
+    >>> len(LandmarkMap([[1.0, 2.0, 0.0]], [np.eye(3)], [[1.0, 0.0]]))
+    1
+    """
+
+    means: FloatArray
+    covariances: FloatArray
+    descriptors: NDArray[np.float32]
+    counts: IntArray = None  # type: ignore[assignment]   # replaced by ones
+    ids: IntArray = None  # type: ignore[assignment]   # replaced by 0 .. N - 1
+
+    def __post_init__(self) -> None:
+        cure = "Give one row per landmark."
+        means = check_array("means", self.means, (None, 3), cure + " Drop landmarks that are not finite.")
+        n = len(means)
+        fields: dict[str, NDArray[Any]] = {
+            "means": means,
+            "covariances": _checked_covariances(self.covariances, n),
+            "descriptors": check_array("descriptors", self.descriptors, (n, None), cure, dtype=np.float32),
+            "counts": np.ones(n, np.int64) if self.counts is None else _checked_integers("counts", self.counts, n, 1),
+            "ids": np.arange(n) if self.ids is None else _checked_integers("ids", self.ids, n, 0),
+        }
+        values, repeats = np.unique(fields["ids"], return_counts=True)
+        if n and repeats.max() > 1:
+            raise bad_argument(
+                "ids", "unique ids", f"an id {int(values[repeats.argmax()])} that repeats", "Give each its own name."
+            )
+        for name, array in fields.items():
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+
+    @classmethod
+    def _trusted(
+        cls,
+        means: FloatArray,
+        covariances: FloatArray,
+        descriptors: NDArray[np.float32],
+        counts: IntArray,
+        ids: IntArray,
+    ) -> Self:
+        """Build a map in a hot loop: no copies, no checks. The caller must not write to the arrays afterwards."""
+        self = object.__new__(cls)
+        arrays: tuple[NDArray[Any], ...] = (means, covariances, descriptors, counts, ids)
+        for name, array in zip(FIELDS, arrays, strict=True):
+            view = array.view()
+            view.setflags(write=False)
+            object.__setattr__(self, name, view)
+        return self
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    @classmethod
+    def empty(cls, descriptor_size: int = 64) -> Self:
+        """Return a map without landmarks."""
+        return cls(np.empty((0, 3)), np.empty((0, 3, 3)), np.empty((0, descriptor_size), np.float32))
+
+    def moved(self, a_from_b: ArrayLike) -> Self:
+        """Express this map, given in frame b, in frame a; the motion is taken as exact.
+
+        Args:
+            a_from_b: (3,) float64 [m, m, rad]. Pose of frame b in frame a. `fusion.move_covariances` adds the
+                uncertainty of a motion that was estimated.
+
+        Returns:
+            A new map: means R mu + t, covariances R Sigma R^T, the rest shared with this one.
+        """
+        pose = check_array("a_from_b", a_from_b, (3,), "Give a pose (x, y, theta).")
+        return self._trusted(
+            transform_points(pose, self.means),
+            rotate_covariances(float(pose[2]), self.covariances),
+            self.descriptors,
+            self.counts,
+            self.ids,
+        )
+
+    def subset(self, indices: ArrayLike) -> Self:
+        """Return the landmarks at `indices`: (k,) integers, each at most once, or an (N,) mask of bools."""
+        chosen = np.asarray(indices)
+        chosen = np.flatnonzero(chosen) if chosen.dtype == np.bool_ and chosen.shape == (len(self),) else chosen
+        cure = f"Give integers from 0 to {len(self) - 1}, or a mask of shape ({len(self)},)."
+        if chosen.ndim != 1 or not (chosen.size == 0 or np.issubdtype(chosen.dtype, np.integer)):
+            raise bad_argument("indices", "(k,) integers or a mask", f"an array {chosen.dtype} {chosen.shape}", cure)
+        rows = chosen.astype(np.int64)
+        if rows.size and (rows.min() < 0 or rows.max() >= len(self) or len(np.unique(rows)) < len(rows)):
+            raise bad_argument("indices", "rows of the map, each at most once", rows.tolist(), cure)
+        return self._trusted(*(getattr(self, name)[rows] for name in FIELDS))
+
+    def save(self, path: str | Path) -> None:
+        """Write the map to `path`, exactly as named, as a numpy archive that `load` reads back bit for bit."""
+        arrays: dict[str, Any] = {name: getattr(self, name) for name in FIELDS}
+        with Path(path).open("wb") as file:
+            np.savez(file, format=np.array(FORMAT), version=np.array(FORMAT_VERSION), **arrays)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read a map that `save` wrote.
+
+        Raises:
+            ValueError: If the file is missing, broken, of another kind or of a newer format version.
+        """
+        expected = "a file written by LandmarkMap.save"
+        if not Path(path).is_file():
+            raise bad_argument("path", expected, "no such file", f"Check the path {str(path)!r}.")
+        cure = f"Save the map again; {str(path)!r} cannot be used."
+        try:
+            with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as archive:
+                kind, version = str(archive["format"]), int(archive["version"])
+                arrays = {name: archive[name] for name in FIELDS} if version == FORMAT_VERSION else {}
+        except UNREADABLE as error:
+            raise bad_argument("path", expected, "a broken file", cure) from error
+        if kind != FORMAT or version != FORMAT_VERSION:
+            raise bad_argument("path", f"{FORMAT!r} version {FORMAT_VERSION}", f"{kind!r} version {version}", cure)
+        return cls(**arrays)
+
+
+def _checked_covariances(value: Any, n: int) -> FloatArray:
+    """Return `value` as fresh (n, 3, 3) covariances, exactly symmetric, or raise."""
+    array: FloatArray = check_array("covariances", value, (n, 3, 3), "Give one 3x3 matrix per landmark.")
+    transposed = array.transpose(0, 2, 1)
+    if not np.allclose(array, transposed, rtol=1e-6, atol=1e-12):
+        raise bad_argument("covariances", "symmetric matrices", "an asymmetric one", "Symmetrise them first.")
+    array = 0.5 * (array + transposed)
+    # A rank-deficient matrix has eigenvalues of either sign at the rounding error of its size.
+    if n and (np.linalg.eigvalsh(array)[:, 0] < -1e-9 * np.abs(array).max(axis=(1, 2))).any():
+        raise bad_argument(
+            "covariances",
+            "positive semi-definite matrices",
+            "a negative eigenvalue",
+            "A variance cannot be negative: check how they were computed.",
+        )
+    return array
+
+
+def _checked_integers(name: str, value: Any, n: int, minimum: int) -> IntArray:
+    """Return `value` as fresh (n,) integers >= `minimum`, or raise; whole numbers in floats are accepted."""
+    cure = f"Give one integer >= {minimum} per landmark."
+    as_float = check_array(name, value, (n,), cure)
+    if n and (as_float.min() < minimum or (as_float != np.round(as_float)).any()):
+        raise bad_argument(name, f"integers >= {minimum}", as_float.tolist(), cure)
+    array: IntArray = check_array(name, value, (n,), cure, dtype=np.int64)
+    return array

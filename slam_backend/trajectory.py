@@ -1,0 +1,150 @@
+"""Paths with time stamps: interpolation, dead reckoning and the TUM file format."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from slam_backend.errors import FloatArray, bad_argument, check_array
+from slam_backend.geometry import wrap_angle
+
+PLANAR_TOLERANCE = 1e-6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trajectory:
+    """The poses of one robot over time, in one frame. The arrays are read-only copies of what was given.
+
+    Attributes:
+        times: (T,) float64 [s], strictly increasing, T >= 1.
+        poses: (T, 3) float64 [m, m, rad].
+
+    Raises:
+        ValueError: If a shape is wrong, a number is not finite, or a time does not come after the one before.
+
+    >>> Trajectory([0.0, 2.0], [[0.0, 0.0, 0.0], [4.0, 0.0, 1.0]]).at(0.5).tolist()
+    [1.0, 0.0, 0.25]
+    """
+
+    times: FloatArray
+    poses: FloatArray
+
+    def __post_init__(self) -> None:
+        times = check_array("times", self.times, (None,), "Give one time per pose.")
+        poses = check_array("poses", self.poses, (len(times), 3), "Give one pose (x, y, theta) per time.")
+        if not len(times):
+            raise bad_argument("times", "at least one time", "an array of none", "Record a pose first.")
+        backwards = np.flatnonzero(np.diff(times) <= 0.0)
+        if len(backwards):
+            later = int(backwards[0]) + 1
+            raise bad_argument(
+                "times",
+                "strictly increasing times",
+                f"a time {times[later]!r} after {times[later - 1]!r} at index {later}",
+                "Sort the poses by time and drop repeated ones.",
+            )
+        for name, array in (("times", times), ("poses", poses)):
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    def at(self, times: ArrayLike) -> FloatArray:
+        """Interpolate: positions along straight lines, headings along the shorter arc.
+
+        Args:
+            times: (...) float64 [s], between the first and the last time.
+
+        Returns:
+            (..., 3) poses [m, m, rad].
+
+        Raises:
+            ValueError: If a time lies outside the recorded ones: nothing is extrapolated.
+        """
+        wanted = np.asarray(times, dtype=np.float64)
+        outside = ~((wanted >= self.times[0]) & (wanted <= self.times[-1]))
+        if outside.any():
+            raise bad_argument(
+                "times",
+                f"times from {self.times[0]:.6f} s to {self.times[-1]:.6f} s",
+                float(wanted[outside][0]),
+                "Cut the times to the recorded range.",
+            )
+        right = np.clip(np.searchsorted(self.times, wanted, side="left"), min(1, len(self) - 1), len(self) - 1)
+        left = np.maximum(right - 1, 0)
+        span = np.where(right > left, self.times[right] - self.times[left], 1.0)
+        share = np.where(right > left, (wanted - self.times[left]) / span, 0.0)[..., None]
+        change = self.poses[right] - self.poses[left]
+        change[..., 2] = wrap_angle(change[..., 2])
+        poses = self.poses[left] + share * change
+        poses[..., 2] = wrap_angle(poses[..., 2])
+        return np.asarray(poses)
+
+    def save_tum(self, path: str | Path) -> None:
+        """Write lines `time tx ty tz qx qy qz qw`, every number in the shortest form that reads back bit for bit."""
+        rows = ["# timestamp tx ty tz qx qy qz qw"]
+        half = 0.5 * self.poses[:, 2]
+        for time, (x, y, _), qz, qw in zip(self.times, self.poses, np.sin(half), np.cos(half), strict=True):
+            rows.append(" ".join(repr(float(v)) for v in (time, x, y, 0.0, 0.0, 0.0, qz, qw)))
+        Path(path).write_text("\n".join(rows) + "\n", encoding="ascii")
+
+    @classmethod
+    def load_tum(cls, path: str | Path) -> Self:
+        """Read a planar path; lines that start with `#` and empty lines are skipped.
+
+        Raises:
+            ValueError: If the file is missing, a line is malformed, a rotation is not about the vertical, or times do
+                not increase.
+        """
+        if not Path(path).is_file():
+            raise bad_argument("path", "a TUM trajectory file", "no such file", f"Check the path {str(path)!r}.")
+        times, poses = [], []
+        lines = Path(path).read_text(encoding="utf-8", errors="replace").splitlines()
+        for number, line in enumerate(lines, start=1):
+            if line.strip() and not line.lstrip().startswith("#"):
+                time, pose = _parse_tum_line(line, f"{path}, line {number}")
+                times.append(time)
+                poses.append(pose)
+        return cls(np.array(times), np.array(poses).reshape(-1, 3))
+
+
+def _parse_tum_line(line: str, where: str) -> tuple[float, tuple[float, float, float]]:
+    """Return the time and the planar pose of one line, or raise an error that says `where` it stands."""
+    expected, cure = "time tx ty tz qx qy qz qw", f"Correct {where}."
+    try:
+        values = np.array([float(word) for word in line.split()])
+    except ValueError as error:
+        raise bad_argument("path", expected, repr(line), cure) from error
+    if len(values) != 8 or not np.isfinite(values).all():
+        raise bad_argument("path", f"8 finite numbers {expected}", repr(line), cure)
+    time, x, y, _, qx, qy, qz, qw = (float(v) for v in values)
+    if abs(np.linalg.norm(values[4:]) - 1.0) > 1e-3:
+        raise bad_argument("path", "a unit quaternion qx qy qz qw", repr(line), cure)
+    if max(abs(qx), abs(qy)) > PLANAR_TOLERANCE:
+        raise bad_argument("path", "a rotation about the vertical (qx = qy = 0)", repr(line), cure)
+    return time, (x, y, float(wrap_angle(2.0 * np.arctan2(qz, qw))))
+
+
+def dead_reckoning(start_pose: ArrayLike, odometry: ArrayLike) -> FloatArray:
+    """Chain odometry readings from a start pose.
+
+    Args:
+        start_pose: (3,) float64 [m, m, rad].
+        odometry: (T, 3) float64 [m, m, rad]. Each the motion since the reading before, in the robot's previous frame.
+
+    Returns:
+        (T + 1, 3) poses in the frame of `start_pose`, which is the first row.
+
+    >>> dead_reckoning([0.0, 0.0, np.pi / 2], [[1.0, 0.0, 0.0], [2.0, 0.0, 0.0]]).round(6)[:, 1].tolist()
+    [0.0, 1.0, 3.0]
+    """
+    start = check_array("start_pose", start_pose, (3,), "Give a pose (x, y, theta).")
+    motion = check_array("odometry", odometry, (None, 3), "Give one row (dx, dy, dtheta) per step.")
+    headings = start[2] + np.concatenate([[0.0], np.cumsum(motion[:, 2])])
+    c, s = np.cos(headings[:-1]), np.sin(headings[:-1])
+    steps = np.stack([c * motion[:, 0] - s * motion[:, 1], s * motion[:, 0] + c * motion[:, 1]], axis=-1)
+    positions = start[:2] + np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
+    return np.column_stack([positions, wrap_angle(headings)])
