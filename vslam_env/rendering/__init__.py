@@ -1,0 +1,5 @@
+"""Pictures of an episode: `Scene` says what is to be seen, `draw_frame` paints it."""
+
+from vslam_env.rendering.scene import MergeFlash, RobotView, Scene
+
+__all__ = ["MergeFlash", "RobotView", "Scene"]
