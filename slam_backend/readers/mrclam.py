@@ -1,0 +1,181 @@
+"""The log of the UTIAS robots (MR.CLAM): strict parsing, and the landmark sightings of each robot."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from slam_backend.errors import BoolArray, FloatArray, IntArray, bad_argument, check_float
+from slam_backend.trajectory import Trajectory
+
+ROBOTS = (1, 2, 3, 4, 5)  # subjects with these numbers are the robots themselves
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RobotLog:
+    """What one robot recorded, and where it really was. The arrays are read-only.
+
+    Attributes:
+        robot: Its number in the log, 1 to 5.
+        commands: (n, 3) float64 [s, m/s, rad/s]. Time, forward and angular velocity as commanded; times never go back.
+        sightings: (m, 4) float64 [s, -, m, rad]. Time, subject, range, bearing (positive to the left) of landmarks;
+            times never go back. Sightings of robots and of unknown barcodes are left out.
+        truth: Poses in the world frame, or None where the log has none.
+    """
+
+    robot: int
+    commands: FloatArray
+    sightings: FloatArray
+    truth: Trajectory | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MrclamLog:
+    """A log of several robots among landmarks with barcodes. The arrays are read-only.
+
+    Attributes:
+        robots: One entry per robot asked for, in that order.
+        subjects: (N,) int64. Numbers of the landmarks that have a barcode, ascending.
+        positions: (N, 2) float64 [m]. Where they really are, world frame.
+    """
+
+    robots: tuple[RobotLog, ...]
+    subjects: IntArray
+    positions: FloatArray
+
+
+def load_mrclam(path: str | Path, robots: Sequence[int] | None = None, duration: float | None = None) -> MrclamLog:
+    """Read a folder such as `MRCLAM_Dataset7`.
+
+    Args:
+        path: Folder with `Barcodes.dat`, `Landmark_Groundtruth.dat` and, for each robot i, `Robot<i>_Odometry.dat`,
+            `Robot<i>_Measurement.dat` and, where known, `Robot<i>_Groundtruth.dat`.
+        robots: Numbers of the robots to read, 1 to 5, each once. None: all whose odometry is there.
+        duration: Keep this many seconds from the earliest command on [s]. None: all.
+
+    Returns:
+        The log. True poses are kept whole, so that any time of the kept readings can be looked up.
+
+    Raises:
+        ValueError: If the folder or a file is missing, a line is malformed (the text names file and line), times go
+            back, a robot is unknown, or a sighted landmark has no true position.
+    """
+    folder = Path(path)
+    if not folder.is_dir():
+        raise bad_argument("path", "a folder of the MR.CLAM log", repr(str(path)), "Check that the folder exists.")
+    numbers = _check_robots(folder, robots)
+    barcodes = _read_table(folder / "Barcodes.dat", ("subject", "barcode"))
+    subject_of = {int(barcode): int(subject) for subject, barcode in barcodes}
+    columns = ("subject", "x", "y", "sigma_x", "sigma_y")
+    place_of = {int(row[0]): row[1:3] for row in _read_table(folder / "Landmark_Groundtruth.dat", columns)}
+    subjects = np.array(sorted(set(subject_of.values()) - set(ROBOTS)), dtype=np.int64)
+    unplaced = [int(subject) for subject in subjects if int(subject) not in place_of]
+    if unplaced:
+        raise bad_argument(
+            "path", "a position of each landmark", f"no position of subject {unplaced[0]}",
+            f"Add it to {folder / 'Landmark_Groundtruth.dat'}.",
+        )  # fmt: skip
+    positions = np.array([place_of[int(subject)] for subject in subjects]).reshape(-1, 2)
+    logs = [_read_robot(folder, robot, subject_of) for robot in numbers]
+    if duration is not None:
+        seconds = check_float("duration", duration, "Give seconds, or None for the whole log.", above=0.0)
+        start = min(log.commands[0, 0] for log in logs)
+        logs = [_cut(log, start + seconds) for log in logs]
+    for array in (subjects, positions, *(a for log in logs for a in (log.commands, log.sightings))):
+        array.setflags(write=False)
+    return MrclamLog(tuple(logs), subjects, positions)
+
+
+def _check_robots(folder: Path, robots: Sequence[int] | None) -> tuple[int, ...]:
+    """Return the numbers of the robots to read, or raise."""
+    if robots is None:
+        present = tuple(robot for robot in ROBOTS if (folder / f"Robot{robot}_Odometry.dat").is_file())
+        if not present:
+            missing = str(folder / "Robot1_Odometry.dat")
+            raise bad_argument("path", "a folder of the MR.CLAM log", f"no file {missing!r}", "Check the folder.")
+        return present
+    numbers = tuple(robots)
+    unknown = [robot for robot in numbers if robot not in ROBOTS]
+    if not numbers or unknown or len(set(numbers)) < len(numbers):
+        raise bad_argument("robots", "different numbers from 1 to 5", numbers, "Name each robot once, e.g. 1,2,3.")
+    return numbers
+
+
+def _read_robot(folder: Path, robot: int, subject_of: dict[int, int]) -> RobotLog:
+    commands = _read_table(folder / f"Robot{robot}_Odometry.dat", ("time", "velocity", "angular_velocity"))
+    rows = _read_table(folder / f"Robot{robot}_Measurement.dat", ("time", "barcode", "range", "bearing"), empty=True)
+    seen = np.array([subject_of.get(int(barcode), 0) for barcode in rows[:, 1]], dtype=np.float64)
+    sightings = np.column_stack([rows[:, 0], seen, rows[:, 2:]])[seen > max(ROBOTS)]
+    truth_file = folder / f"Robot{robot}_Groundtruth.dat"
+    truth = None
+    if truth_file.is_file():
+        poses = _read_table(truth_file, ("time", "x", "y", "theta"))
+        fresh = np.diff(poses[:, 0], prepend=-np.inf) > 0.0  # a repeated stamp says nothing new
+        truth = Trajectory(poses[fresh, 0], poses[fresh, 1:])
+    return RobotLog(robot, commands, sightings, truth)
+
+
+def _cut(log: RobotLog, end: float) -> RobotLog:
+    """Drop the readings after `end` [s]; a robot that has not started by then keeps its first command."""
+    kept = log.commands[log.commands[:, 0] <= end]
+    return RobotLog(
+        log.robot, kept if len(kept) else log.commands[:1], log.sightings[log.sightings[:, 0] <= end], log.truth
+    )
+
+
+def _read_table(file: Path, columns: tuple[str, ...], empty: bool = False) -> FloatArray:
+    """Return the rows (n, columns) of a file of numbers; comments after `#` and empty lines are skipped.
+
+    Raises:
+        ValueError: If the file is missing or, unless `empty` says otherwise, has no rows; if a line does not hold one
+            finite number per column; if subjects or barcodes are not whole, ranges not positive, or times go back.
+    """
+    if not file.is_file():
+        raise bad_argument("path", f"a folder with {file.name}", f"no file {str(file)!r}", "Check the folder.")
+    lines = file.read_text(encoding="utf-8", errors="replace").split("\n")
+    rows: list[list[float]] = []
+    numbers: list[int] = []
+    for number, line in enumerate(lines, start=1):
+        body = line.partition("#")[0]
+        if body.strip():
+            row = _parse(body)
+            if row is None or len(row) != len(columns):
+                raise _bad_line(file, number, line, columns, "")
+            rows.append(row)
+            numbers.append(number)
+    if not rows and not empty:
+        raise bad_argument("path", f"rows ({' '.join(columns)})", "no rows", f"{file} is empty: get it again.")
+    table = np.array(rows, dtype=np.float64).reshape(-1, len(columns))
+    for rule, broken in _faults(table, columns):
+        if broken.any():
+            number = numbers[int(np.argmax(broken))]
+            raise _bad_line(file, number, lines[number - 1], columns, f" with {rule}")
+    return table
+
+
+def _faults(table: FloatArray, columns: tuple[str, ...]) -> Iterator[tuple[str, BoolArray]]:
+    """Yield each rule that rows (n, columns) must keep, with a mask (n,) of those that break it."""
+    yield "finite numbers", ~np.isfinite(table).all(axis=1)
+    for name, column in zip(columns, table.T, strict=True):
+        if name in ("subject", "barcode"):
+            yield f"a whole {name}", column != np.round(column)
+        elif name == "range":
+            yield "a range > 0", column <= 0.0
+        elif name == "time":
+            yield "a time not before that of the line above", np.diff(column, prepend=-np.inf) < 0.0
+
+
+def _parse(body: str) -> list[float] | None:
+    """Return the numbers that a line spells, or None if a word spells none."""
+    if "_" in body:  # Python reads 1_000 as a number, a log that holds it is damaged
+        return None
+    try:
+        return [float(word) for word in body.split()]
+    except ValueError:
+        return None
+
+
+def _bad_line(file: Path, number: int, line: str, columns: tuple[str, ...], rule: str) -> ValueError:
+    expected = f"{len(columns)} numbers ({' '.join(columns)}){rule}"
+    return bad_argument("path", expected, repr(line.strip()), f"Correct line {number} of {file}.")
