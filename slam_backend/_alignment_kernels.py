@@ -1,0 +1,251 @@
+"""The compiled inner loops of map alignment: residuals of matched landmarks, refinement, search over minimal samples.
+
+A table holds one row of 18 numbers for each candidate match: the position in map a (3), the position in map b (3), and
+the upper triangles (xx, xy, xz, yy, yz, zz) of the covariances in a (6) and in b (6), each in its own frame.
+"""
+
+import math
+
+import numpy as np
+
+from slam_backend._jit import jit
+from slam_backend.errors import BoolArray, FloatArray, IntArray
+
+MATCH_COLUMNS = 18
+MIN_SUPPORT = 3  # a minimal sample always supports itself: only a third candidate is evidence
+MIN_VARIANCE = 1e-8  # [m^2], (0.1 mm)^2: keeps exact landmarks (Sigma = 0) solvable
+MEDIAN_CHI2_3 = 2.3659738843753377
+MAX_ROUNDS = 30
+
+
+@jit
+def _residual(
+    row: FloatArray, cos: float, sin: float, tx: float, ty: float, floor: float
+) -> tuple[float, float, float, float, float, float]:
+    """Return (D, rx, ry, wxx, wxy, wyy) of one candidate under p_a = R p_b + t.
+
+    S = Sigma_a + R Sigma_b R^T + floor I. The height is eliminated first, so that a 2x2 system remains: (rx, ry) is
+    the planar residual given the height's, w the inverse of its covariance, and D = r^T S^-1 r in all three axes.
+    """
+    rx = row[0] - cos * row[3] + sin * row[4] - tx
+    ry = row[1] - sin * row[3] - cos * row[4] - ty
+    rz = row[2] - row[5]
+    bxx, bxy, bxz, byy, byz = row[12], row[13], row[14], row[15], row[16]
+    sxx = row[6] + cos * cos * bxx - 2.0 * cos * sin * bxy + sin * sin * byy + floor  # Eqs. 16-17, corrected
+    sxy = row[7] + cos * sin * (bxx - byy) + (cos * cos - sin * sin) * bxy
+    syy = row[9] + sin * sin * bxx + 2.0 * cos * sin * bxy + cos * cos * byy + floor
+    sxz = row[8] + cos * bxz - sin * byz
+    syz = row[10] + sin * bxz + cos * byz
+    szz = row[11] + row[17] + floor
+    rx -= sxz * rz / szz
+    ry -= syz * rz / szz
+    sxx -= sxz * sxz / szz
+    sxy -= sxz * syz / szz
+    syy -= syz * syz / szz
+    determinant = sxx * syy - sxy * sxy
+    wxx, wxy, wyy = syy / determinant, -sxy / determinant, sxx / determinant
+    distance = rz * rz / szz + wxx * rx * rx + 2.0 * wxy * rx * ry + wyy * ry * ry
+    return distance, rx, ry, wxx, wxy, wyy
+
+
+@jit
+def squared_distances(table: FloatArray, pose: FloatArray, floor: float) -> FloatArray:
+    """Return the squared Mahalanobis residuals (k,) of all candidates under `pose` (3,) = a_from_b."""
+    cos, sin = math.cos(pose[2]), math.sin(pose[2])
+    result = np.empty(len(table))
+    for i in range(len(table)):
+        result[i] = _residual(table[i], cos, sin, pose[0], pose[1], floor)[0]
+    return result
+
+
+@jit
+def _support(
+    table: FloatArray, pose: FloatArray, floor: float, gate: float, members: BoolArray
+) -> tuple[int, float]:
+    """Mark the candidates within `gate`; return their number and the score, sum of 1 - D / gate over them."""
+    cos, sin, tx, ty = math.cos(pose[2]), math.sin(pose[2]), pose[0], pose[1]
+    count, score = 0, 0.0
+    for i in range(len(table)):
+        row = table[i]
+        members[i] = False
+        rx = row[0] - cos * row[3] + sin * row[4] - tx
+        ry = row[1] - sin * row[3] - cos * row[4] - ty
+        # No direction's variance exceeds the trace: most outliers are told by this alone.
+        if rx * rx + ry * ry <= gate * (row[6] + row[9] + row[11] + row[12] + row[15] + row[17] + floor):
+            distance = _residual(row, cos, sin, tx, ty, floor)[0]
+            if distance <= gate:
+                members[i] = True
+                count += 1
+                score += 1.0 - distance / gate
+    return count, score
+
+
+@jit
+def information(table: FloatArray, members: BoolArray, pose: FloatArray, floor: float) -> tuple[FloatArray, FloatArray]:
+    """Return H = sum J^T S^-1 J (3, 3) and g = sum J^T S^-1 r (3,) over the members, J = [e_x, e_y, dR/dtheta p_b]."""
+    cos, sin, tx, ty = math.cos(pose[2]), math.sin(pose[2]), pose[0], pose[1]
+    h, g = np.zeros((3, 3)), np.zeros(3)
+    for i in range(len(table)):
+        if members[i]:
+            _, rx, ry, wxx, wxy, wyy = _residual(table[i], cos, sin, tx, ty, floor)
+            jx = -sin * table[i, 3] - cos * table[i, 4]
+            jy = cos * table[i, 3] - sin * table[i, 4]
+            wx, wy = wxx * rx + wxy * ry, wxy * rx + wyy * ry
+            vx, vy = wxx * jx + wxy * jy, wxy * jx + wyy * jy
+            h[0, 0] += wxx
+            h[0, 1] += wxy
+            h[1, 1] += wyy
+            h[0, 2] += vx
+            h[1, 2] += vy
+            h[2, 2] += jx * vx + jy * vy
+            g[0] += wx
+            g[1] += wy
+            g[2] += jx * wx + jy * wy
+    h[1, 0], h[2, 0], h[2, 1] = h[0, 1], h[0, 2], h[1, 2]
+    return h, g
+
+
+@jit
+def gauss_newton_step(table: FloatArray, members: BoolArray, pose: FloatArray, floor: float) -> FloatArray:
+    """Return `pose` after one weighted Gauss-Newton step; unchanged if the members leave the rotation open."""
+    h, g = information(table, members, pose, floor)
+    determinant = h[0, 0] * h[1, 1] - h[0, 1] * h[0, 1]
+    if determinant <= 0.0:
+        return pose.copy()
+    # The translation is eliminated first: u = H_tt^-1 H_t,theta and v = H_tt^-1 g_t.
+    ux = (h[1, 1] * h[0, 2] - h[0, 1] * h[1, 2]) / determinant
+    uy = (h[0, 0] * h[1, 2] - h[0, 1] * h[0, 2]) / determinant
+    vx = (h[1, 1] * g[0] - h[0, 1] * g[1]) / determinant
+    vy = (h[0, 0] * g[1] - h[0, 1] * g[0]) / determinant
+    remaining = h[2, 2] - h[0, 2] * ux - h[1, 2] * uy
+    if remaining <= 1e-12 * h[2, 2]:
+        return pose.copy()
+    turn = (g[2] - h[0, 2] * vx - h[1, 2] * vy) / remaining
+    heading = (pose[2] + turn + math.pi) % (2.0 * math.pi) - math.pi
+    return np.array([pose[0] + vx - ux * turn, pose[1] + vy - uy * turn, heading])
+
+
+@jit
+def _fitted_variance(table: FloatArray, members: BoolArray, pose: FloatArray, floor: float) -> float:
+    """Return the added variance, at most `floor`, under which the members' median D is that of 3 degrees of freedom.
+
+    Honest covariances get almost nothing added, so that the weights stay efficient; over-confident ones get what
+    their residuals show.
+    """
+    chosen = table[members]
+    target = MEDIAN_CHI2_3 * (1.0 - 1.0 / max(len(chosen), 2))  # three of the 3 k residuals went into the fit
+    if np.median(squared_distances(chosen, pose, floor)) >= target:
+        return floor
+    low, high = min(MIN_VARIANCE, floor), floor
+    for _ in range(25):
+        middle = math.sqrt(low * high)
+        if np.median(squared_distances(chosen, pose, middle)) > target:
+            low = middle
+        else:
+            high = middle
+    return high
+
+
+@jit
+def refine(table: FloatArray, start: FloatArray, floor: float, gate: float) -> tuple[FloatArray, BoolArray, float]:
+    """Alternate inliers, added variance and Gauss-Newton steps until the pose rests.
+
+    Returns:
+        The pose (3,); the members (k,) that shaped it; the added variance [m^2]. Members lie within `gate` under
+        the fitted variance, which is stricter than the inliers' own test under `floor`.
+    """
+    pose = start.copy()
+    members = np.zeros(len(table), np.bool_)
+    variance = floor
+    for _ in range(MAX_ROUNDS):
+        _support(table, pose, floor, gate, members)
+        variance = _fitted_variance(table, members, pose, floor)
+        _support(table, pose, variance, gate, members)
+        moved = gauss_newton_step(table, members, pose, variance)
+        rests = np.abs(moved - pose).max() < 1e-10
+        pose = moved
+        if rests:
+            break
+    return pose, members, variance
+
+
+@jit
+def _pose_from_two(table: FloatArray, i: int, j: int, gate: float, floor: float, min_baseline: float) -> FloatArray:
+    """Return the rigid motion (3,) that two candidates suggest; NaN if their distances disagree or are too short."""
+    ax, ay = table[j, 0] - table[i, 0], table[j, 1] - table[i, 1]
+    bx, by = table[j, 3] - table[i, 3], table[j, 4] - table[i, 4]
+    length_a, length_b = math.hypot(ax, ay), math.hypot(bx, by)
+    if min(length_a, length_b) <= min_baseline:
+        return np.full(3, np.nan)
+    ux, uy, vx, vy = ax / length_a, ay / length_a, bx / length_b, by / length_b
+    variance = 2.0 * floor
+    for m in (i, j):
+        variance += ux * ux * table[m, 6] + 2.0 * ux * uy * table[m, 7] + uy * uy * table[m, 9]
+        variance += vx * vx * table[m, 12] + 2.0 * vx * vy * table[m, 13] + vy * vy * table[m, 15]
+    if (length_a - length_b) ** 2 > gate * variance:
+        return np.full(3, np.nan)
+    theta = math.atan2(vx * uy - vy * ux, ux * vx + uy * vy)
+    cos, sin = math.cos(theta), math.sin(theta)
+    mx, my = 0.5 * (table[i, 3] + table[j, 3]), 0.5 * (table[i, 4] + table[j, 4])
+    tx = 0.5 * (table[i, 0] + table[j, 0]) - cos * mx + sin * my
+    ty = 0.5 * (table[i, 1] + table[j, 1]) - sin * mx - cos * my
+    return np.array([tx, ty, theta])
+
+
+@jit
+def _samples_needed(share: float, log_failure: float) -> float:
+    """Return how many pairs to draw so that one stems from a consensus set that holds `share` of the candidates.
+
+    Half of that set's pairs are taken to lie too close together to give a useful rotation.
+    """
+    return log_failure / math.log(1.0 - 0.5 * min(share, 1.0) ** 2)
+
+
+@jit
+def search(
+    table: FloatArray,
+    samples: IntArray,
+    floor: float,
+    gate: float,
+    min_baseline: float,
+    min_inliers: int,
+    max_ratio: float,
+    log_failure: float,
+) -> FloatArray:
+    """Turn minimal samples into locally optimised hypotheses, until enough samples have been drawn.
+
+    A sample is the number n of a pair (i, j), j < i, with n = i (i - 1) / 2 + j. Drawing stops when a consensus set
+    of `max_ratio` times the best one's size would have been sampled with probability 1 - exp(log_failure): so the
+    best is found, and every rival that would make it ambiguous.
+
+    Returns:
+        (h, 5) rows (tx, ty, theta, inliers, score) of all hypotheses with at least `MIN_SUPPORT` inliers.
+    """
+    found = np.empty((len(samples), 5))
+    members = np.zeros(len(table), np.bool_)
+    h, most = 0, min_inliers
+    needed = _samples_needed(max_ratio * most / len(table), log_failure)
+    for drawn in range(len(samples)):
+        if drawn >= needed:
+            break
+        n = samples[drawn]
+        i = int((1.0 + math.sqrt(1.0 + 8.0 * n)) // 2.0)
+        i -= i * (i - 1) // 2 > n
+        i += i * (i + 1) // 2 <= n
+        pose = _pose_from_two(table, i, n - i * (i - 1) // 2, gate, floor, min_baseline)
+        if math.isnan(pose[0]):
+            continue
+        # Two noisy points aim badly at far ones: the first set is taken at twice the distance.
+        count, score = _support(table, pose, floor, 4.0 * gate, members)
+        for _ in range(2):
+            if count < MIN_SUPPORT:
+                break
+            pose = gauss_newton_step(table, members, pose, floor)
+            count, score = _support(table, pose, floor, gate, members)
+        if count >= MIN_SUPPORT:
+            found[h, 0], found[h, 1], found[h, 2], found[h, 3], found[h, 4] = pose[0], pose[1], pose[2], count, score
+            h += 1
+            if count > most:
+                most = count
+                needed = _samples_needed(max_ratio * most / len(table), log_failure)
+    return found[:h]

@@ -1,0 +1,295 @@
+"""The motion between two maps of unknown relative frame, or a reason why it is not known (Sec. 3.1)."""
+
+import math
+from dataclasses import dataclass
+from typing import Literal, Self
+
+import numpy as np
+
+from slam_backend import _alignment_kernels as kernels
+from slam_backend._matching import mutual_nearest, unlike_other_places
+from slam_backend.errors import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    bad_argument,
+    check_array,
+    check_choice,
+    check_float,
+    check_int,
+)
+from slam_backend.geometry import transform_points, wrap_angle
+from slam_backend.landmark_map import LandmarkMap
+from slam_backend.metrics import align_se2
+
+METHODS = ("ransac", "svd")
+Reason = Literal["", "too few candidates", "too few inliers", "ambiguous", "poorly spread", "too uncertain"]
+REASONS: tuple[Reason, ...] = (
+    "too few candidates",
+    "too few inliers",
+    "ambiguous",
+    "poorly spread",
+    "too uncertain",
+)
+RIVAL_DISTANCE = 0.5  # [m]; beyond these two an alignment counts as another one, and as a false one
+RIVAL_ANGLE = np.deg2rad(5.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AlignmentOptions:
+    """When two landmarks look alike, when they lie together, and when an alignment is believed.
+
+    Attributes:
+        descriptor_gate: Largest L2 distance between matched descriptors [-].
+        descriptor_ratio: A match must be closer than this times the best landmark of another place [-].
+        same_place: Landmarks of one map within this distance may be duplicates, and do not compete [m].
+        position_gate: Largest squared Mahalanobis residual of an inlier [-]; 11.34 is 99 % of 3 degrees of freedom.
+        position_floor: Standard deviation added to the residuals, because filters' maps are over-confident [m].
+        min_inliers: Fewer inliers are refused; at least 3.
+        max_ratio: Refused when a different alignment has more than this times the best one's inliers [-].
+        min_spread: Refused when the inliers extend over less than this along their main axis [m].
+        max_sigma_position: Refused when the translation is less certain than this in any direction [m].
+        max_sigma_heading: Refused when the rotation is less certain than this [rad].
+        success_probability: That a random search meets the best alignment, and each rival that would make it
+            ambiguous [-].
+        max_samples: Bound on the minimal samples of that search, whatever the probability.
+    """
+
+    descriptor_gate: float = 0.45
+    descriptor_ratio: float = 0.8
+    same_place: float = 1.0
+    position_gate: float = 11.34
+    position_floor: float = 0.1
+    min_inliers: int = 8
+    max_ratio: float = 0.5
+    min_spread: float = 2.0
+    max_sigma_position: float = 0.25
+    max_sigma_heading: float = 0.035
+    success_probability: float = 0.999
+    max_samples: int = 20_000
+
+    def __post_init__(self) -> None:
+        above = ("descriptor_gate", "position_gate", "position_floor", "max_sigma_position", "max_sigma_heading")
+        for name in above:
+            check_float(f"options.{name}", getattr(self, name), "Give a positive number.", above=0.0)
+        for name in ("descriptor_ratio", "max_ratio"):
+            check_float(f"options.{name}", getattr(self, name), "Give a share.", above=0.0, at_most=1.0)
+        for name in ("same_place", "min_spread"):
+            check_float(f"options.{name}", getattr(self, name), "Give a distance in metres.", at_least=0.0)
+        probability = self.success_probability
+        check_float("options.success_probability", probability, "Use e.g. 0.999.", above=0.0, at_most=1.0 - 1e-12)
+        check_int("options.min_inliers", self.min_inliers, kernels.MIN_SUPPORT, "Two fit any motion: demand more.")
+        check_int("options.max_samples", self.max_samples, 1, "Allow at least one sample.")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Alignment:
+    """The motion from map b to map a, p_a = R(theta) p_b + t, or a refusal.
+
+    Attributes:
+        success: Whether the alignment is believed.
+        reason: Empty on success, else one of `REASONS`.
+        tx: Translation [m], frame a; NaN when refused.
+        ty: Likewise.
+        theta: Rotation [rad] in [-pi, pi); NaN when refused.
+        covariance: (3, 3) float64 [m, m, rad] of (tx, ty, theta); NaN when refused.
+        inliers: (k, 2) int64 rows (index in map a, index in map b), one-to-one; none when refused.
+        ratio: Inliers of the best alignment that differs (by more than 0.5 m or 5 degrees) over those of this one;
+            0 if there was none or the method looks for none.
+    """
+
+    success: bool
+    reason: str
+    tx: float
+    ty: float
+    theta: float
+    covariance: FloatArray
+    inliers: IntArray
+    ratio: float
+
+    def __post_init__(self) -> None:
+        if self.reason not in (REASONS if not self.success else ("",)):
+            expected = "'' on success, else one of " + ", ".join(REASONS)
+            raise bad_argument("reason", expected, self.reason, "Name why it was refused.")
+        cure = "A successful alignment has a finite motion and covariance."
+        pose = check_array("tx, ty, theta", (self.tx, self.ty, self.theta), (3,), cure, finite=self.success)
+        for name, value in zip(("tx", "ty", "theta"), pose, strict=True):
+            object.__setattr__(self, name, float(value))
+        covariance = check_array("covariance", self.covariance, (3, 3), cure, finite=self.success)
+        inliers = check_array("inliers", self.inliers, (None, 2), "Give rows (a, b).", dtype=np.int64)
+        for name, array in (("covariance", covariance), ("inliers", inliers)):
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+
+    @property
+    def transform(self) -> FloatArray:
+        """The motion (3,) = a_from_b [m, m, rad]; NaN when refused."""
+        return np.array([self.tx, self.ty, self.theta])
+
+    @classmethod
+    def refused(cls, reason: Reason, ratio: float = 0.0) -> Self:
+        """Return a refusal: NaN motion and covariance, no inliers."""
+        nan = float("nan")
+        return cls(False, reason, nan, nan, nan, np.full((3, 3), nan), np.empty((0, 2), np.int64), ratio)
+
+
+def candidate_matches(map_a: LandmarkMap, map_b: LandmarkMap, options: AlignmentOptions) -> IntArray:
+    """Match landmarks by appearance, without regard to where they lie in the plane.
+
+    Each is the other's nearest descriptor, within the gate, clearly nearer than any landmark of another place in
+    either map; and their heights agree, because planar robots with one camera height share z (Sec. 3.1).
+
+    Args:
+        map_a: The one map.
+        map_b: The other, in any other planar frame.
+        options: Gates.
+
+    Returns:
+        (k, 2) int64 rows (index in map_a, index in map_b), one-to-one, by rising index in map_a.
+
+    Raises:
+        ValueError: If the maps' descriptors differ in size.
+    """
+    if map_a.descriptors.shape[1] != map_b.descriptors.shape[1]:
+        raise bad_argument(
+            "map_b",
+            f"descriptors of size {map_a.descriptors.shape[1]}, as in map_a",
+            map_b.descriptors.shape[1],
+            "Describe the landmarks of both maps with the same front end.",
+        )
+    matches = mutual_nearest(map_a.descriptors, map_b.descriptors, options.descriptor_gate)
+    for one, other, here, there in ((map_a, map_b, 0, 1), (map_b, map_a, 1, 0)):
+        descriptors, partners = one.descriptors[matches[:, here]], matches[:, there]
+        limits = (options.same_place, options.descriptor_ratio)
+        matches = matches[unlike_other_places(descriptors, partners, other.descriptors, other.means, *limits)]
+    rows_a, rows_b = matches.T
+    climb = map_a.means[rows_a, 2] - map_b.means[rows_b, 2]
+    variance = map_a.covariances[rows_a, 2, 2] + map_b.covariances[rows_b, 2, 2] + options.position_floor**2
+    level: IntArray = matches[climb**2 <= options.position_gate * variance]
+    return level
+
+
+def align_maps(
+    map_a: LandmarkMap,
+    map_b: LandmarkMap,
+    method: str = "ransac",
+    rng: np.random.Generator | None = None,
+    options: AlignmentOptions | None = None,
+) -> Alignment:
+    """Estimate the planar motion between two maps from landmarks that look alike; refuse when in doubt.
+
+    Args:
+        map_a: The map whose frame the result leads to.
+        map_b: The other map.
+        method: `"ransac"`: search over pairs of candidate matches, each hypothesis locally optimised, then weighted
+            Gauss-Newton to convergence. `"svd"`: closed form and weighted Gauss-Newton over ALL candidate matches,
+            without any rejection of outliers, for comparison.
+        rng: Order of the search; None: a fixed one. The same generator state gives the same result.
+        options: Gates and refusals; None: the defaults.
+
+    Returns:
+        The alignment, or a refusal with its reason. A refusal is cheap, a false merge is not.
+
+    Raises:
+        ValueError: If the method is unknown or the maps' descriptors differ in size.
+    """
+    check_choice("method", method, METHODS)
+    options = AlignmentOptions() if options is None else options
+    rng = np.random.default_rng(0) if rng is None else rng
+    matches = candidate_matches(map_a, map_b, options)
+    if len(matches) < options.min_inliers:
+        return Alignment.refused("too few candidates")
+    table = _match_table(map_a, map_b, matches)
+    floor = options.position_floor**2
+    if method == "ransac":
+        hypotheses = _search(table, rng, options)
+        if not len(hypotheses):
+            return Alignment.refused("too few inliers")
+        pose, members, variance = kernels.refine(
+            table, hypotheses[hypotheses[:, 4].argmax(), :3].copy(), floor, options.position_gate
+        )
+    else:
+        hypotheses = np.empty((0, 5))
+        pose, members, variance = _fit_all(table, floor)
+    inside = kernels.squared_distances(table, pose, floor) <= options.position_gate
+    inliers = matches[inside]
+    if len(inliers) < options.min_inliers:
+        return Alignment.refused("too few inliers")
+    points_b = map_b.means[inliers[:, 1], :2]
+    ratio = _strongest_rival(hypotheses, pose, points_b.mean(axis=0)) / len(inliers)
+    if ratio > options.max_ratio:
+        return Alignment.refused("ambiguous", ratio)
+    if _extent(points_b) < options.min_spread:
+        return Alignment.refused("poorly spread", ratio)
+    covariance = _covariance(kernels.information(table, members, pose, variance)[0])
+    if covariance is None or not _certain(covariance, options):
+        return Alignment.refused("too uncertain", ratio)
+    return Alignment(True, "", pose[0], pose[1], pose[2], covariance, inliers, ratio)
+
+
+def _match_table(map_a: LandmarkMap, map_b: LandmarkMap, matches: IntArray) -> FloatArray:
+    """Return the (k, 18) table of matched landmarks that the kernels read."""
+    upper = np.triu_indices(3)
+    table = np.empty((len(matches), kernels.MATCH_COLUMNS))
+    for offset, source, rows in ((0, map_a, matches[:, 0]), (1, map_b, matches[:, 1])):
+        table[:, 3 * offset : 3 * offset + 3] = source.means[rows]
+        table[:, 6 + 6 * offset : 12 + 6 * offset] = source.covariances[rows][:, upper[0], upper[1]]
+    return table
+
+
+def _search(table: FloatArray, rng: np.random.Generator, options: AlignmentOptions) -> FloatArray:
+    """Return the hypotheses (h, 5) of a random search over pairs of candidates, without repetition where it can."""
+    pairs = len(table) * (len(table) - 1) // 2
+    limit = options.max_samples
+    samples = rng.permutation(pairs)[:limit] if pairs <= 4 * limit else rng.integers(0, pairs, limit)
+    return kernels.search(
+        table,
+        samples,
+        options.position_floor**2,
+        options.position_gate,
+        0.5 * options.min_spread,  # pairs that lie closer say little about the rotation
+        options.min_inliers,
+        options.max_ratio,
+        math.log(1.0 - options.success_probability),
+    )
+
+
+def _fit_all(table: FloatArray, floor: float) -> tuple[FloatArray, BoolArray, float]:
+    """Return the motion (3,) fitted to all candidates alike, all of them as members, and the added variance."""
+    pose = align_se2(table[:, :2], table[:, 3:5])
+    members = np.ones(len(table), np.bool_)
+    for _ in range(kernels.MAX_ROUNDS):
+        pose = kernels.gauss_newton_step(table, members, pose, floor)
+    return pose, members, floor
+
+
+def _strongest_rival(hypotheses: FloatArray, pose: FloatArray, centre_b: FloatArray) -> float:
+    """Return the most inliers of a hypothesis that puts the inliers' centre elsewhere or turns by another angle."""
+    cos, sin = np.cos(hypotheses[:, 2]), np.sin(hypotheses[:, 2])
+    here = transform_points(pose, centre_b)
+    x = hypotheses[:, 0] + cos * centre_b[0] - sin * centre_b[1] - here[0]
+    y = hypotheses[:, 1] + sin * centre_b[0] + cos * centre_b[1] - here[1]
+    turned = np.abs(wrap_angle(hypotheses[:, 2] - pose[2])) > RIVAL_ANGLE
+    return float(hypotheses[(np.hypot(x, y) > RIVAL_DISTANCE) | turned, 3].max(initial=0.0))
+
+
+def _extent(points: FloatArray) -> float:
+    """Return how far points (k, 2) [m] reach along their main axis [m]."""
+    centred = points - points.mean(axis=0)
+    main_axis = np.linalg.eigh(centred.T @ centred)[1][:, -1]
+    return float(np.ptp(centred @ main_axis))
+
+
+def _covariance(h: FloatArray) -> FloatArray | None:
+    """Return the covariance (3, 3) of a solution with information `h`; None if that leaves a direction open."""
+    scale = np.sqrt(np.diag(h))
+    if not (scale > 0.0).all() or np.linalg.eigvalsh(h / np.outer(scale, scale))[0] < 1e-12:
+        return None
+    covariance = np.linalg.solve(h, np.eye(3))
+    return np.asarray(0.5 * (covariance + covariance.T))
+
+
+def _certain(covariance: FloatArray, options: AlignmentOptions) -> bool:
+    """Tell whether an alignment is certain enough to be believed."""
+    position = math.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1])
+    return position <= options.max_sigma_position and math.sqrt(covariance[2, 2]) <= options.max_sigma_heading

@@ -1,0 +1,22 @@
+"""How good a map or a path is, and whether its stated uncertainty is honest."""
+
+from slam_backend.metrics.consistency import anees, nees, nis
+from slam_backend.metrics.maps import GospaResult, MapScore, gospa, map_error, map_rmse, ospa
+from slam_backend.metrics.paths import AteResult, RpeResult, align_se2, ate, rpe
+
+__all__ = [
+    "AteResult",
+    "GospaResult",
+    "MapScore",
+    "RpeResult",
+    "align_se2",
+    "anees",
+    "ate",
+    "gospa",
+    "map_error",
+    "map_rmse",
+    "nees",
+    "nis",
+    "ospa",
+    "rpe",
+]

@@ -1,0 +1,233 @@
+"""How far an estimated map is from the true landmarks, counting what is missing and what is too much."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.optimize import linear_sum_assignment
+
+from slam_backend._jit import jit
+from slam_backend.errors import FloatArray, IntArray, bad_argument, check_array, check_float
+
+FALSE, UNCOUNTED = -1, -2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GospaResult:
+    """The generalised optimal sub-pattern assignment between estimates and truths.
+
+    Attributes:
+        distance: The metric itself [m].
+        error: Divided by the number of truths (at least 1) inside the root, as `map_error` is [m].
+        localisation: Sum of d^p over the pairs closer than the cutoff [m^p].
+        missed: Truths without an estimate closer than the cutoff.
+        false: Estimates without a truth closer than the cutoff.
+    """
+
+    distance: float
+    error: float
+    localisation: float
+    missed: int
+    false: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapScore:
+    """The error of the landmarks that were matched; read it together with how many they are.
+
+    Attributes:
+        rmse: Root mean square distance of the matched landmarks [m]; NaN if none is matched.
+        recall: Matched landmarks over the true ones; 0 if there are none.
+        precision: Matched landmarks over the estimated ones; 0 if there are none.
+        matched: (k, 2) int64 rows (index of the estimate, index of the truth), one-to-one.
+    """
+
+    rmse: float
+    recall: float
+    precision: float
+    matched: IntArray
+
+
+@jit
+def _nearest_claimants(means: FloatArray, claims: IntArray, truths: FloatArray) -> tuple[FloatArray, IntArray, int]:
+    """Return per truth the least squared distance of a claimant (inf: none) and its index, and what is too much.
+
+    The last number counts false estimates and those whose truth a nearer claimant holds; it is -1 - i if claim i is
+    neither a truth nor a mark.
+    """
+    least, holder = np.full(len(truths), np.inf), np.full(len(truths), -1)
+    surplus = 0
+    for i in range(len(means)):
+        claim = claims[i]
+        if claim >= len(truths) or claim < UNCOUNTED:
+            return least, holder, -1 - i
+        if claim == FALSE:
+            surplus += 1
+        elif claim >= 0:
+            distance = 0.0
+            for axis in range(3):
+                distance += (means[i, axis] - truths[claim, axis]) ** 2
+            surplus += holder[claim] >= 0
+            if distance < least[claim]:
+                least[claim], holder[claim] = distance, i
+    return least, holder, surplus
+
+
+def map_error(means: FloatArray, claims: IntArray, true_positions: FloatArray, cutoff: float = 1.0) -> float:
+    """Return the map error E of landmarks whose origin is known, fast enough for every step of a simulation.
+
+    E = sqrt((1/N) (sum over held landmarks of min(d^2, c^2) + c^2/2 (missed + false + duplicate))): the nearest
+    claimant of a true landmark holds it, its other claimants are duplicates, and true landmarks that nobody claims
+    are missed. It equals `gospa(...).error` where true landmarks lie more than 2 c apart and estimates are closer
+    than c to the landmark they claim.
+
+    Args:
+        means: (n, 3) float64 [m], world frame. Estimated positions.
+        claims: (n,) int64. Index of the true landmark that created each; -1: none, it is false; -2: a true landmark
+            that is not among the countable ones: ignored, neither held nor false.
+        true_positions: (N, 3) float64 [m], world frame, N >= 1.
+        cutoff: c [m].
+
+    Raises:
+        ValueError: If shapes disagree, a claim names no landmark, a mean is not finite, or N = 0.
+
+    >>> map_error(np.array([[0.0, 0.6, 0.0]]), np.array([0]), np.array([[0.0, 0.0, 0.0]]))
+    0.6
+    """
+    least, _, surplus = _claimed(means, claims, true_positions)
+    if not cutoff > 0.0:
+        raise bad_argument("cutoff", "a number > 0", cutoff, "Give the cutoff distance in metres.")
+    if not len(least):
+        raise bad_argument("true_positions", "at least one landmark", "an array of none", "Use a world with landmarks.")
+    squared = cutoff * cutoff
+    held = least < np.inf
+    missed = len(least) - np.count_nonzero(held)
+    total = np.minimum(least[held], squared).sum() + 0.5 * squared * (missed + surplus)
+    return float(np.sqrt(total / len(least)))
+
+
+def _claimed(means: FloatArray, claims: IntArray, truths: FloatArray) -> tuple[FloatArray, IntArray, int]:
+    """Check the arrays cheaply and return `_nearest_claimants` of them."""
+    means, truths = np.ascontiguousarray(means, np.float64), np.ascontiguousarray(truths, np.float64)
+    claims = np.ascontiguousarray(claims, np.int64)
+    if means.shape != (len(claims), 3):
+        raise bad_argument("means", f"an array of shape ({len(claims)}, 3)", f"shape {means.shape}", "One per claim.")
+    if truths.ndim != 2 or truths.shape[1] != 3:
+        raise bad_argument("true_positions", "an array of shape (N, 3)", f"shape {truths.shape}", "One row each.")
+    if not np.isfinite(means).all():
+        raise bad_argument("means", "finite numbers", "NaN or infinity", "Drop landmarks that are not finite.")
+    least, holder, surplus = _nearest_claimants(means, claims, truths)
+    if surplus < 0:
+        expected = f"indices below {len(truths)}, -1 for false or -2 for uncounted ones"
+        raise bad_argument("claims", expected, int(claims[-1 - surplus]), "Claim landmarks that exist.")
+    return least, holder, surplus
+
+
+def gospa(
+    estimates: ArrayLike, truths: ArrayLike, cutoff: float = 1.0, order: float = 2.0, alpha: float = 2.0
+) -> GospaResult:
+    """Return the GOSPA metric between two point sets, by optimal assignment.
+
+    d = (min over assignments of sum min(d_ij, c)^p + c^p / alpha | n - N |)^(1/p), the smaller set assigned whole.
+    With alpha = 2 this is the sum of `localisation` and c^p / 2 for each missed and each false one.
+
+    Args:
+        estimates: (n, 3) or (n, 2) float64 [m].
+        truths: (N, 3) or (N, 2) float64 [m], same frame and width.
+        cutoff: c [m].
+        order: p >= 1.
+        alpha: In (0, 2].
+
+    Raises:
+        ValueError: If shapes disagree, a number is not finite or a parameter lies outside its range.
+
+    >>> gospa([[0.0, 0.0, 0.0]], [[0.0, 0.0, 0.6], [9.0, 0.0, 0.0]]).missed
+    1
+    """
+    check_float("order", order, "The metric needs p >= 1.", at_least=1.0)
+    check_float("alpha", alpha, "Use 2 to count missed and false ones alike.", above=0.0, at_most=2.0)
+    costs, rows, columns = _assigned(estimates, truths, cutoff, order)
+    n, count = costs.shape
+    paired = costs[rows, columns]
+    far = int(np.count_nonzero(paired >= cutoff**order))
+    total = float(paired.sum()) + cutoff**order / alpha * abs(n - count)
+    return GospaResult(
+        distance=total ** (1.0 / order),
+        error=(total / max(count, 1)) ** (1.0 / order),
+        localisation=float(paired[paired < cutoff**order].sum()),
+        missed=max(count - n, 0) + far,
+        false=max(n - count, 0) + far,
+    )
+
+
+def ospa(estimates: ArrayLike, truths: ArrayLike, cutoff: float = 1.0, order: float = 2.0) -> float:
+    """Return the OSPA metric [m], ((sum min(d_ij, c)^p + c^p | n - N |) / max(n, N))^(1/p), in [0, c].
+
+    Args:
+        estimates: (n, 3) or (n, 2) float64 [m].
+        truths: (N, 3) or (N, 2) float64 [m], same frame and width.
+        cutoff: c [m].
+        order: p >= 1.
+
+    Raises:
+        ValueError: As `gospa`.
+
+    >>> ospa([[0.0, 0.0]], [[0.0, 0.5]], cutoff=2.0)
+    0.5
+    """
+    check_float("order", order, "The metric needs p >= 1.", at_least=1.0)
+    costs, rows, columns = _assigned(estimates, truths, cutoff, order)
+    total = float(costs[rows, columns].sum()) + cutoff**order * abs(costs.shape[0] - costs.shape[1])
+    return float((total / max(*costs.shape, 1)) ** (1.0 / order))
+
+
+def map_rmse(estimates: ArrayLike, truths: ArrayLike, claims: ArrayLike | None = None, gate: float = 0.5) -> MapScore:
+    """Return the RMS error of matched landmarks with recall and precision.
+
+    Args:
+        estimates: (n, 3) float64 [m], world frame.
+        truths: (N, 3) float64 [m], world frame.
+        claims: (n,) int64 as in `map_error`: the nearest claimant of each true landmark is its match, however far;
+            claims of -2 count neither way. None: optimal assignment, pairs at `gate` or farther left out.
+        gate: [m].
+
+    Raises:
+        ValueError: If shapes disagree, a number is not finite or a claim names no landmark.
+
+    >>> map_rmse([[0.0, 0.3, 0.0], [5.0, 5.0, 0.0]], [[0.0, 0.0, 0.0]]).precision
+    0.5
+    """
+    cure = "Give one position (x, y, z) per landmark."
+    means, true = (check_array(n, v, (None, 3), cure) for n, v in (("estimates", estimates), ("truths", truths)))
+    uncounted = 0
+    if claims is None:
+        costs, rows, columns = _assigned(means, true, gate, 2.0)
+        near = costs[rows, columns] < gate**2
+        matched = np.column_stack([rows[near], columns[near]]).astype(np.int64)
+    else:
+        named = check_array("claims", claims, (len(means),), "Give one claim per estimate.", dtype=np.int64)
+        holder = _claimed(means, named, true)[1]
+        held = np.flatnonzero(holder >= 0)
+        matched = np.column_stack([holder[held], held])
+        uncounted = int(np.count_nonzero(named == UNCOUNTED))
+    squares = ((means[matched[:, 0]] - true[matched[:, 1]]) ** 2).sum(axis=1)
+    return MapScore(
+        rmse=float(np.sqrt(squares.mean())) if len(matched) else float("nan"),
+        recall=len(matched) / max(len(true), 1),
+        precision=len(matched) / max(len(means) - uncounted, 1),
+        matched=matched,
+    )
+
+
+def _assigned(
+    estimates: ArrayLike, truths: ArrayLike, cutoff: float, order: float
+) -> tuple[FloatArray, IntArray, IntArray]:
+    """Return costs (n, N) min(d, cutoff)^order and the rows and columns of their optimal assignment."""
+    cutoff = check_float("cutoff", cutoff, "Give a distance in metres.", above=0.0)
+    width = np.shape(estimates)[1] if np.ndim(estimates) == 2 and np.shape(estimates)[1] == 2 else 3
+    a = check_array("estimates", estimates, (None, width), "Give one position per row.")
+    b = check_array("truths", truths, (None, width), "Give one position per row, as wide as the estimates.")
+    distances = np.sqrt(((a[:, None] - b[None]) ** 2).sum(axis=2))
+    costs = np.minimum(distances, cutoff) ** order
+    rows, columns = linear_sum_assignment(costs)
+    return costs, rows, columns
