@@ -17,3 +17,8 @@ def jit(function: Callable[P, T]) -> Callable[P, T]:
     breaks forked workers.
     """
     return cast(Callable[P, T], numba.njit(cache=True, nogil=True)(function))
+
+
+def inlined(function: Callable[P, T]) -> Callable[P, T]:
+    """Compile a small building block into each kernel that calls it: passing arrays costs more than its arithmetic."""
+    return cast(Callable[P, T], numba.njit(cache=True, nogil=True, forceinline=True)(function))

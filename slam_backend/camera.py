@@ -61,7 +61,7 @@ class StereoCamera:
         return np.asarray((points - np.asarray(self.mount)) @ ROBOT_FROM_CAMERA)
 
     def project(self, points: FloatArray) -> FloatArray:
-        """Return (u, v, disparity) [px] (..., 3) of points (..., 3) [m] in the camera frame, u and v from the centre."""
+        """Return (u, v, disparity) (..., 3) [px] of points (..., 3) [m], camera frame; u, v from the image centre."""
         x, y, z = points[..., 0], points[..., 1], points[..., 2]
         return np.stack([x, y, np.full_like(z, self.baseline)], axis=-1) * (self.focal_px / z)[..., None]
 

@@ -25,7 +25,8 @@ def bad_argument(name: str, expected: str, got: object, cure: str) -> ValueError
     >>> print(bad_argument("num_particles", "an int >= 1", 0, "Use at least one particle."))
     num_particles: expected an int >= 1, got 0. Use at least one particle.
     """
-    text = got if isinstance(got, str) and got.startswith(("shape ", "an array ", "a ", "'", "no ", "NaN")) else repr(got)
+    described = isinstance(got, str) and got.startswith(("shape ", "an array ", "a ", "'", "no ", "NaN"))
+    text = str(got) if described else repr(got)
     if len(text) > 80:
         text = text[:77] + "..."
     return ValueError(f"{name}: expected {expected}, got {text}. {cure}")

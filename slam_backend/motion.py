@@ -27,8 +27,8 @@ class OdometryModel:
     sigma_across: float = 0.02
     sigma_heading: float = np.pi / 90.0
     sigma_turn: float = 0.02
-    floor_position: float = 1e-3
-    floor_heading: float = 1e-3
+    floor_position: float = 3e-4
+    floor_heading: float = 3e-4
 
     def __post_init__(self) -> None:
         for name in ("sigma_along", "sigma_across", "sigma_heading", "sigma_turn", "floor_position", "floor_heading"):

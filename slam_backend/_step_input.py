@@ -1,0 +1,74 @@
+"""The readings of one step, checked before anything is changed, so that a refused step leaves no trace."""
+
+from typing import Any
+
+import numpy as np
+
+from slam_backend import _kernels
+from slam_backend.errors import FloatArray, IntArray, bad_argument, check_array
+from slam_backend.measurements import Measurements
+
+
+def check_step(
+    k: int, size: int, odometry: Any, measurements: Any, identities: Any, poses: Any
+) -> tuple[list[FloatArray | None], list[Measurements | None], list[IntArray | None], list[FloatArray | None]]:
+    """Return the arguments of `FastSlam.step` for k robots as lists of checked arrays.
+
+    Args:
+        k: Number of robots.
+        size: Length of the map's descriptors, 0 if there are none yet.
+        odometry, measurements, identities, poses: As in `FastSlam.step`.
+
+    Raises:
+        ValueError: If one is ill-formed; the text names it.
+    """
+    none = [None] * k
+    for name, value in (
+        ("odometry", odometry), ("measurements", measurements), ("identities", identities), ("poses", poses)
+    ):
+        if value is None and name in ("identities", "poses"):
+            continue
+        if isinstance(value, Measurements) or not hasattr(value, "__len__") or len(value) != k:
+            got = f"a sequence of {len(value)}" if hasattr(value, "__len__") else repr(value)
+            raise bad_argument(name, f"a sequence with one entry per robot ({k})", got, "Use None for no reading.")
+    identities = none if identities is None else identities
+    poses = none if poses is None else poses
+    moves: list[FloatArray | None] = []
+    names: list[IntArray | None] = []
+    exact: list[FloatArray | None] = []
+    for robot in range(k):
+        move, frame, identity, pose = odometry[robot], measurements[robot], identities[robot], poses[robot]
+        cure = "Give the motion (dx, dy, dtheta) in the previous robot frame, or None."
+        moves.append(None if move is None else check_array(f"odometry[{robot}]", move, (3,), cure))
+        if frame is not None:
+            if not isinstance(frame, Measurements):
+                raise bad_argument(f"measurements[{robot}]", "Measurements or None", frame, "Wrap the arrays.")
+            if len(frame):
+                size = _check_frame(robot, frame, size)
+        if identity is not None:
+            wanted = (0 if frame is None else len(frame),)
+            identity = check_array(f"identities[{robot}]", identity, wanted, "Name each measurement.", dtype=np.int64)
+        names.append(identity)
+        cure = "Give (x, y, theta) in the robot's own start frame, or None."
+        exact.append(None if pose is None else check_array(f"poses[{robot}]", pose, (3,), cure))
+    return moves, list(measurements), names, exact
+
+
+def _check_frame(robot: int, frame: Measurements, size: int) -> int:
+    """Check one frame against the map's descriptor size (0 = any) and the camera model; return its descriptor size."""
+    if size not in (0, frame.descriptors.shape[1]):
+        raise bad_argument(
+            f"measurements[{robot}].descriptors",
+            f"vectors of size {size} as in the map",
+            f"shape {frame.descriptors.shape}",
+            "Use one kind of descriptor throughout a run.",
+        )
+    nearest = float(frame.points[:, 2].min())
+    if frame.covariances is None and nearest < _kernels.MIN_DEPTH:
+        raise bad_argument(
+            f"measurements[{robot}].points",
+            f"depths Z >= {_kernels.MIN_DEPTH} m",
+            nearest,
+            "Drop points at or behind the camera, or give covariances.",
+        )
+    return int(frame.descriptors.shape[1])

@@ -1,0 +1,65 @@
+"""What a `FastSlam` assumes and how it decides: one frozen, validated record."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from slam_backend.camera import StereoCamera
+from slam_backend.errors import bad_argument, check_choice, check_float, check_int
+from slam_backend.motion import OdometryModel
+from slam_backend.resampling import RESAMPLING
+
+PROPOSALS = ("fastslam2", "fastslam1")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FilterOptions:
+    """What a `FastSlam` assumes and how it decides; the arguments of `FastSlam` without the number of robots and seed.
+
+    Attributes:
+        num_particles: M.
+        camera: Assumed camera and its noise.
+        motion: Assumed noise of the odometry.
+        proposal: "fastslam2": the measurements shape the sampled pose. "fastslam1": poses are sampled from the motion
+            model alone and association follows Algorithm 1 to the letter (as corrected).
+        resampling: Scheme, a key of `slam_backend.resampling.RESAMPLING`.
+        resample_threshold: Resample when ESS / M falls below this; 1 = at every step with a measurement.
+        position_gate: D0, largest squared Mahalanobis distance of a match [-] (11.34: 99 % at 3 degrees of freedom).
+        descriptor_gate: Square root of E0, largest L2 distance between matched descriptors [-].
+        dead_zone: Measurements whose nearest candidate lies between `position_gate` and this are neither matched nor
+            new (`fastslam2`) [-].
+        descriptor_sigma: L2 distance between descriptors that costs a match as much as one sigma of position
+            (`fastslam2`) [-].
+        ambiguity: A runner-up whose cost (squared Mahalanobis + log-determinant + descriptor) is nearer than this
+            makes a measurement ambiguous, and it is held back (`fastslam2`) [-].
+        new_landmark_density: p0, density of measurements that match nothing [1/m^3].
+        one_to_one: Match a landmark at most once in a frame (`fastslam2` always does).
+    """
+
+    num_particles: int = 100
+    camera: StereoCamera = field(default_factory=StereoCamera)
+    motion: OdometryModel = field(default_factory=OdometryModel)
+    proposal: Literal["fastslam2", "fastslam1"] = "fastslam2"
+    resampling: str = "systematic"
+    resample_threshold: float = 0.5
+    position_gate: float = 11.34
+    descriptor_gate: float = 0.45
+    dead_zone: float = 25.0
+    descriptor_sigma: float = 0.1
+    ambiguity: float = 6.0
+    new_landmark_density: float = 0.01
+    one_to_one: bool = True
+
+    def __post_init__(self) -> None:
+        check_int("num_particles", self.num_particles, 1, "Use at least one particle; 100 is a good start.")
+        for name, kind in (("camera", StereoCamera), ("motion", OdometryModel)):
+            if not isinstance(getattr(self, name), kind):
+                raise bad_argument(name, f"a {kind.__name__}", getattr(self, name), f"Build one: {kind.__name__}(...).")
+        check_choice("proposal", self.proposal, PROPOSALS)
+        check_choice("resampling", self.resampling, tuple(RESAMPLING))
+        check_float("resample_threshold", self.resample_threshold, "Give a share of M.", at_least=0.0, at_most=1.0)
+        for name in ("position_gate", "descriptor_gate", "descriptor_sigma", "new_landmark_density"):
+            check_float(name, getattr(self, name), "Give a positive number.", above=0.0)
+        check_float("dead_zone", self.dead_zone, "It starts where the gate ends.", at_least=self.position_gate)
+        check_float("ambiguity", self.ambiguity, "Use 0 to hold nothing back.", at_least=0.0)
+        if not isinstance(self.one_to_one, bool):
+            raise bad_argument("one_to_one", "a bool", self.one_to_one, "Say True or False.")

@@ -1,0 +1,63 @@
+"""Resampling schemes: normalised weights in, ancestor indices out; gathering is a separate step.
+
+Every scheme is unbiased: particle m is drawn M w_m times on average. They differ in variance.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from slam_backend.errors import FloatArray, IntArray
+
+
+def effective_sample_size(weights: FloatArray) -> float:
+    """Return 1 / sum w^2 of weights (M,) that sum to 1, in [1, M].
+
+    >>> effective_sample_size(np.array([0.5, 0.5, 0.0]))
+    2.0
+    """
+    return float(1.0 / np.sum(weights * weights))
+
+
+def _invert(weights: FloatArray, uniforms: FloatArray) -> IntArray:
+    """Return the ancestors of sorted or unsorted `uniforms` in [0, 1) under the weights' distribution function."""
+    edges = np.cumsum(weights)
+    edges /= edges[-1]
+    return np.minimum(np.searchsorted(edges, uniforms, side="right"), len(weights) - 1).astype(np.int64)
+
+
+def systematic(weights: FloatArray, rng: np.random.Generator, count: int | None = None) -> IntArray:
+    """Draw with one uniform shared by all strata."""
+    count = len(weights) if count is None else count
+    return _invert(weights, (np.arange(count) + rng.random()) / count)
+
+
+def stratified(weights: FloatArray, rng: np.random.Generator, count: int | None = None) -> IntArray:
+    """Draw with one uniform per stratum."""
+    count = len(weights) if count is None else count
+    return _invert(weights, (np.arange(count) + rng.random(count)) / count)
+
+
+def multinomial(weights: FloatArray, rng: np.random.Generator, count: int | None = None) -> IntArray:
+    """Draw independently."""
+    return _invert(weights, rng.random(len(weights) if count is None else count))
+
+
+def residual(weights: FloatArray, rng: np.random.Generator, count: int | None = None) -> IntArray:
+    """Keep floor(count w) copies of each, and draw the rest from what remains."""
+    count = len(weights) if count is None else count
+    scaled = count * weights / weights.sum()
+    copies = np.floor(scaled).astype(np.int64)
+    kept = np.repeat(np.arange(len(weights)), copies)
+    missing = count - len(kept)
+    if missing == 0:
+        return kept.astype(np.int64)
+    return np.concatenate([kept, multinomial(scaled - copies, rng, missing)]).astype(np.int64)
+
+
+RESAMPLING: dict[str, Callable[..., IntArray]] = {
+    "systematic": systematic,
+    "stratified": stratified,
+    "multinomial": multinomial,
+    "residual": residual,
+}
