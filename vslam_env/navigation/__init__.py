@@ -1,0 +1,32 @@
+"""What a robot does with the floor it has seen: grid, frontiers, paths. It knows no simulator, no sensor, no reward."""
+
+from vslam_env.navigation.frontiers import CandidateSlots, Frontiers, find_frontiers
+from vslam_env.navigation.planning import DistanceMap, distance_map, follow_path, plan_path
+from vslam_env.navigation.seen_grid import (
+    CELL,
+    FREE,
+    GRID_SIZE,
+    OCCUPIED,
+    UNKNOWN,
+    SeenGrid,
+    cell_of,
+    centre_of,
+)
+
+__all__ = [
+    "CELL",
+    "FREE",
+    "GRID_SIZE",
+    "OCCUPIED",
+    "UNKNOWN",
+    "CandidateSlots",
+    "DistanceMap",
+    "Frontiers",
+    "SeenGrid",
+    "cell_of",
+    "centre_of",
+    "distance_map",
+    "find_frontiers",
+    "follow_path",
+    "plan_path",
+]

@@ -1,0 +1,174 @@
+"""`SeenGrid`: what one robot has seen of the floor, in its own start frame."""
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from slam_backend.errors import FloatArray, IntArray, bad_argument, check_array, check_float
+from vslam_env.navigation import _painting
+from vslam_env.navigation._painting import CELL, FREE, GRID_SIZE, HALF_WIDTH, OCCUPIED, UNKNOWN
+
+__all__ = ["CELL", "FREE", "GRID_SIZE", "OCCUPIED", "UNKNOWN", "SeenGrid", "cell_of", "centre_of"]
+
+
+def cell_of(points: ArrayLike) -> IntArray:
+    """Return the cells in which points lie.
+
+    Args:
+        points: (..., 2) float64 [m], start frame, rows (x, y).
+
+    Returns:
+        (..., 2) int64 rows (row, column), to index `SeenGrid.cells`. Below 0 or at least `GRID_SIZE` for points
+        outside the grid.
+
+    >>> cell_of([0.1, -29.9]).tolist()
+    [0, 150]
+    """
+    points = np.asarray(points, dtype=np.float64)
+    return np.asarray(np.floor((points[..., ::-1] + HALF_WIDTH) / CELL), dtype=np.int64)
+
+
+def centre_of(cells: ArrayLike) -> FloatArray:
+    """Return the centres of cells.
+
+    Args:
+        cells: (..., 2) int64 rows (row, column).
+
+    Returns:
+        (..., 2) float64 [m], start frame, rows (x, y).
+
+    >>> centre_of([0, 150]).round(6).tolist()
+    [0.1, -29.9]
+    """
+    return np.asarray((np.asarray(cells)[..., ::-1] + 0.5) * CELL - HALF_WIDTH, dtype=np.float64)
+
+
+class SeenGrid:
+    """An occupancy grid of 60 x 60 m around a robot's start pose, whatever the world, so that it reveals nothing.
+
+    Each cell counts evidence (hits against passes) between bounds, so that one bad reading neither walls up a door
+    nor opens a wall; `cells` holds the verdict. What lies outside the grid is ignored.
+
+    Attributes:
+        cells: (300, 300) uint8, read-only, indexed [row, column] with row = y upwards and column = x: `UNKNOWN`,
+            `FREE` or `OCCUPIED`. It shares memory with the grid and follows its changes.
+    """
+
+    __slots__ = ("_cells", "_evidence", "_read_only", "cells")
+
+    def __init__(self) -> None:
+        self._adopt(np.zeros((GRID_SIZE, GRID_SIZE), np.int8), np.full((GRID_SIZE, GRID_SIZE), UNKNOWN, np.uint8))
+
+    def _adopt(self, evidence: NDArray[np.int8], cells: NDArray[np.uint8], read_only: bool = False) -> None:
+        self._evidence, self._cells, self._read_only = evidence, cells, read_only
+        self.cells = cells.view()
+        self.cells.flags.writeable = False
+
+    def paint_scan(self, pose: ArrayLike, ranges: ArrayLike, angles: ArrayLike, max_range: float = 8.0) -> None:
+        """Mark what a range scan saw: free before the first surface, occupied on it.
+
+        Args:
+            pose: (3,) float64 [m, m, rad], start frame. Where the robot was.
+            ranges: (n,) float64 [m]. A reading of `max_range` or more saw nothing.
+            angles: (n,) float64 [rad], robot frame. Ascending, n >= 2, spanning less than pi.
+            max_range: [m].
+
+        Raises:
+            ValueError: If the pose is not finite, or ranges or angles are not as described.
+            RuntimeError: If the grid is a read-only view.
+        """
+        x, y, theta = self._pose(pose)
+        ranges = np.ascontiguousarray(ranges, dtype=np.float64)
+        angles = np.ascontiguousarray(angles, dtype=np.float64)
+        if ranges.ndim != 1 or ranges.shape != angles.shape or len(ranges) < 2:
+            raise bad_argument(
+                "ranges",
+                "an array of shape (n,), n >= 2, like angles",
+                f"shape {ranges.shape} with angles {angles.shape}",
+                "Give one range per ray.",
+            )
+        fault = _painting.paint_scan(self._evidence, self._cells, x, y, theta, ranges, angles, float(max_range))
+        if fault == _painting.BAD_RANGES:
+            raise bad_argument("ranges", "distances >= 0 [m]", ranges, "Use max_range where a ray saw nothing.")
+        if fault == _painting.BAD_ANGLES:
+            raise bad_argument(
+                "angles", "ascending angles spanning less than pi [rad]", angles, "Order the rays from right to left."
+            )
+
+    def clear_disc(self, pose: ArrayLike, radius: float = 0.2) -> None:
+        """Mark as free what the body of a robot covers.
+
+        Args:
+            pose: (3,) float64 [m, m, rad], start frame.
+            radius: Of the robot [m]. Occupied cells at its rim stay: they hold the wall that the robot touches.
+        """
+        x, y, _ = self._pose(pose)
+        radius = check_float("radius", radius, "Give the robot's radius in metres.", above=0.0)
+        _painting.paint_disc(self._evidence, self._cells, x, y, radius)
+
+    def bump(self, pose: ArrayLike, radius: float = 0.2) -> None:
+        """Mark the cell just ahead of a robot's rim as occupied: it bumped into something there.
+
+        A bump does not tell its direction, so the mark is no firmer than two hits, and later readings can lift it.
+
+        Args:
+            pose: (3,) float64 [m, m, rad], start frame.
+            radius: Of the robot [m].
+        """
+        x, y, theta = self._pose(pose)
+        ahead = radius + 0.5 * CELL
+        row, col = cell_of([x + ahead * math.cos(theta), y + ahead * math.sin(theta)])
+        if 0 <= row < GRID_SIZE and 0 <= col < GRID_SIZE:
+            self._evidence[row, col] = max(self._evidence[row, col], 2 * _painting.HIT)
+            self._cells[row, col] = OCCUPIED
+
+    def absorb(self, other: "SeenGrid", self_from_other: ArrayLike) -> None:
+        """Add the evidence of another robot's grid.
+
+        Args:
+            other: It stays as it is.
+            self_from_other: (3,) float64 [m, m, rad]. The other's start pose in this robot's start frame.
+        """
+        x, y, theta = self._pose(self_from_other, "self_from_other")
+        _painting.paint_grid(self._evidence, self._cells, other._evidence.copy(), x, y, theta)
+
+    def copy(self) -> "SeenGrid":
+        """Return an independent grid, which can be written to, with the same content."""
+        grid = SeenGrid()
+        grid._adopt(self._evidence.copy(), self._cells.copy())
+        return grid
+
+    def frozen(self) -> "SeenGrid":
+        """Return a view that refuses changes and shares memory with this grid: it follows changes made here."""
+        grid = SeenGrid.__new__(SeenGrid)
+        grid._adopt(self._evidence, self._cells, read_only=True)
+        return grid
+
+    def get_state(self) -> dict[str, Any]:
+        """Return a copy of all that `set_state` needs to continue bit by bit."""
+        return {"evidence": self._evidence.copy()}
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Restore what `get_state` returned, in place: views made by `frozen` follow."""
+        self._refuse_if_read_only()
+        shape = (GRID_SIZE, GRID_SIZE)
+        evidence = check_array("evidence", state["evidence"], shape, "Use what get_state returned.", dtype=np.int8)
+        self._evidence[:] = evidence
+        self._cells[:] = np.where(evidence == 0, UNKNOWN, np.where(evidence > 0, OCCUPIED, FREE))
+
+    def _refuse_if_read_only(self) -> None:
+        if self._read_only:
+            raise RuntimeError("SeenGrid: this is a read-only view. Make a copy() to write to.")
+
+    def _pose(self, pose: ArrayLike, name: str = "pose") -> tuple[float, float, float]:
+        """Return a pose as three finite floats, after making sure that this grid may be written to."""
+        self._refuse_if_read_only()
+        values = np.asarray(pose, dtype=np.float64)
+        if values.shape != (3,):
+            raise bad_argument(name, "an array of shape (3,)", f"shape {values.shape}", "Give (x, y, theta).")
+        x, y, theta = values.tolist()
+        if not math.isfinite(x + y + theta):
+            raise bad_argument(name, "finite numbers", values, "Give (x, y, theta) in metres and radians.")
+        return x, y, theta
