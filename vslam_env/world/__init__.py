@@ -1,0 +1,30 @@
+"""The true world: walls, landmarks, free space, and the simulator that moves robots in it.
+
+A reset goes: `make_world` -> `FreeSpace` -> `place_landmarks` (unless the world has some) -> `draw_starts` or
+`check_starts` -> `Simulator`.
+"""
+
+from vslam_env.world.floorplan import load_floorplan, load_walls_json
+from vslam_env.world.freespace import FreeSpace
+from vslam_env.world.landmarks import LandmarkConfig, place_landmarks
+from vslam_env.world.odometry import OdometryNoise, draw_bias, read_odometry
+from vslam_env.world.registry import WORLD_FAMILIES, WorldSource, make_world
+from vslam_env.world.simulator import Simulator
+from vslam_env.world.spec import Landmarks, World
+
+__all__ = [
+    "WORLD_FAMILIES",
+    "FreeSpace",
+    "LandmarkConfig",
+    "Landmarks",
+    "OdometryNoise",
+    "Simulator",
+    "World",
+    "WorldSource",
+    "draw_bias",
+    "load_floorplan",
+    "load_walls_json",
+    "make_world",
+    "place_landmarks",
+    "read_odometry",
+]

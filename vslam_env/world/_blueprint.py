@@ -1,0 +1,162 @@
+"""Drawing a building: rooms, walls with doors in them, and furniture that leaves the ways free."""
+
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import numpy as np
+
+from slam_backend.errors import FloatArray
+
+DOOR = (1.1, 1.4)  # [m] least and greatest width
+JAMB = 0.35  # [m] wall left between a door and the end of its wall
+DOOR_CLEARANCE = 1.1  # [m] nothing stands closer than this to the middle of a door
+PASSAGE = 0.75  # [m] left free around things that stand in a room
+PILASTER = (0.25, 0.35)  # [m] how far one juts into a corridor
+
+Segment = tuple[float, float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Room:
+    """A rectangle from (x0, y0) to (x1, y1) [m]."""
+
+    x0: float
+    y0: float
+    x1: float
+    y1: float
+
+    @property
+    def size(self) -> tuple[float, float]:
+        """Width and height [m]."""
+        return self.x1 - self.x0, self.y1 - self.y0
+
+    def halves(self) -> tuple["Room", "Room"]:
+        """Cut the longer side in two and leave a passage between the halves."""
+        width, height = self.size
+        if width >= height:
+            x = 0.5 * (self.x0 + self.x1)
+            gap = 0.5 * PASSAGE
+            return Room(self.x0, self.y0, x - gap, self.y1), Room(x + gap, self.y0, self.x1, self.y1)
+        y = 0.5 * (self.y0 + self.y1)
+        gap = 0.5 * PASSAGE
+        return Room(self.x0, self.y0, self.x1, y - gap), Room(self.x0, y + gap, self.x1, self.y1)
+
+
+@dataclass(slots=True)
+class Blueprint:
+    """A plan under the pencil.
+
+    Attributes:
+        rng: Source of all draws.
+        segments: Walls drawn so far [m].
+        doors: Middles (x, y) of the doors so far [m].
+    """
+
+    rng: np.random.Generator
+    segments: list[Segment] = field(default_factory=list)
+    doors: list[tuple[float, float]] = field(default_factory=list)
+
+    def wall(self, x0: float, y0: float, x1: float, y1: float, spans: tuple[tuple[float, float], ...] = ()) -> None:
+        """Draw a wall along an axis, with a door somewhere in each of `spans` (from, to), coordinates along it [m]."""
+        upright = x0 == x1
+        begin, end = (y0, y1) if upright else (x0, x1)
+        cuts = [begin]
+        for low, high in sorted(spans):
+            width = self.rng.uniform(*DOOR)
+            middle = self.rng.uniform(low + JAMB + 0.5 * width, high - JAMB - 0.5 * width)
+            cuts += [middle - 0.5 * width, middle + 0.5 * width]
+            self.doors.append((x0, middle) if upright else (middle, y0))
+        cuts.append(end)
+        for a, b in zip(cuts[0::2], cuts[1::2], strict=True):
+            self.segments.append((x0, a, x0, b) if upright else (a, y0, b, y0))
+
+    def split(self, begin: float, end: float, parts: int) -> list[float]:
+        """Draw where to cut [begin, end] into parts of similar length; return all their ends."""
+        shares = self.rng.uniform(0.75, 1.25, parts)
+        return [begin, *(begin + (end - begin) * np.cumsum(shares)[:-1] / shares.sum()).tolist(), end]
+
+    def pilasters(self, begin: float, end: float, low: float, high: float) -> None:
+        """Let columns jut out alternately from the walls y = `low` and y = `high` of a corridor [m].
+
+        Seen along a corridor its walls are too oblique to show anything; the columns face the traveller.
+        """
+        x = begin + self.rng.uniform(1.0, 3.0)
+        upper = self.rng.random() < 0.5
+        while x < end - 0.5:
+            y, inward = (high, -1.0) if upper else (low, 1.0)
+            if self._clear_of_doors(x, y, x, y):
+                self.segments.append((x, y, x, y + inward * self.rng.uniform(*PILASTER)))
+                upper = not upper
+                x += self.rng.uniform(2.5, 4.0)
+            x += 0.4
+
+    def furnish(self, room: Room) -> None:
+        """Put something into a room, or into both halves of a large one."""
+        width, height = room.size
+        parts = room.halves() if max(width, height) > 4.5 else (room,)
+        for part in parts:
+            thing = (self._screen, self._cabinet, self._table)[self.rng.choice(3, p=(0.45, 0.25, 0.3))]
+            for _ in range(8):
+                segments = thing(room, part)
+                if segments and self._clear(segments):
+                    self.segments += segments
+                    break
+
+    def _screen(self, room: Room, part: Room) -> list[Segment]:
+        """Draw a screen that juts out from a wall of the room, deep enough to hide what is behind."""
+        upright = room.size[0] >= room.size[1]
+        depth = room.size[1] if upright else room.size[0]
+        length = min(self.rng.uniform(0.3, 0.55) * depth, depth - 1.4)
+        from_far = self.rng.random() < 0.5
+        if upright:
+            x = self.rng.uniform(part.x0 + PASSAGE, max(part.x0 + PASSAGE, part.x1 - PASSAGE))
+            return [(x, room.y1, x, room.y1 - length) if from_far else (x, room.y0, x, room.y0 + length)]
+        y = self.rng.uniform(part.y0 + PASSAGE, max(part.y0 + PASSAGE, part.y1 - PASSAGE))
+        return [(room.x1, y, room.x1 - length, y) if from_far else (room.x0, y, room.x0 + length, y)]
+
+    def _cabinet(self, room: Room, part: Room) -> list[Segment]:
+        """Draw a cabinet against the upper or lower wall of the room: three sides of a box."""
+        width, depth = self.rng.uniform(1.0, 1.6), self.rng.uniform(0.4, 0.6)
+        if part.x1 - part.x0 < width + 2.0 * PASSAGE or room.size[1] < depth + 1.4:
+            return []
+        x = self.rng.uniform(part.x0 + PASSAGE, part.x1 - PASSAGE - width)
+        y, inward = (room.y1, -depth) if self.rng.random() < 0.5 else (room.y0, depth)
+        return _chain([(x, y), (x, y + inward), (x + width, y + inward), (x + width, y)])
+
+    def _table(self, room: Room, part: Room) -> list[Segment]:
+        """Draw a table, or a column, that stands free."""
+        if self.rng.random() < 0.3:
+            width = height = self.rng.uniform(0.35, 0.5)
+        else:
+            width, height = self.rng.uniform(1.2, 1.8), self.rng.uniform(0.7, 0.9)
+        if part.size[1] > part.size[0]:
+            width, height = height, width
+        free_x, free_y = part.size[0] - width - 2.0 * PASSAGE, part.size[1] - height - 2.0 * PASSAGE
+        if min(free_x, free_y) < 0.0:
+            return []
+        x, y = part.x0 + PASSAGE + self.rng.uniform(0.0, free_x), part.y0 + PASSAGE + self.rng.uniform(0.0, free_y)
+        return _chain([(x, y), (x + width, y), (x + width, y + height), (x, y + height), (x, y)])
+
+    def _clear(self, segments: list[Segment]) -> bool:
+        """Tell whether a thing leaves all doors free."""
+        box = np.array(segments).reshape(-1, 2)
+        return self._clear_of_doors(*box.min(axis=0).tolist(), *box.max(axis=0).tolist())
+
+    def _clear_of_doors(self, x0: float, y0: float, x1: float, y1: float) -> bool:
+        """Tell whether no door's middle is close to a box."""
+        return all(
+            np.hypot(max(x0 - x, 0.0, x - x1), max(y0 - y, 0.0, y - y1)) > DOOR_CLEARANCE for x, y in self.doors
+        )
+
+    def finished(self) -> FloatArray:
+        """Return the walls (S, 4) [m], perhaps mirrored."""
+        walls = np.array(self.segments)
+        for axes in ([0, 2], [1, 3]):
+            if self.rng.random() < 0.5:
+                walls[:, axes] = walls[:, axes].max() - walls[:, axes]
+        return walls
+
+
+def _chain(corners: list[tuple[float, float]]) -> list[Segment]:
+    """Return the segments that join corners one after the other."""
+    return [(*a, *b) for a, b in pairwise(corners)]

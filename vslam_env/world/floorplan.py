@@ -1,0 +1,130 @@
+"""A floor plan, drawn as an image or written as JSON, becomes a `World`."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from slam_backend.errors import FloatArray, bad_argument, check_float
+from vslam_env.world.spec import World
+
+BRIGHT_SHARE = 0.85  # light grey 195 over mid grey 128, white over black, 254 over the 205 of "unknown" in ROS maps
+COLOURED = 60  # levels between the strongest and the weakest colour of a marker such as a yellow start cell
+UPSAMPLING = 3
+
+
+def load_floorplan(
+    path: str | Path, metres_per_pixel: float = 0.045, tolerance_px: float = 1.0, robot_radius: float = 0.2
+) -> World:
+    """Trace the walls of a floor plan.
+
+    Free space is what is at least 85 % as bright as the brightest grey of the plan, and what is coloured; all else is
+    wall. The part that holds the coloured cell is kept, or else the largest one; its outline and those of its holes
+    become walls. The world's origin is the image's lower left corner, y upwards.
+
+    Args:
+        path: PNG, JPEG, PGM or any other format that OpenCV reads.
+        metres_per_pixel: By default 0.045, which makes the corridors of 640 x 480 dungeon plans (32 px) 1.4 m wide, and
+            the farthest two places of any (665 px) 30 m apart: a robot's 60 x 60 m grid holds all of it from any start.
+        tolerance_px: Outlines are straightened where they deviate less than this from a line [px].
+        robot_radius: A plan in which no such disc fits is refused [m].
+
+    Raises:
+        ValueError: If the file is missing or no image, or shows no free space that is large enough.
+    """
+    metres_per_pixel = check_float("metres_per_pixel", metres_per_pixel, "Give the side of a pixel.", above=0.0)
+    tolerance_px = check_float("tolerance_px", tolerance_px, "Give pixels.", at_least=0.0)
+    path = _existing(path)
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    if image is None:
+        raise bad_argument("world", "an image that OpenCV can read", str(path), "Save the plan as PNG.")
+    free = _free_part(image, str(path))
+    widest = 2.0 * metres_per_pixel * float(cv2.distanceTransform(np.pad(free, 1), cv2.DIST_L2, 5).max())
+    if widest < 2.5 * robot_radius:
+        raise bad_argument(
+            "world",
+            f"free space for robots of radius {robot_radius:g} m",
+            f"a widest place of {widest:.2f} m in {path}",
+            "Raise metres_per_pixel or draw wider rooms.",
+        )
+    outlines = _outlines(free, tolerance_px)
+    segments = np.vstack([np.hstack([line, np.roll(line, -1, axis=0)]) for line in outlines])
+    flip = np.array([1.0, -1.0, 1.0, -1.0])
+    height = np.array([0.0, free.shape[0], 0.0, free.shape[0]])
+    return World(path.stem, metres_per_pixel * (height + flip * segments))
+
+
+def load_walls_json(path: str | Path) -> World:
+    """Read `{"walls": [[x1, y1, x2, y2], ...], "start_poses": [[x, y, theta], ...]}`, in metres and radians.
+
+    Raises:
+        ValueError: If the file is missing, no JSON, or has other keys; `start_poses` and `name` may be left out.
+    """
+    path = _existing(path)
+    cure = 'Write {"walls": [[x1, y1, x2, y2], ...]}, in metres; "start_poses" and "name" are optional.'
+    try:
+        content: Any = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise bad_argument("world", "a JSON file", f"a syntax error in {path}: {error}", cure) from error
+    known = {"walls", "start_poses", "name"}
+    if not isinstance(content, dict) or "walls" not in content or not set(content) <= known:
+        keys = sorted(content) if isinstance(content, dict) else content
+        raise bad_argument("world", "an object with the key 'walls'", keys, cure)
+    return World(content.get("name", path.stem), content["walls"], start_poses=content.get("start_poses"))
+
+
+def _existing(path: str | Path) -> Path:
+    """Return the path of a file that is there."""
+    path = Path(path)
+    if not path.is_file():
+        raise bad_argument("world", "a file", str(path), "Check the path: there is no such file.")
+    return path
+
+
+def _free_part(image: Any, path: str) -> Any:
+    """Return the free part (H, W) uint8, 1 = free, of an image (H, W, 3) uint8."""
+    coloured = image.max(axis=2).astype(np.int16) - image.min(axis=2) > COLOURED
+    grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    levels = grey[~coloured]
+    brightest = float(levels.max()) if levels.size else 0.0
+    if not levels.size or levels.min() >= BRIGHT_SHARE * brightest:
+        raise bad_argument(
+            "world",
+            "a plan with free space lighter than its walls",
+            f"no free space to tell from walls in {path}",
+            "Draw free space white and walls black.",
+        )
+    free = ((grey >= BRIGHT_SHARE * brightest) | coloured).astype(np.uint8)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(free, connectivity=4)
+    marked = np.bincount(labels[coloured & (free > 0)], minlength=count)
+    sizes = stats[:, cv2.CC_STAT_AREA].astype(np.int64)
+    sizes[0] = marked[0] = 0
+    part = int(np.argmax(marked if marked.any() else sizes))
+    return (labels == part).astype(np.uint8)
+
+
+def _outlines(free: Any, tolerance_px: float) -> list[FloatArray]:
+    """Return the closed outlines [(n, 2) px, x right and y down] of a mask (H, W), along pixel edges.
+
+    OpenCV traces pixel centres. In a mask enlarged threefold these are nearest to the corners of the original pixels,
+    so rounding gives the exact edges.
+    """
+    enlarged = np.kron(np.pad(free, 1), np.ones((UPSAMPLING, UPSAMPLING), dtype=np.uint8))
+    contours, _ = cv2.findContours(enlarged, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
+    outlines = []
+    for contour in contours:
+        corners = np.rint((contour[:, 0].astype(np.float64) + 0.5) / UPSAMPLING).astype(np.int32) - 1
+        corners = _without_flat_corners(corners[np.any(corners != np.roll(corners, 1, axis=0), axis=1)])
+        straight = cv2.approxPolyDP(corners[:, None], tolerance_px, closed=True)[:, 0]
+        straight = _without_flat_corners(straight)
+        if len(straight) >= 3:
+            outlines.append(straight.astype(np.float64))
+    return outlines
+
+
+def _without_flat_corners(corners: Any) -> Any:
+    """Drop the corners (n, 2) of a closed outline at which it goes straight on."""
+    before, after = corners - np.roll(corners, 1, axis=0), np.roll(corners, -1, axis=0) - corners
+    return corners[before[:, 0] * after[:, 1] != before[:, 1] * after[:, 0]]

@@ -1,0 +1,239 @@
+"""Where robots fit in a world, what they can reach, which landmarks they could ever see, and where they start."""
+
+from typing import Any
+
+import cv2
+import numpy as np
+
+from slam_backend.camera import StereoCamera
+from slam_backend.errors import BoolArray, FloatArray, bad_argument, check_array, check_float, check_int
+from slam_backend.geometry import wrap_angle
+from vslam_env.world.spec import Landmarks, World
+from vslam_env.world.visibility import (
+    cast_scans,
+    clearance_raster,
+    distances_to_walls,
+    seen_from_somewhere,
+    view_limits,
+    visible_landmarks,
+)
+
+CELL = 0.1  # [m] side of a raster cell
+AREA_STEP = 2  # free area is counted in squares of 2 x 2 raster cells
+VIEW_AHEAD = 1.5  # [m] a robot should not start with its nose at a wall
+MAX_INCIDENCE = np.radians(60.0)
+
+
+class FreeSpace:
+    """The part of a world that robots can reach, on a raster of 0.1 m.
+
+    The part is the one that holds the world's start poses, or else the largest that walls enclose. A cell counts as
+    reachable if the robot's disc fits wherever in the cell its centre stands.
+
+    Attributes:
+        world: The world it was made from.
+        radius: Of the robots' discs [m].
+        origin: (2,) float64 [m], world frame. Lower left corner of cell (0, 0).
+        reachable: (H, W) bool, row = y upwards. Cells in which a robot's centre can be.
+        open_space: (H, W) bool. Cells joined to these through which sight passes, if no disc.
+        free_area_cells: (n, 2) float64 [m], world frame. Centres of the 0.2 m squares that no wall touches, in the
+            open space: the area that robots can explore.
+
+    Raises:
+        ValueError: If the walls enclose no space in which a robot fits.
+    """
+
+    def __init__(self, world: World, radius: float = 0.2) -> None:
+        self.world = world
+        self.radius = check_float("robot_radius", radius, "Give the radius of a robot in metres.", above=0.0)
+        x_min, y_min, x_max, y_max = world.bounds
+        padding = 3 * CELL
+        self.origin = np.array([x_min - padding, y_min - padding])
+        rows, columns = (int(np.ceil((span + 2 * padding) / CELL)) for span in (y_max - y_min, x_max - x_min))
+        half_diagonal = 0.5 * np.sqrt(2.0) * CELL
+        margin = radius + half_diagonal
+        clearance = clearance_raster(world.walls, self.origin, CELL, rows, columns, margin + CELL)
+        # Cells farther than half a cell from any wall: no step between two neighbours of one edge crosses a wall.
+        labels = _label(clearance > 0.5 * CELL + 1e-6)
+        fits = _label(clearance >= margin)
+        outside = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
+        fits[np.isin(labels, outside)] = 0
+        if not fits.any():
+            raise bad_argument(
+                "world",
+                f"walls that enclose a space in which a disc of radius {radius:g} m fits",
+                f"no such space in {world.name!r}",
+                "Close the outer walls, widen the rooms, or check that the unit is metres.",
+            )
+        self.reachable: BoolArray = fits == self._main_part(fits)
+        self.open_space: BoolArray = labels == labels[self.reachable][0]
+        squares = np.zeros_like(self.open_space)
+        squares[AREA_STEP // 2 :: AREA_STEP, AREA_STEP // 2 :: AREA_STEP] = True
+        self.free_area_cells: FloatArray = self._centres(squares & self.open_space & (clearance > 0.5 * AREA_STEP * CELL))
+
+    def _main_part(self, fits: Any) -> int:
+        """Return the label of the part with the world's first start pose, or else of the largest part."""
+        if self.world.start_poses is not None and len(self.world.start_poses):
+            distances = np.linalg.norm(self._centres(fits > 0) - self.world.start_poses[0, :2], axis=1)
+            return int(fits[fits > 0][np.argmin(distances)])
+        return int(np.argmax(np.bincount(fits[fits > 0])))
+
+    def _centres(self, mask: BoolArray) -> FloatArray:
+        """Return the centres (n, 2) [m], world frame, of the cells of a mask (H, W)."""
+        rows, columns = np.nonzero(mask)
+        return self.origin + CELL * (np.stack([columns, rows], axis=1) + 0.5)
+
+    def contains(self, points: FloatArray) -> BoolArray:
+        """Tell which points (n, 2) [m], world frame, lie in the open space."""
+        columns, rows = np.floor((np.asarray(points) - self.origin) / CELL).astype(np.int64).T
+        height, width = self.open_space.shape
+        inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
+        return np.asarray(inside & self.open_space[rows.clip(0, height - 1), columns.clip(0, width - 1)])
+
+    def visible_landmarks(
+        self, landmarks: Landmarks, camera: StereoCamera, max_incidence: float = MAX_INCIDENCE
+    ) -> BoolArray:
+        """Tell which landmarks some robot can see from a reachable place, whatever its heading.
+
+        Args:
+            landmarks: Of the world.
+            camera: Its range, height and vertical field of view count.
+            max_incidence: Largest angle between a face's normal and the line of sight [rad].
+
+        Returns:
+            (N,) bool. The count of True is the N of the map error.
+        """
+        return seen_from_somewhere(
+            landmarks.positions,
+            landmarks.normals,
+            landmarks.walls,
+            self.world.walls,
+            self.reachable,
+            self.origin,
+            CELL,
+            camera.mount[2],
+            view_limits(camera, max_incidence),
+        )
+
+    def draw_starts(
+        self,
+        num_robots: int,
+        rng: np.random.Generator,
+        min_distance: float = 5.0,
+        no_shared_view: StereoCamera | None = None,
+        landmarks: Landmarks | None = None,
+        max_incidence: float = MAX_INCIDENCE,
+    ) -> FloatArray:
+        """Draw start poses from which the robots can reach one another, far apart and looking at different things.
+
+        Args:
+            num_robots: How many (K).
+            rng: Source of the draws.
+            min_distance: Between any two robots [m].
+            no_shared_view: The camera; no landmark is then seen by two robots at their starts. None: views may
+                overlap.
+            landmarks: What the cameras see; by default those of the world, if it has any.
+            max_incidence: As in `visible_landmarks` [rad].
+
+        Returns:
+            (K, 3) float64 [m, m, rad], world frame.
+
+        Raises:
+            ValueError: If 30 rounds of 100 draws a robot find none.
+        """
+        num_robots = check_int("num_robots", num_robots, 1, "Use at least one robot.")
+        min_distance = check_float("min_distance", min_distance, "Give metres.", at_least=0.0)
+        landmarks = self.world.landmarks if landmarks is None else landmarks
+        centres = self._centres(self.reachable)
+        apart = max(min_distance, 2.0 * self.radius)
+        for _ in range(30):
+            starts = np.empty((0, 3))
+            taken = np.zeros(0 if landmarks is None else len(landmarks), dtype=np.bool_)
+            for _ in range(100):
+                position = centres[rng.integers(len(centres))] + rng.uniform(-0.5 * CELL, 0.5 * CELL, 2)
+                if len(starts) and np.linalg.norm(starts[:, :2] - position, axis=1).min() < apart:
+                    continue
+                pose = np.array([*position, self._draw_heading(position, rng)])
+                if landmarks is not None and no_shared_view is not None:
+                    view = view_limits(no_shared_view, max_incidence)
+                    seen = visible_landmarks(
+                        pose[None],
+                        landmarks.positions,
+                        landmarks.normals,
+                        landmarks.walls,
+                        self.world.walls,
+                        self.radius,
+                        np.asarray(no_shared_view.mount),
+                        view,
+                    )[0]
+                    if np.any(seen & taken):
+                        continue
+                    taken |= seen
+                starts = np.vstack([starts, pose])
+                if len(starts) == num_robots:
+                    return starts
+        unshared = " with no shared view" if no_shared_view is not None else ""
+        raise bad_argument(
+            "num_robots",
+            f"as many as can start {min_distance:g} m apart{unshared} in {self.world.name!r}",
+            num_robots,
+            "Use fewer robots, a smaller distance between starts, starts that may share a view, or a larger world.",
+        )
+
+    def _draw_heading(self, position: FloatArray, rng: np.random.Generator) -> float:
+        """Draw a heading [rad] with some free way ahead, or, after a few draws, any."""
+        headings = rng.uniform(-np.pi, np.pi, 8)
+        walls = self.world.walls
+        free = [cast_scans(np.array([[*position, h]]), np.zeros(1), walls, 0.0, VIEW_AHEAD)[0, 0] for h in headings]
+        return float(headings[int(np.argmax(np.array(free) >= VIEW_AHEAD))])
+
+    def check_starts(self, start_poses: Any, num_robots: int | None = None) -> FloatArray:
+        """Return start poses as (K, 3) float64 [m, m, rad], theta in [-pi, pi), after a check that robots can stand there.
+
+        Args:
+            start_poses: (K, 3) [m, m, rad], world frame.
+            num_robots: K, if it is given by something else.
+
+        Raises:
+            ValueError: If a shape is wrong, or a robot touches a wall, is cut off from the reachable space, or
+                overlaps another. The message names the robot.
+        """
+        cure = "Give one row x y theta, in metres and radians, for each robot."
+        starts = check_array("start_poses", start_poses, (num_robots, 3), cure)
+        starts[:, 2] = wrap_angle(starts[:, 2])
+        gaps = distances_to_walls(starts[:, :2], self.world.walls)
+        near = self._near_reachable(starts[:, :2])
+        for robot, (gap, inside) in enumerate(zip(gaps, near, strict=True)):
+            name = f"start_poses[{robot}]"
+            if not inside:
+                raise bad_argument(
+                    name, "a place that robots can reach", starts[robot].tolist(), "Move the robot inside the walls."
+                )
+            if gap < self.radius:
+                raise bad_argument(
+                    name,
+                    f"a place at least {self.radius:g} m (the robot's radius) from any wall",
+                    f"a distance of {gap:.3f} m",
+                    "Move the robot away from the wall.",
+                )
+            others = np.linalg.norm(starts[:robot, :2] - starts[robot, :2], axis=1)
+            if robot and others.min() < 2.0 * self.radius:
+                raise bad_argument(
+                    name,
+                    f"a place at least {2 * self.radius:g} m from the other robots",
+                    f"a distance of {others.min():.3f} m to robot {int(np.argmin(others))}",
+                    "Move the robots apart.",
+                )
+        return starts
+
+    def _near_reachable(self, points: FloatArray) -> BoolArray:
+        """Tell which points (n, 2) [m] lie in the open space within two cells of a reachable cell."""
+        grown = cv2.dilate(self.reachable.astype(np.uint8), np.ones((5, 5), dtype=np.uint8)) > 0
+        columns, rows = np.floor((points - self.origin) / CELL).astype(np.int64).T
+        height, width = grown.shape
+        return np.asarray(self.contains(points) & grown[rows.clip(0, height - 1), columns.clip(0, width - 1)])
+
+
+def _label(mask: BoolArray) -> Any:
+    """Number the parts of a mask that hang together along cell edges: (H, W) int32, 0 where False."""
+    return cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)[1]

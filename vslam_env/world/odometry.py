@@ -1,0 +1,76 @@
+"""True odometry noise: what wheel encoders read of the way that robots really went."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from slam_backend.errors import FloatArray, check_float
+from slam_backend.geometry import between, wrap_angle
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OdometryNoise:
+    """Noise of odometry readings; everything grows with the distance d travelled in a tick.
+
+    Attributes:
+        sigma_distance: Standard deviation of the distance read, as a share of d [m/m].
+        sigma_heading_per_metre: Standard deviation of the turn read [rad/m].
+        bias_distance: Standard deviation of the share by which a robot misreads all distances of an episode [m/m].
+        bias_heading_per_metre: Standard deviation of the turn per metre by which it misreads them [rad/m].
+    """
+
+    sigma_distance: float = 0.05
+    sigma_heading_per_metre: float = float(np.radians(2.0))
+    bias_distance: float = 0.02
+    bias_heading_per_metre: float = float(np.radians(0.5))
+
+    def __post_init__(self) -> None:
+        for name in self.__slots__:
+            check_float(f"odometry.{name}", getattr(self, name), "Give a standard deviation.", at_least=0.0)
+
+
+def draw_bias(noise: OdometryNoise, num_robots: int, rng: np.random.Generator) -> FloatArray:
+    """Draw what each robot misreads throughout an episode.
+
+    Returns:
+        (K, 2) float64. Share of the distance [m/m] and turn per metre [rad/m].
+    """
+    return rng.standard_normal((num_robots, 2)) * (noise.bias_distance, noise.bias_heading_per_metre)
+
+
+def read_odometry(
+    previous_poses: FloatArray,
+    poses: FloatArray,
+    bias: FloatArray,
+    noise: OdometryNoise,
+    rng: np.random.Generator,
+) -> FloatArray:
+    """Read the motion of one tick with the encoders' errors.
+
+    An encoder misjudges how far a wheel rolled, so one factor stretches the reading as a whole, whatever its direction
+    in the robot's frame; the direction itself suffers from the misread turn. A robot at rest reads exactly zero.
+
+    Args:
+        previous_poses: (K, 3) float64 [m, m, rad], world frame. At the last tick.
+        poses: (K, 3) float64 [m, m, rad], world frame. Now.
+        bias: (K, 2) float64, from `draw_bias`.
+        noise: Standard deviations.
+        rng: Source of the draws: 2 K of them, whatever the motion.
+
+    Returns:
+        (K, 3) float64 [m, m, rad], each robot's previous frame: (dx, dy, dtheta).
+    """
+    motion = between(previous_poses, poses)
+    distance = np.hypot(motion[:, 0], motion[:, 1])
+    draws = rng.standard_normal((len(motion), 2))
+    stretch = 1.0 + bias[:, 0] + noise.sigma_distance * draws[:, 0]
+    turn = distance * (bias[:, 1] + noise.sigma_heading_per_metre * draws[:, 1])
+    c, s = np.cos(0.5 * turn), np.sin(0.5 * turn)  # half of the misread turn falls before the middle of the way
+    return np.stack(
+        [
+            stretch * (c * motion[:, 0] - s * motion[:, 1]),
+            stretch * (s * motion[:, 0] + c * motion[:, 1]),
+            wrap_angle(motion[:, 2] + turn),
+        ],
+        axis=1,
+    )

@@ -1,0 +1,65 @@
+"""A name, a path, a `World` or a function becomes a `World`."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from slam_backend.errors import bad_argument
+from vslam_env.world.fig5 import fig5
+from vslam_env.world.floorplan import load_floorplan, load_walls_json
+from vslam_env.world.office import office
+from vslam_env.world.spec import World
+
+WorldMaker = Callable[[np.random.Generator], World]
+WorldSource = str | Path | World | WorldMaker
+
+WORLD_FAMILIES: dict[str, WorldMaker] = {"office": office, "fig5": fig5}
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".pgm")
+
+
+def make_world(world: WorldSource, rng: np.random.Generator) -> World:
+    """Make a world.
+
+    Args:
+        world: A family name (see `WORLD_FAMILIES`); a path of a floor plan (.png, .jpg, .pgm), of a .json file of
+            walls, or of a folder of such files, of which one is drawn; a `World`; or a function of `rng` that returns
+            one.
+        rng: Source of all draws.
+
+    Raises:
+        ValueError: If there is no such family or file, or the function returns something else.
+    """
+    if isinstance(world, World):
+        return world
+    if isinstance(world, str) and world in WORLD_FAMILIES:
+        return WORLD_FAMILIES[world](rng)
+    if isinstance(world, (str, Path)):
+        return _load(Path(world), rng)
+    if callable(world):
+        made = world(rng)
+        if not isinstance(made, World):
+            raise bad_argument("world", "a function that returns a World", made, "Return World(name, walls).")
+        return made
+    raise bad_argument("world", "a name, a path, a World or a function", world, f"Names: {', '.join(WORLD_FAMILIES)}.")
+
+
+def _load(path: Path, rng: np.random.Generator) -> World:
+    """Load the world at a path, or one of a folder's."""
+    if path.is_dir():
+        files = sorted(p for p in path.iterdir() if p.suffix.lower() in (*IMAGE_SUFFIXES, ".json"))
+        if not files:
+            raise bad_argument("world", "a folder with floor plans", str(path), "Put .png, .jpg, .pgm or .json files there.")
+        path = files[int(rng.integers(len(files)))]
+    suffix = path.suffix.lower()
+    if suffix == ".json":
+        return load_walls_json(path)
+    if suffix in IMAGE_SUFFIXES:
+        return load_floorplan(path)
+    names = ", ".join(repr(name) for name in WORLD_FAMILIES)
+    raise bad_argument(
+        "world",
+        f"one of {names}, or a path of an image, a .json file or a folder",
+        str(path),
+        "Check the spelling, or that the file ends in .png, .jpg, .pgm or .json.",
+    )

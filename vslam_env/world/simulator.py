@@ -1,0 +1,147 @@
+"""The one owner of the pymunk space: robots drive as commanded until walls or other robots stop them."""
+
+from typing import Any
+
+import numpy as np
+import pymunk
+
+from slam_backend._jit import jit
+from slam_backend.errors import BoolArray, FloatArray, check_array, check_float
+from vslam_env.world.spec import World
+
+LONGEST_SUBSTEP = 12.5e-3  # [m] no robot moves farther between two looks for contacts
+SKIN = 9e-3  # [m] contacts begin this far outside the robot, so that the robot itself stays out of walls
+SLOP = 1e-3  # [m] depth of contact, inside the skin, that is left alone
+CORRECTION = 0.2  # share of a deeper contact that is undone in each substep
+STANDING_MASS = 1e6  # [kg] a robot with its brakes on is not pushed away by one of 1 kg
+SHORTFALL = 0.01  # share of the commanded way that must be missing for a bump
+
+
+@jit
+def _drive_freely(
+    poses: FloatArray, commands: FloatArray, tick: float, walls: FloatArray, radius: float
+) -> tuple[FloatArray, bool]:
+    """Return where robots (K, 3) that nothing stops end after a tick, and whether surely nothing can stop them.
+
+    A robot goes along the chord of its arc, so that it ends where the arc does.
+    """
+    goals = np.empty_like(poses)
+    reach = np.empty(len(poses))
+    for k in range(len(poses)):
+        turn = commands[k, 1] * tick
+        chord = commands[k, 0] * tick * (np.sin(0.5 * turn) / (0.5 * turn) if turn != 0.0 else 1.0)
+        goals[k, 0] = poses[k, 0] + chord * np.cos(poses[k, 2] + 0.5 * turn)
+        goals[k, 1] = poses[k, 1] + chord * np.sin(poses[k, 2] + 0.5 * turn)
+        goals[k, 2] = (poses[k, 2] + turn + np.pi) % (2.0 * np.pi) - np.pi
+        reach[k] = radius + abs(chord)
+    clear = True
+    for k in range(len(poses)):
+        for i in range(len(walls)):
+            ex, ey = walls[i, 2] - walls[i, 0], walls[i, 3] - walls[i, 1]
+            px, py = poses[k, 0] - walls[i, 0], poses[k, 1] - walls[i, 1]
+            u = min(1.0, max(0.0, (px * ex + py * ey) / (ex * ex + ey * ey)))
+            clear &= (px - u * ex) ** 2 + (py - u * ey) ** 2 > reach[k] ** 2
+        for j in range(k):
+            gap = (poses[k, 0] - poses[j, 0]) ** 2 + (poses[k, 1] - poses[j, 1]) ** 2
+            clear &= gap > (reach[k] + reach[j]) ** 2
+    return goals, clear
+
+
+class Simulator:
+    """A world with robots in it: discs that follow velocity commands, stop at what they hit and slide along it.
+
+    Nothing but the poses outlives a tick, so they are the whole state. Chipmunk remembers the impulses of contacts and
+    the corrections that are due; bodies therefore enter its space only for a tick in which something can touch, and
+    wait outside the walls, where it forgets both, for the rest of the time.
+
+    Attributes:
+        radius: Of the robots [m].
+        tick: Duration of a step [s].
+
+    Raises:
+        ValueError: If a number is out of range or poses are not (K, 3) finite numbers.
+    """
+
+    def __init__(self, world: World, start_poses: FloatArray, radius: float = 0.2, tick: float = 0.1) -> None:
+        self.radius = check_float("radius", radius, "Give the radius of a robot in metres.", above=0.0)
+        self.tick = check_float("tick", tick, "Give seconds.", above=0.0)
+        self._walls = world.walls
+        self._space = pymunk.Space()
+        self._space.collision_slop = SLOP
+        self._space.collision_persistence = 1  # a contact is forgotten in the first substep without it
+        self._space.add(*(pymunk.Segment(self._space.static_body, (a, b), (c, d), 0.0) for a, b, c, d in world.walls.tolist()))
+        self._bodies = []
+        self._poses = check_array("start_poses", start_poses, (None, 3), "Give one row x y theta for each robot.")
+        _, _, x_max, y_max = world.bounds
+        apart = 4.0 * (radius + SKIN)
+        self._parking = [(x_max + apart * (2 + robot), y_max + apart) for robot in range(len(self._poses))]
+        for place in self._parking:
+            body = pymunk.Body(1.0, float("inf"))
+            body.position = place
+            self._space.add(body, pymunk.Circle(body, radius + SKIN))
+            self._bodies.append(body)
+        self._bumped = np.zeros(len(self._bodies), dtype=np.bool_)
+
+    @property
+    def poses(self) -> FloatArray:
+        """True poses (K, 3) [m, m, rad], world frame, theta in [-pi, pi). A fresh copy."""
+        return self._poses.copy()
+
+    @property
+    def bumped(self) -> BoolArray:
+        """Which robots (K,) something kept from going where they were commanded in the last tick. A fresh copy."""
+        return self._bumped.copy()
+
+    def step(self, commands: Any) -> None:
+        """Drive all robots for one tick.
+
+        Args:
+            commands: (K, 2) float64 [m/s, rad/s]. Speed ahead and rate of turn of each robot.
+
+        Raises:
+            ValueError: If the shape is wrong or a number is not finite.
+        """
+        commands = check_array("commands", commands, (len(self._bodies), 2), "Give (v, omega) for each robot.")
+        goals, clear = _drive_freely(self._poses, commands, self.tick, self._walls, self.radius + SKIN)
+        if clear:
+            self._bumped = np.zeros(len(goals), dtype=np.bool_)
+        else:
+            way = goals[:, :2] - self._poses[:, :2]
+            goals[:, :2] = self._move_in_contact(way)
+            achieved = np.sum((goals[:, :2] - self._poses[:, :2]) * way, axis=1)
+            self._bumped = achieved < (1.0 - SHORTFALL) * np.sum(way * way, axis=1)
+        self._poses = goals
+
+    def _move_in_contact(self, way: FloatArray) -> FloatArray:
+        """Move the bodies by `way` (K, 2) [m] as far as contacts allow; return their positions (K, 2) [m].
+
+        A step of pymunk moves bodies first and solves contacts afterwards. The first step here starts from rest, with
+        the command given as a force: contacts that are there already act before anything moves.
+        """
+        longest = float(np.hypot(way[:, 0], way[:, 1]).max())
+        substeps = max(2, int(np.ceil(longest / LONGEST_SUBSTEP)))
+        duration = self.tick / substeps
+        for body, (x, y), (dx, dy) in zip(self._bodies, self._poses[:, :2].tolist(), way.tolist(), strict=True):
+            body.position = x, y
+            body.velocity = 0.0, 0.0
+            body.mass = STANDING_MASS if dx == dy == 0.0 else 1.0
+            body.force = body.mass * dx / (self.tick * duration), body.mass * dy / (self.tick * duration)
+        self._space.collision_bias = (1.0 - CORRECTION) ** (1.0 / duration)  # what pymunk leaves of a depth after 1 s
+        for _ in range(substeps + 1):
+            self._space.step(duration)
+        after = np.array([body.position for body in self._bodies])
+        for body, place in zip(self._bodies, self._parking, strict=True):
+            body.position = place
+        self._space.step(duration)
+        return after
+
+    def get_state(self) -> dict[str, Any]:
+        """Return all that the next tick depends on; it shares no memory with the simulator."""
+        return {"poses": self._poses.copy(), "bumped": self._bumped.copy()}
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Go on from a state of `get_state`, bit by bit as the simulator would have from which it was taken."""
+        robots = len(self._bodies)
+        cure = "Give what get_state returned, for the same number of robots."
+        self._poses = check_array("state['poses']", state["poses"], (robots, 3), cure)
+        self._bumped = check_array("state['bumped']", state["bumped"], (robots,), cure, dtype=np.bool_)

@@ -1,0 +1,115 @@
+"""What a world is: walls, the landmarks on them, and perhaps where robots start. Frozen and checked."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_backend.errors import FloatArray, IntArray, bad_argument, check_array
+
+SHORTEST_WALL = 1e-3  # [m] anything shorter has no direction worth the name
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Landmarks:
+    """Points with a texture on the faces of walls.
+
+    Attributes:
+        positions: (N, 3) float64 [m], world frame. z is the height above the robots' reference height.
+        normals: (N, 2) float64 [-], world frame. Unit vectors that point out of the face, horizontally.
+        walls: (N,) int64. Index of the wall that carries the landmark.
+        descriptors: (N, d) float32 [-]. Unit appearance vectors.
+
+    Raises:
+        ValueError: If a shape is wrong, a number is not finite, or a vector has not length 1.
+    """
+
+    positions: FloatArray
+    normals: FloatArray
+    walls: IntArray
+    descriptors: NDArray[np.float32]
+
+    def __post_init__(self) -> None:
+        cure = "Give one row per landmark."
+        positions: Any = check_array("landmarks.positions", self.positions, (None, 3), cure)
+        normals: Any = check_array("landmarks.normals", self.normals, (len(positions), 2), cure)
+        walls: Any = check_array("landmarks.walls", self.walls, (len(positions),), cure, dtype=np.int64)
+        descriptors: Any = check_array(
+            "landmarks.descriptors", self.descriptors, (len(positions), None), cure, dtype=np.float32
+        )
+        for name, vectors in (("normals", normals), ("descriptors", descriptors)):
+            lengths = np.linalg.norm(vectors, axis=1)
+            if len(lengths) and not np.allclose(lengths, 1.0, atol=1e-4):
+                worst = float(lengths[np.argmax(np.abs(lengths - 1.0))])
+                raise bad_argument(f"landmarks.{name}", "unit vectors", f"a length of {worst:g}", "Normalise them.")
+        for name, array in zip(self.__slots__, (positions, normals, walls, descriptors), strict=True):
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class World:
+    """A flat building seen from above, in metres.
+
+    Attributes:
+        name: Shown in tables and pictures.
+        walls: (S, 4) float64 [m], world frame. Rows x1 y1 x2 y2: thin, opaque, solid segments.
+        landmarks: None: an environment places them on the walls.
+        start_poses: None, or (K, 3) float64 [m, m, rad], world frame. None: an environment draws them.
+
+    Raises:
+        ValueError: If there is no wall, a wall has no length, a number is not finite, or a landmark names no wall.
+
+    >>> World("room", [[0, 0, 4, 0], [4, 0, 4, 3], [4, 3, 0, 3], [0, 3, 0, 0]]).bounds
+    (0.0, 0.0, 4.0, 3.0)
+    """
+
+    name: str
+    walls: FloatArray
+    landmarks: Landmarks | None = field(default=None)
+    start_poses: FloatArray | None = field(default=None)
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.name, str):
+            raise bad_argument("world.name", "a string", self.name, "Give the world a name.")
+        walls: Any = check_array("world.walls", self.walls, (None, 4), "Give rows x1 y1 x2 y2 in metres.")
+        if not len(walls):
+            raise bad_argument("world.walls", "at least one wall", "no rows", "Give rows x1 y1 x2 y2 in metres.")
+        lengths = np.hypot(walls[:, 2] - walls[:, 0], walls[:, 3] - walls[:, 1])
+        if lengths.min() < SHORTEST_WALL:
+            at = int(np.argmin(lengths))
+            raise bad_argument(
+                f"world.walls[{at}]",
+                f"a wall longer than {SHORTEST_WALL:g} m",
+                f"a length of {lengths[at]:g} m",
+                "Drop it, or check that the unit is metres.",
+            )
+        walls.setflags(write=False)
+        object.__setattr__(self, "walls", walls)
+        if self.landmarks is not None:
+            if not isinstance(self.landmarks, Landmarks):
+                raise bad_argument("world.landmarks", "Landmarks or None", self.landmarks, "Build them with Landmarks.")
+            named = self.landmarks.walls
+            if len(named) and (named.min() < 0 or named.max() >= len(walls)):
+                raise bad_argument(
+                    "world.landmarks.walls",
+                    f"wall indices 0 to {len(walls) - 1}",
+                    [int(named.min()), int(named.max())],
+                    "Count walls from 0.",
+                )
+        if self.start_poses is not None:
+            starts: Any = check_array(
+                "world.start_poses", self.start_poses, (None, 3), "Give rows x y theta in metres and radians."
+            )
+            starts.setflags(write=False)
+            object.__setattr__(self, "start_poses", starts)
+
+    @property
+    def bounds(self) -> tuple[float, float, float, float]:
+        """The smallest box (xmin, ymin, xmax, ymax) [m] that holds all walls."""
+        x, y = self.walls[:, 0::2], self.walls[:, 1::2]
+        return float(x.min()), float(y.min()), float(x.max()), float(y.max())
