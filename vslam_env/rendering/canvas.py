@@ -1,0 +1,151 @@
+"""From metres to pixels, and the few strokes that a picture is made of, all with sub-pixel positions."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Self
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_backend.errors import FloatArray
+from vslam_env.rendering.palette import Colour
+
+Image = NDArray[np.uint8]
+
+SHIFT = 4  # fractional bits of the coordinates that OpenCV gets
+FARTHEST = 20_000.0  # [px] OpenCV's fixed-point coordinates overflow not far beyond
+MARGIN_M = 0.4  # [m] of paper around the world
+UNSEEN_PX = 0.3  # a path may be off by so much
+CHI_SQUARE_95 = 5.991  # 95 % of a planar Gaussian lie inside this squared Mahalanobis distance
+FONT = cv2.FONT_HERSHEY_SIMPLEX
+_CORNERS = np.linspace(0.0, 2.0 * np.pi, 18, endpoint=False)
+_CIRCLE = np.stack([np.cos(_CORNERS), np.sin(_CORNERS)], axis=-1)
+
+
+@dataclass(frozen=True, slots=True)
+class Viewport:
+    """Where world points fall on an image: y points up in the world and down in the image.
+
+    Attributes:
+        scale: [px/m], the same both ways.
+        left: World x of the image's left edge [m].
+        top: World y of the image's top edge [m].
+    """
+
+    scale: float
+    left: float
+    top: float
+
+    @classmethod
+    def around(cls, points: FloatArray, width: int, height: int) -> Self:
+        """Fit points (n, 2) [m], n >= 1, with a margin into an image, centred and undistorted."""
+        low, high = points.min(axis=0) - MARGIN_M, points.max(axis=0) + MARGIN_M
+        scale = float(min(width / (high[0] - low[0]), height / (high[1] - low[1])))
+        centre = 0.5 * (low + high)
+        return cls(scale, float(centre[0] - 0.5 * width / scale), float(centre[1] + 0.5 * height / scale))
+
+    def pixels(self, points: FloatArray) -> FloatArray:
+        """Return the image positions (..., 2) [px] of world points (..., 2 or more) [m]."""
+        x, y = (points[..., 0] - self.left) * self.scale, (self.top - points[..., 1]) * self.scale
+        return np.clip(np.stack([x, y], axis=-1), -FARTHEST, FARTHEST)
+
+
+def fixed(points: FloatArray) -> NDArray[np.int32]:
+    """Return pixel positions as OpenCV's fixed-point numbers; the centre of the first pixel is (0, 0) there."""
+    return np.rint((points - 0.5) * (1 << SHIFT)).astype(np.int32)
+
+
+def fill(image: Image, colour: Colour) -> None:
+    """Paint a whole image in one colour."""
+    image[:] = np.full((image.shape[1], 3), colour, np.uint8)  # row by row: eight times as fast as pixel by pixel
+
+
+def lines(image: Image, points: Sequence[FloatArray] | FloatArray, colour: Colour, width: int, closed: bool) -> None:
+    """Draw polylines, each (n, 2) [px], anti-aliased."""
+    if len(points):
+        paths: Any = list(fixed(points)) if isinstance(points, np.ndarray) else [fixed(line) for line in points]
+        cv2.polylines(image, paths, closed, colour, width, cv2.LINE_AA, SHIFT)
+
+
+def path(image: Image, points: FloatArray, colour: Colour, width: int) -> None:
+    """Draw a long polyline (n, 2) [px] without the corners that nobody would see."""
+    if len(points) > 1:
+        corners = cv2.approxPolyDP(points.astype(np.float32)[:, None], UNSEEN_PX, closed=False)
+        lines(image, corners[:, 0].astype(np.float64)[None], colour, width, False)
+
+
+def disc(image: Image, centre: FloatArray, radius: float, colour: Colour, width: int = -1) -> None:
+    """Draw a circle around `centre` (2,) [px]; a `width` of -1 fills it."""
+    x, y = fixed(centre).tolist()
+    cv2.circle(image, (x, y), max(1, round(radius * (1 << SHIFT))), colour, width, cv2.LINE_AA, SHIFT)
+
+
+def dots(image: Image, centres: FloatArray, radius: float, colour: Colour) -> None:
+    """Draw small equal filled discs around `centres` (n, 2) [px]: polygons, as OpenCV's small circles are diamonds."""
+    # Anti-aliasing adds half a pixel all around.
+    for outline in fixed(centres[:, None] + (radius - 0.5) * _CIRCLE[::2]):
+        cv2.fillConvexPoly(image, outline, colour, cv2.LINE_AA, SHIFT)
+
+
+def veils(image: Image, centres: FloatArray, radius: float, colour: Colour, opacity: float) -> None:
+    """Draw equal translucent discs, which add up where they overlap.
+
+    Args:
+        image: (H, W, 3) uint8; changed in place.
+        centres: (n, 2) float64 [px]. Those outside the image are cut off.
+        radius: [px].
+        colour: RGB.
+        opacity: Of one disc, in (0, 1).
+    """
+    reach = int(np.ceil(radius + 0.5))
+    inside = (centres > -reach).all(axis=1) & (centres < np.array(image.shape[1::-1]) + reach).all(axis=1)
+    if not inside.any():
+        return
+    corner = np.maximum(np.floor(centres[inside].min(axis=0)).astype(np.int64) - reach, 0)
+    end = np.floor(centres[inside].max(axis=0)).astype(np.int64) + reach + 1
+    part = image[corner[1] : end[1], corner[0] : end[0]]
+    height, width = part.shape[:2]
+    centres = centres[inside] - corner
+    offsets = np.arange(-reach, reach + 1)
+    columns = np.floor(centres[:, 0]).astype(np.int64)[:, None, None] + offsets[None, None, :]
+    rows = np.floor(centres[:, 1]).astype(np.int64)[:, None, None] + offsets[None, :, None]
+    distance = np.hypot(columns + 0.5 - centres[:, 0, None, None], rows + 0.5 - centres[:, 1, None, None])
+    cover = opacity * np.clip(radius + 0.5 - distance, 0.0, 1.0)
+    seen = (cover > 0.0) & (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
+    at = (rows * width + columns)[seen]
+    through = np.ones(height * width, np.float32)
+    np.multiply.at(through, at, (1.0 - cover[seen]).astype(np.float32))
+    share, pixels = through[at, None], np.divmod(at, width)
+    part[pixels] = np.rint(part[pixels] * share + np.array(colour, np.float32) * (1.0 - share)).astype(np.uint8)
+
+
+def ellipse_outlines(means: FloatArray, covariances: FloatArray, view: Viewport, smallest: float) -> FloatArray:
+    """Return the 95 % regions of planar Gaussians as polygons.
+
+    Args:
+        means: (n, 2) float64 [m].
+        covariances: (n, 2, 2) float64 [m^2]. Ones that are not positive semi-definite are drawn as far as they are.
+        view: From metres to pixels.
+        smallest: [px] Ellipses whose long half axis is shorter are left out: a dot would hide them.
+
+    Returns:
+        (m, 18, 2) [px], m <= n.
+    """
+    variances, axes = np.linalg.eigh(0.5 * (covariances + covariances.swapaxes(-1, -2)))
+    half_axes = np.sqrt(CHI_SQUARE_95 * np.maximum(variances, 0.0))
+    visible = half_axes[:, 1] * view.scale >= smallest
+    roots = axes[visible] * half_axes[visible, None, :]
+    return view.pixels(means[visible, None, :] + _CIRCLE @ roots.swapaxes(-1, -2))
+
+
+def text_width(text: str, size: float) -> float:
+    """Return how wide a line of text is [px]; `size` is the height of a capital [px]."""
+    (width, _), _ = cv2.getTextSize(text, FONT, size / 21.0, 1)
+    return float(width)
+
+
+def write(image: Image, text: str, left: float, middle: float, size: float, colour: Colour) -> None:
+    """Write one line that starts at x = `left` and is centred at y = `middle` [px]."""
+    where = (round(left), round(middle + 0.5 * size))
+    cv2.putText(image, text, where, FONT, size / 21.0, colour, 1, cv2.LINE_AA)

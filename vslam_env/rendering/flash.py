@@ -1,0 +1,73 @@
+"""The moment of a merge: lines between the two groups, expanding rings, and a caption, all fading."""
+
+import cv2
+import numpy as np
+
+from slam_backend.errors import FloatArray
+from vslam_env.rendering import palette
+from vslam_env.rendering.canvas import Image, Viewport, disc, lines, text_width, write
+from vslam_env.rendering.palette import mix
+from vslam_env.rendering.scene import MergeFlash, Scene
+
+FLASH_TICKS = 20
+RING_M = 2.2  # [m] how far the rings run
+
+
+def draw_flashes(plot: Image, view: Viewport, scene: Scene, unit: float) -> None:
+    """Draw the merges that are younger than `FLASH_TICKS`, the youngest caption on top."""
+    young = sorted((m for m in scene.merges if m.age_ticks < FLASH_TICKS), key=lambda merge: merge.age_ticks)
+    for merge in young:
+        _draw_glow(plot, view, scene, merge, unit)
+    for line, merge in enumerate(young):
+        _draw_caption(plot, merge, line, unit)
+
+
+def caption(merge: MergeFlash) -> str:
+    """Say who merged.
+
+    >>> caption(MergeFlash(0, (1,), (2,)))
+    'robot 1 + robot 2: maps merged'
+    """
+    return f"{_names(merge.robots_a)} + {_names(merge.robots_b)}: maps merged"
+
+
+def _names(robots: tuple[int, ...]) -> str:
+    """Return `robot 1` or `robots 0, 2`."""
+    return ("robot " if len(robots) == 1 else "robots ") + ", ".join(str(robot) for robot in robots)
+
+
+def _draw_glow(plot: Image, view: Viewport, scene: Scene, merge: MergeFlash, unit: float) -> None:
+    """Join every robot of one group to the nearest of the other, and let a ring run out from each."""
+    age = merge.age_ticks / FLASH_TICKS
+    overlay = plot.copy()
+    here, there = (_positions(view, scene, robots) for robots in (merge.robots_a, merge.robots_b))
+    for start in here:
+        end = there[np.argmin(np.hypot(*(there - start).T))]
+        lines(overlay, [np.stack([start, end])], palette.FLASH, max(2, round(5 * unit)), False)
+    start_radius = scene.robot_radius * view.scale
+    for centre in (*here, *there):
+        for lag in (0.0, 0.25):
+            radius = start_radius + RING_M * view.scale * np.sqrt(max(age - lag, 0.0))
+            disc(overlay, centre, radius, palette.FLASH, max(1, round((5 - 3 * age) * unit)))
+    cv2.addWeighted(overlay, 0.9 * (1.0 - age), plot, 1.0 - 0.9 * (1.0 - age), 0.0, plot)
+
+
+def _positions(view: Viewport, scene: Scene, robots: tuple[int, ...]) -> FloatArray:
+    """Return the image positions (k, 2) [px] of the true robots."""
+    return np.stack([view.pixels(scene.robots[robot].true_pose) for robot in robots])
+
+
+def _draw_caption(plot: Image, merge: MergeFlash, line: int, unit: float) -> None:
+    """Write who merged on a plate at the top of the plot."""
+    age = merge.age_ticks / FLASH_TICKS
+    size = max(6.0, 13.0 * unit)
+    text = caption(merge)
+    width, high = text_width(text, size) + 3.0 * size, 2.6 * size
+    middle = 0.5 * plot.shape[1]
+    row, column = round(8 * unit + line * 1.15 * high), round(middle - 0.5 * width)
+    plate = plot[row : row + round(high), max(column, 0) : column + round(width)]
+    fade = 0.5 * age * age
+    before = plate.copy()
+    plate[:] = mix(palette.FLASH, palette.PAPER, 0.25)
+    write(plate, text, 1.5 * size, 0.5 * high, size, palette.INK)
+    cv2.addWeighted(plate.copy(), 1.0 - fade, before, fade, 0.0, plate)

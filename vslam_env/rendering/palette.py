@@ -1,0 +1,41 @@
+"""The colours of a picture, RGB: few, quiet, and told apart by colour-blind readers."""
+
+import numpy as np
+
+Colour = tuple[int, int, int]
+
+PAPER: Colour = (250, 249, 246)
+STRIP: Colour = (240, 239, 235)
+RULE: Colour = (216, 214, 208)
+INK: Colour = (52, 54, 60)
+FAINT_INK: Colour = (122, 124, 130)
+WALL: Colour = (176, 178, 184)
+TRUE_LANDMARK: Colour = (160, 160, 158)
+FLASH: Colour = (240, 196, 25)
+
+# Okabe and Ito's set, its yellow (too light on paper) replaced by a brown.
+ROBOTS: tuple[Colour, ...] = (
+    (0, 114, 178),
+    (213, 94, 0),
+    (0, 158, 115),
+    (204, 121, 167),
+    (230, 159, 0),
+    (86, 180, 233),
+    (122, 84, 48),
+    (70, 70, 76),
+)
+
+
+def robot_colour(index: int) -> Colour:
+    """Return the colour of a robot; they repeat after eight."""
+    return ROBOTS[index % len(ROBOTS)]
+
+
+def mix(colour: Colour, other: Colour, share: float) -> Colour:
+    """Return `colour` with a `share` in [0, 1] of `other`: drawn on paper this looks translucent.
+
+    >>> mix((0, 100, 200), (100, 100, 100), 0.5)
+    (50, 100, 150)
+    """
+    r, g, b = np.rint((1.0 - share) * np.array(colour) + share * np.array(other)).astype(int).tolist()
+    return (r, g, b)
