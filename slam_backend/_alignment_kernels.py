@@ -15,36 +15,39 @@ MATCH_COLUMNS = 18
 MIN_SUPPORT = 3  # a minimal sample always supports itself: only a third candidate is evidence
 MIN_VARIANCE = 1e-8  # [m^2], (0.1 mm)^2: keeps exact landmarks (Sigma = 0) solvable
 MEDIAN_CHI2_3 = 2.3659738843753377
+SAME_DISTANCE, SAME_ANGLE = 0.25, math.radians(2.5)  # half of what makes two alignments differ
 MAX_ROUNDS = 30
+BISECTIONS = 12  # of a variance between 1e-8 and 1e-2 m^2, on the log scale: to 0.3 %
 
 
 @jit
 def _residual(
-    row: FloatArray, cos: float, sin: float, tx: float, ty: float, floor: float
+    table: FloatArray, i: int, cos: float, sin: float, tx: float, ty: float, floor: float
 ) -> tuple[float, float, float, float, float, float]:
     """Return (D, rx, ry, wxx, wxy, wyy) of one candidate under p_a = R p_b + t.
 
     S = Sigma_a + R Sigma_b R^T + floor I. The height is eliminated first, so that a 2x2 system remains: (rx, ry) is
     the planar residual given the height's, w the inverse of its covariance, and D = r^T S^-1 r in all three axes.
     """
-    rx = row[0] - cos * row[3] + sin * row[4] - tx
-    ry = row[1] - sin * row[3] - cos * row[4] - ty
-    rz = row[2] - row[5]
-    bxx, bxy, bxz, byy, byz = row[12], row[13], row[14], row[15], row[16]
-    sxx = row[6] + cos * cos * bxx - 2.0 * cos * sin * bxy + sin * sin * byy + floor  # Eqs. 16-17, corrected
-    sxy = row[7] + cos * sin * (bxx - byy) + (cos * cos - sin * sin) * bxy
-    syy = row[9] + sin * sin * bxx + 2.0 * cos * sin * bxy + cos * cos * byy + floor
-    sxz = row[8] + cos * bxz - sin * byz
-    syz = row[10] + sin * bxz + cos * byz
-    szz = row[11] + row[17] + floor
-    rx -= sxz * rz / szz
-    ry -= syz * rz / szz
-    sxx -= sxz * sxz / szz
-    sxy -= sxz * syz / szz
-    syy -= syz * syz / szz
-    determinant = sxx * syy - sxy * sxy
-    wxx, wxy, wyy = syy / determinant, -sxy / determinant, sxx / determinant
-    distance = rz * rz / szz + wxx * rx * rx + 2.0 * wxy * rx * ry + wyy * ry * ry
+    rx = table[i, 0] - cos * table[i, 3] + sin * table[i, 4] - tx
+    ry = table[i, 1] - sin * table[i, 3] - cos * table[i, 4] - ty
+    rz = table[i, 2] - table[i, 5]
+    bxx, bxy, bxz, byy, byz = table[i, 12], table[i, 13], table[i, 14], table[i, 15], table[i, 16]
+    sxx = table[i, 6] + cos * cos * bxx - 2.0 * cos * sin * bxy + sin * sin * byy + floor  # Eqs. 16-17, corrected
+    sxy = table[i, 7] + cos * sin * (bxx - byy) + (cos * cos - sin * sin) * bxy
+    syy = table[i, 9] + sin * sin * bxx + 2.0 * cos * sin * bxy + cos * cos * byy + floor
+    sxz = table[i, 8] + cos * bxz - sin * byz
+    syz = table[i, 10] + sin * bxz + cos * byz
+    wzz = 1.0 / (table[i, 11] + table[i, 17] + floor)
+    kx, ky = sxz * wzz, syz * wzz
+    rx -= kx * rz
+    ry -= ky * rz
+    sxx -= kx * sxz
+    sxy -= kx * syz
+    syy -= ky * syz
+    scale = 1.0 / (sxx * syy - sxy * sxy)
+    wxx, wxy, wyy = scale * syy, -scale * sxy, scale * sxx
+    distance = rz * rz * wzz + wxx * rx * rx + 2.0 * wxy * rx * ry + wyy * ry * ry
     return distance, rx, ry, wxx, wxy, wyy
 
 
@@ -54,7 +57,7 @@ def squared_distances(table: FloatArray, pose: FloatArray, floor: float) -> Floa
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
     result = np.empty(len(table))
     for i in range(len(table)):
-        result[i] = _residual(table[i], cos, sin, pose[0], pose[1], floor)[0]
+        result[i] = _residual(table, i, cos, sin, pose[0], pose[1], floor)[0]
     return result
 
 
@@ -66,13 +69,13 @@ def _support(
     cos, sin, tx, ty = math.cos(pose[2]), math.sin(pose[2]), pose[0], pose[1]
     count, score = 0, 0.0
     for i in range(len(table)):
-        row = table[i]
         members[i] = False
-        rx = row[0] - cos * row[3] + sin * row[4] - tx
-        ry = row[1] - sin * row[3] - cos * row[4] - ty
-        # No direction's variance exceeds the trace: most outliers are told by this alone.
-        if rx * rx + ry * ry <= gate * (row[6] + row[9] + row[11] + row[12] + row[15] + row[17] + floor):
-            distance = _residual(row, cos, sin, tx, ty, floor)[0]
+        rx = table[i, 0] - cos * table[i, 3] + sin * table[i, 4] - tx
+        ry = table[i, 1] - sin * table[i, 3] - cos * table[i, 4] - ty
+        # No direction's variance exceeds the traces' sum: most outliers are told by this alone.
+        largest = table[i, 6] + table[i, 9] + table[i, 11] + table[i, 12] + table[i, 15] + table[i, 17] + floor
+        if rx * rx + ry * ry <= gate * largest:
+            distance = _residual(table, i, cos, sin, tx, ty, floor)[0]
             if distance <= gate:
                 members[i] = True
                 count += 1
@@ -87,7 +90,7 @@ def information(table: FloatArray, members: BoolArray, pose: FloatArray, floor: 
     h, g = np.zeros((3, 3)), np.zeros(3)
     for i in range(len(table)):
         if members[i]:
-            _, rx, ry, wxx, wxy, wyy = _residual(table[i], cos, sin, tx, ty, floor)
+            _, rx, ry, wxx, wxy, wyy = _residual(table, i, cos, sin, tx, ty, floor)
             jx = -sin * table[i, 3] - cos * table[i, 4]
             jy = cos * table[i, 3] - sin * table[i, 4]
             wx, wy = wxx * rx + wxy * ry, wxy * rx + wyy * ry
@@ -137,7 +140,7 @@ def _fitted_variance(table: FloatArray, members: BoolArray, pose: FloatArray, fl
     if np.median(squared_distances(chosen, pose, floor)) >= target:
         return floor
     low, high = min(MIN_VARIANCE, floor), floor
-    for _ in range(25):
+    for _ in range(BISECTIONS):
         middle = math.sqrt(low * high)
         if np.median(squared_distances(chosen, pose, middle)) > target:
             low = middle
@@ -193,6 +196,15 @@ def _pose_from_two(table: FloatArray, i: int, j: int, gate: float, floor: float,
 
 
 @jit
+def _same(pose: FloatArray, other: FloatArray, x: float, y: float) -> bool:
+    """Tell whether two poses agree so well about the point (x, y) of map b that refining both would waste time."""
+    turned = abs((pose[2] - other[2] + math.pi) % (2.0 * math.pi) - math.pi)
+    cos, sin = math.cos(pose[2]) - math.cos(other[2]), math.sin(pose[2]) - math.sin(other[2])
+    apart = math.hypot(pose[0] - other[0] + cos * x - sin * y, pose[1] - other[1] + sin * x + cos * y)
+    return turned < SAME_ANGLE and apart < SAME_DISTANCE
+
+
+@jit
 def _samples_needed(share: float, log_failure: float) -> float:
     """Return how many pairs to draw so that one stems from a consensus set that holds `share` of the candidates.
 
@@ -223,7 +235,7 @@ def search(
     """
     found = np.empty((len(samples), 5))
     members = np.zeros(len(table), np.bool_)
-    h, most = 0, min_inliers
+    h, most, best = 0, min_inliers, np.full(3, np.nan)
     needed = _samples_needed(max_ratio * most / len(table), log_failure)
     for drawn in range(len(samples)):
         if drawn >= needed:
@@ -233,7 +245,7 @@ def search(
         i -= i * (i - 1) // 2 > n
         i += i * (i + 1) // 2 <= n
         pose = _pose_from_two(table, i, n - i * (i - 1) // 2, gate, floor, min_baseline)
-        if math.isnan(pose[0]):
+        if math.isnan(pose[0]) or _same(pose, best, table[i, 3], table[i, 4]):
             continue
         # Two noisy points aim badly at far ones: the first set is taken at twice the distance.
         count, score = _support(table, pose, floor, 4.0 * gate, members)
@@ -246,6 +258,6 @@ def search(
             found[h, 0], found[h, 1], found[h, 2], found[h, 3], found[h, 4] = pose[0], pose[1], pose[2], count, score
             h += 1
             if count > most:
-                most = count
+                most, best = count, pose
                 needed = _samples_needed(max_ratio * most / len(table), log_failure)
     return found[:h]

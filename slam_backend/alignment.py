@@ -216,7 +216,7 @@ def align_maps(
     if len(inliers) < options.min_inliers:
         return Alignment.refused("too few inliers")
     points_b = map_b.means[inliers[:, 1], :2]
-    ratio = _strongest_rival(hypotheses, pose, points_b.mean(axis=0)) / len(inliers)
+    ratio = _strongest_rival(table, hypotheses, pose, points_b.mean(axis=0), options) / len(inliers)
     if ratio > options.max_ratio:
         return Alignment.refused("ambiguous", ratio)
     if _extent(points_b) < options.min_spread:
@@ -238,10 +238,10 @@ def _match_table(map_a: LandmarkMap, map_b: LandmarkMap, matches: IntArray) -> F
 
 
 def _search(table: FloatArray, rng: np.random.Generator, options: AlignmentOptions) -> FloatArray:
-    """Return the hypotheses (h, 5) of a random search over pairs of candidates, without repetition where it can."""
+    """Return the hypotheses (h, 5) of a random search over pairs of candidates; over all of them if they are few."""
     pairs = len(table) * (len(table) - 1) // 2
-    limit = options.max_samples
-    samples = rng.permutation(pairs)[:limit] if pairs <= 4 * limit else rng.integers(0, pairs, limit)
+    few = 4 * pairs <= options.max_samples
+    samples = rng.permutation(pairs) if few else rng.integers(0, pairs, options.max_samples)
     return kernels.search(
         table,
         samples,
@@ -263,14 +263,27 @@ def _fit_all(table: FloatArray, floor: float) -> tuple[FloatArray, BoolArray, fl
     return pose, members, floor
 
 
-def _strongest_rival(hypotheses: FloatArray, pose: FloatArray, centre_b: FloatArray) -> float:
-    """Return the most inliers of a hypothesis that puts the inliers' centre elsewhere or turns by another angle."""
-    cos, sin = np.cos(hypotheses[:, 2]), np.sin(hypotheses[:, 2])
+def _strongest_rival(
+    table: FloatArray, hypotheses: FloatArray, pose: FloatArray, centre_b: FloatArray, options: AlignmentOptions
+) -> int:
+    """Return how many inliers the best hypothesis has that differs from `pose` even when both are refined."""
+    floor, gate = options.position_floor**2, options.position_gate
+    rivals = hypotheses[_differ(hypotheses[:, :3], pose, centre_b)]
+    for rival in rivals[np.argsort(-rivals[:, 3], kind="stable")]:
+        refined = kernels.refine(table, rival[:3].copy(), floor, gate)[0]
+        if _differ(refined[None], pose, centre_b)[0]:
+            return int(np.count_nonzero(kernels.squared_distances(table, refined, floor) <= gate))
+    return 0
+
+
+def _differ(poses: FloatArray, pose: FloatArray, centre_b: FloatArray) -> BoolArray:
+    """Tell which of `poses` (h, 3) put the point `centre_b` (2,) elsewhere than `pose` does, or turn otherwise."""
+    cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     here = transform_points(pose, centre_b)
-    x = hypotheses[:, 0] + cos * centre_b[0] - sin * centre_b[1] - here[0]
-    y = hypotheses[:, 1] + sin * centre_b[0] + cos * centre_b[1] - here[1]
-    turned = np.abs(wrap_angle(hypotheses[:, 2] - pose[2])) > RIVAL_ANGLE
-    return float(hypotheses[(np.hypot(x, y) > RIVAL_DISTANCE) | turned, 3].max(initial=0.0))
+    x = poses[:, 0] + cos * centre_b[0] - sin * centre_b[1] - here[0]
+    y = poses[:, 1] + sin * centre_b[0] + cos * centre_b[1] - here[1]
+    turned = np.abs(wrap_angle(poses[:, 2] - pose[2]))
+    return np.asarray((np.hypot(x, y) > RIVAL_DISTANCE) | (turned > RIVAL_ANGLE))
 
 
 def _extent(points: FloatArray) -> float:
