@@ -1,1 +1,42 @@
-"""Visual FastSLAM for one robot or a team, without any simulator or learner."""
+"""Visual FastSLAM for one robot or a team, without any simulator or learner.
+
+    slam = FastSlam(num_particles=100, seed=0)
+    for odometry, measurements in log:
+        slam.step([odometry], [measurements])
+    print(slam.pose().mean, len(slam.map()))
+"""
+
+from slam_backend.alignment import Alignment, AlignmentOptions, align_maps
+from slam_backend.attempts import AttemptOptions
+from slam_backend.camera import StereoCamera
+from slam_backend.filter import FastSlam
+from slam_backend.filter_options import FilterOptions
+from slam_backend.fusion import fuse_landmarks, fuse_maps
+from slam_backend.landmark_map import LandmarkMap
+from slam_backend.measurements import Measurements
+from slam_backend.motion import OdometryModel
+from slam_backend.reports import MergeEvent, PoseEstimate, Renaming, StepReport, TeamReport
+from slam_backend.team import TeamSlam
+from slam_backend.trajectory import Trajectory
+
+__all__ = [
+    "Alignment",
+    "AlignmentOptions",
+    "AttemptOptions",
+    "FastSlam",
+    "FilterOptions",
+    "LandmarkMap",
+    "Measurements",
+    "MergeEvent",
+    "OdometryModel",
+    "PoseEstimate",
+    "Renaming",
+    "StepReport",
+    "StereoCamera",
+    "TeamReport",
+    "TeamSlam",
+    "Trajectory",
+    "align_maps",
+    "fuse_landmarks",
+    "fuse_maps",
+]

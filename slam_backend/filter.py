@@ -24,8 +24,8 @@ from slam_backend.motion import OdometryModel
 from slam_backend.reports import PoseEstimate, StepReport
 from slam_backend.resampling import RESAMPLING, effective_sample_size
 
-_UPPER = np.triu_indices(3)
-_UNPACK = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
+UPPER = np.triu_indices(3)  # where the six stored elements of a covariance stand in the full matrix
+UNPACK = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 
 
 class FastSlam:
@@ -144,6 +144,11 @@ class FastSlam:
         return int(np.count_nonzero(self._ids >= 0))
 
     @property
+    def descriptor_size(self) -> int:
+        """Length of the descriptors in the map, 0 before the first one."""
+        return int(self._descriptors.shape[1])
+
+    @property
     def weights(self) -> FloatArray:
         """(M,) weights, summing to 1. A copy."""
         return np.asarray(np.exp(self._log_weights))
@@ -183,7 +188,7 @@ class FastSlam:
         slots = slots[np.argsort(self._ids[slots])]
         if estimate == "best":
             values = self._landmarks[slots, :, best]
-            means, covariances = values[:, :3], values[:, 3:][:, _UNPACK]
+            means, covariances = values[:, :3], values[:, 3:][:, UNPACK]
         else:
             values = self._landmarks[slots]
             weights = np.exp(self._log_weights) * self._present[slots]
@@ -191,7 +196,7 @@ class FastSlam:
             mixed = np.einsum("ncm,nm->nc", values, weights)
             means = mixed[:, :3]
             offsets = values[:, :3] - means[:, :, None]
-            covariances = mixed[:, 3:][:, _UNPACK] + np.einsum("nim,njm,nm->nij", offsets, offsets, weights)
+            covariances = mixed[:, 3:][:, UNPACK] + np.einsum("nim,njm,nm->nij", offsets, offsets, weights)
         return LandmarkMap._trusted(
             means, covariances, self._descriptors[slots], self._counts[slots, best], self._ids[slots]
         )
@@ -276,7 +281,7 @@ class FastSlam:
             given = frame.covariances is not None
             noises = np.zeros((len(keep), 6))
             if frame.covariances is not None:
-                noises[:] = (ROBOT_FROM_CAMERA @ frame.covariances[keep] @ ROBOT_FROM_CAMERA.T)[:, *_UPPER]
+                noises[:] = (ROBOT_FROM_CAMERA @ frame.covariances[keep] @ ROBOT_FROM_CAMERA.T)[:, *UPPER]
             descriptors = frame.descriptors[keep]
         kept_names = None if names is None else names[keep]
         starts, slots, squares = self._candidates(descriptors, kept_names, len(keep))
@@ -418,6 +423,12 @@ class FastSlam:
         if isinstance(robot, bool) or not isinstance(robot, (int, np.integer)) or not 0 <= robot < self.num_robots:
             raise bad_argument("robot", f"an index from 0 to {self.num_robots - 1}", robot, "Count robots from 0.")
         return int(robot)
+
+    def reorder(self, order: IntArray) -> None:
+        """Renumber the robots: robot i becomes the one that was `order[i]`; (K,) a permutation."""
+        for name in ("_poses", "_start_poses", "_pose_means", "_pose_covariances"):
+            setattr(self, name, getattr(self, name)[order])
+        self._estimates = [self._estimates[robot] for robot in order]
 
     # ------------------------------------------------------------------ snapshots
 

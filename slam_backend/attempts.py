@@ -1,0 +1,99 @@
+"""Which pair of groups tries to align its maps, and when: alignment is dear, and the same evidence fails twice."""
+
+import copy
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from slam_backend.alignment import AlignmentOptions, candidate_matches
+from slam_backend.errors import check_int
+from slam_backend.landmark_map import LandmarkMap
+
+PairKey = tuple[tuple[int, ...], tuple[int, ...]]  # two groups, as tuples of robots
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AttemptOptions:
+    """When groups try to align their maps.
+
+    Attributes:
+        every: At most one pair tries in so many steps.
+        new_candidates: A refused pair tries again only when so many of its candidate matches are new.
+        longest_wait: After each refusal a pair waits twice as long as before, at most so many steps.
+    """
+
+    every: int = 25
+    new_candidates: int = 3
+    longest_wait: int = 200
+
+    def __post_init__(self) -> None:
+        for name in ("every", "new_candidates", "longest_wait"):
+            check_int(f"attempts.{name}", getattr(self, name), 1, "Give a number of at least 1.")
+
+
+@dataclass(slots=True)
+class _Record:
+    """What one pair of groups has tried."""
+
+    wait: int
+    next_step: int = 0
+    tried: set[tuple[int, int]] = field(default_factory=set)  # candidate matches of the last attempt, by landmark ids
+
+
+class AttemptSchedule:
+    """The memory of past attempts.
+
+    Args:
+        options: The rhythm.
+        alignment: What makes a candidate match, and how many an alignment needs.
+    """
+
+    def __init__(self, options: AttemptOptions, alignment: AlignmentOptions) -> None:
+        self._options = options
+        self._alignment = alignment
+        self._records: dict[PairKey, _Record] = {}
+        self._proposed: dict[PairKey, set[tuple[int, int]]] = {}
+
+    def is_due(self, step: int) -> bool:
+        """Tell whether a pair may try at this step."""
+        return step % self._options.every == self._options.every - 1
+
+    def may_try(self, pair: PairKey, step: int) -> bool:
+        """Tell whether the pair's wait is over."""
+        return pair not in self._records or step >= self._records[pair].next_step
+
+    def choose(self, maps: Mapping[PairKey, tuple[LandmarkMap, LandmarkMap]]) -> PairKey | None:
+        """Return the pair with the most new candidate matches, if it has enough for an attempt; the first of equals."""
+        best: PairKey | None = None
+        most = 0
+        self._proposed = {}
+        for pair, (map_a, map_b) in maps.items():
+            rows = candidate_matches(map_a, map_b, self._alignment)
+            if len(rows) < self._alignment.min_inliers:
+                continue
+            found = set(zip(map_a.ids[rows[:, 0]].tolist(), map_b.ids[rows[:, 1]].tolist(), strict=True))
+            tried = self._records[pair].tried if pair in self._records else set()
+            new = len(found - tried)
+            if new >= self._options.new_candidates and new > most:
+                best, most = pair, new
+                self._proposed = {pair: found}
+        return best
+
+    def record(self, pair: PairKey, step: int, success: bool) -> None:
+        """Remember an attempt of the pair that `choose` returned: its evidence, and how long it now waits."""
+        if success:
+            gone = set(pair[0]) | set(pair[1])
+            self._records = {key: value for key, value in self._records.items() if not gone & set(key[0] + key[1])}
+            return
+        record = self._records.setdefault(pair, _Record(self._options.every))
+        record.tried = self._proposed.get(pair, set())
+        record.next_step = step + record.wait
+        record.wait = min(2 * record.wait, self._options.longest_wait)
+
+    def get_state(self) -> dict[PairKey, Any]:
+        """Return a copy of the memory."""
+        return copy.deepcopy(self._records)
+
+    def set_state(self, state: Mapping[PairKey, Any]) -> None:
+        """Take over a memory that `get_state` returned."""
+        self._records = copy.deepcopy(dict(state))

@@ -1,0 +1,284 @@
+"""Two filters and an alignment become one joint filter, particle by particle, so that the path uncertainty survives.
+
+Each new particle pairs one of either group. Its own motion between the two maps is estimated from the landmarks that
+the consensus of the maps says are shared, with the means and covariances that this pair of particles holds:
+Gauss-Newton on
+
+    chi^2(T) = sum over pairs of r^T S^-1 r,    r = mu_a - (R mu_b + t),    S = Sigma_a + R Sigma_b R^T.
+
+T is then drawn from N(T^, Lambda^-1): the pair's uncertainty about T becomes a spread of particles, and within a
+particle T is known. Pairs are weighed by their evidence, the integral of exp(-chi^2 / 2) over T by Laplace's formula.
+Landmarks in common are fused at the drawn T (Eqs. 13-15), the others of b are moved (Eq. 16).
+
+Maps of particle filters are over-confident, and two of them then contradict each other. The contradiction is
+measured, phi = median over pairs of chi^2 / degrees of freedom, and where it exceeds 1 both maps' covariances are
+scaled by it (the Birge ratio): the joint filter starts with uncertainties that explain what was seen.
+"""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_backend._jit import jit
+from slam_backend.alignment import Alignment
+from slam_backend.errors import BoolArray, FloatArray, IntArray
+from slam_backend.filter import UNPACK, UPPER, FastSlam
+from slam_backend.fusion import fuse_descriptors, fuse_landmarks
+from slam_backend.geometry import compose, inverse, rotation
+from slam_backend.resampling import systematic
+
+MIN_PAIRS = 3  # fewer shared landmarks in a particle do not fix a motion better than the consensus does
+CANDIDATES = 4  # pairs of particles weighed for each that is kept
+
+
+def inverse_alignment(alignment: Alignment) -> Alignment:
+    """Return the alignment seen from the other map: inverse motion, its covariance to first order, pairs swapped."""
+    x, y, theta = inverse(alignment.transform)
+    c, s = math.cos(alignment.theta), math.sin(alignment.theta)
+    jacobian = np.array([[-c, -s, y], [s, -c, -x], [0.0, 0.0, -1.0]])
+    covariance = jacobian @ alignment.covariance @ jacobian.T
+    return Alignment(
+        alignment.success, alignment.reason, x, y, theta, covariance, alignment.inliers[:, ::-1], alignment.ratio
+    )
+
+
+def merge_filters(
+    a: FastSlam, b: FastSlam, alignment: Alignment, pairs: IntArray, rng: np.random.Generator
+) -> tuple[FastSlam, IntArray]:
+    """Merge two filters into a joint one in a's map frame (Secs. 3.2 and 4).
+
+    Args:
+        a: Filter whose map frame and landmark ids stay.
+        b: The other filter.
+        alignment: Motion a_from_b of the maps, successful; where Gauss-Newton starts, and what is used where two
+            particles share fewer than three landmarks.
+        pairs: (k, 2) int64 rows (landmark id in a, landmark id in b) in common, one-to-one.
+        rng: For the pairing and the draws of T.
+
+    Returns:
+        The joint filter, a's robots first, with as many particles as the larger of the two; and (n, 2) int64 rows
+        (id in b, id in the joint map) of all of b's landmarks.
+    """
+    count = max(a.num_particles, b.num_particles)
+    slots_a, slots_b = np.flatnonzero(a._ids >= 0), np.flatnonzero(b._ids >= 0)
+    shared_a, shared_b = _slots_of(a._ids, pairs[:, 0]), _slots_of(b._ids, pairs[:, 1])
+    from_a = systematic(a.weights, rng, CANDIDATES * count)
+    from_b = rng.permutation(systematic(b.weights, rng, CANDIDATES * count))
+    motions, informations, chi2, log_dets, shared = _align_pairs(
+        a._landmarks[shared_a], a._present[shared_a], b._landmarks[shared_b], b._present[shared_b],
+        from_a, from_b, alignment.transform,
+    )
+    scale = _contradiction(chi2, shared)
+    evidence, factors = _weigh(motions, informations, chi2, log_dets, shared, scale, alignment)
+    weights = np.exp(evidence - evidence.max())
+    chosen = systematic(weights / weights.sum(), rng, count)
+    from_a, from_b, evidence = from_a[chosen], from_b[chosen], evidence[chosen]
+    draws = rng.standard_normal((count, 3))
+    motion = motions[chosen] + np.einsum("mij,mj->mi", factors[chosen], draws)
+
+    joint = FastSlam.from_options(
+        a.num_robots + b.num_robots,
+        replace(a.options, num_particles=count),
+        np.random.default_rng(rng.integers(2**63, size=4)),
+    )
+    moved = {"_poses": b._poses, "_start_poses": b._start_poses, "_pose_means": b._pose_means}
+    for name, poses_b in moved.items():
+        setattr(joint, name, np.concatenate([getattr(a, name)[:, from_a], compose(motion, poses_b[:, from_b])]))
+    turn = np.zeros((count, 3, 3))
+    turn[:, :2, :2], turn[:, 2, 2] = rotation(motion[:, 2]), 1.0
+    spread_b = turn @ b._pose_covariances[:, from_b] @ turn.transpose(0, 2, 1)
+    joint._pose_covariances = np.concatenate([a._pose_covariances[:, from_a], spread_b])
+    joint._path_log_weights = a._path_log_weights[from_a] + b._path_log_weights[from_b] + evidence
+    joint._log_weights = np.full(count, -math.log(count))
+
+    landmarks_a = np.take(a._landmarks[slots_a], from_a, axis=2)
+    landmarks_b = np.take(b._landmarks[slots_b], from_b, axis=2)
+    present_a, present_b = a._present[slots_a][:, from_a], b._present[slots_b][:, from_b]
+    counts_a, counts_b = a._counts[slots_a][:, from_a], b._counts[slots_b][:, from_b]
+    landmarks_a[:, 3:] *= scale
+    landmarks_b[:, 3:] *= scale
+    _move_landmarks(landmarks_b, motion)
+    rows_a, rows_b = np.searchsorted(slots_a, shared_a), np.searchsorted(slots_b, shared_b)
+    descriptors = a._descriptors[slots_a].copy()
+    identities = a._identities[slots_a].copy()
+    if len(rows_a):
+        seen_a, seen_b = counts_a[rows_a].max(axis=1), counts_b[rows_b].max(axis=1)
+        descriptors[rows_a] = fuse_descriptors(
+            descriptors[rows_a], np.maximum(seen_a, 1), b._descriptors[shared_b], np.maximum(seen_b, 1)
+        )
+        identities[rows_a] = np.where(identities[rows_a] < 0, b._identities[shared_b], identities[rows_a])
+        _fuse_rows((landmarks_a, present_a, counts_a), rows_a, (landmarks_b, present_b, counts_b), rows_b)
+    own = np.setdiff1d(np.arange(len(slots_b)), rows_b)  # b's landmarks that a does not have
+    new_ids = a._next_id + np.arange(len(own))
+    joint._landmarks = np.concatenate([landmarks_a, landmarks_b[own]])
+    joint._present = np.concatenate([present_a, present_b[own]])
+    joint._counts = np.concatenate([counts_a, counts_b[own]])
+    joint._descriptors = _stack_descriptors(descriptors, b._descriptors[slots_b[own]])
+    joint._identities = np.concatenate([identities, b._identities[slots_b[own]]])
+    joint._ids = np.concatenate([a._ids[slots_a], new_ids])
+    joint._ids[~joint._present.any(axis=1)] = -1
+    joint._next_id = a._next_id + len(own)
+    joint._steps = max(a._steps, b._steps)
+    joint._estimates = [joint._mixture(robot, joint.weights) for robot in range(joint.num_robots)]
+    renamed = np.concatenate([pairs[:, ::-1], np.column_stack([b._ids[slots_b[own]], new_ids])])
+    return joint, renamed.astype(np.int64)
+
+
+def _slots_of(ids: IntArray, wanted: IntArray) -> IntArray:
+    """Return the slots that hold the landmarks `wanted`."""
+    order = np.argsort(ids)
+    return np.asarray(order[np.searchsorted(ids, wanted, sorter=order)])
+
+
+def _stack_descriptors(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Stack the descriptors of two maps, one of which may still be empty and of unknown width."""
+    if not len(a) or not len(b):
+        return np.array(a if len(a) else b)
+    return np.concatenate([a, b])
+
+
+def _contradiction(chi2: FloatArray, shared: IntArray) -> float:
+    """Return phi >= 1, by how much the maps' covariances understate the differences between them."""
+    enough = shared >= MIN_PAIRS
+    if not enough.any():
+        return 1.0
+    return max(1.0, float(np.median(chi2[enough] / (3.0 * shared[enough] - 3.0))))
+
+
+def _weigh(
+    motions: FloatArray,
+    informations: FloatArray,
+    chi2: FloatArray,
+    log_dets: FloatArray,
+    shared: IntArray,
+    scale: float,
+    alignment: Alignment,
+) -> tuple[FloatArray, FloatArray]:
+    """Return log-evidences (c,) and factors (c, 3, 3) with C C^T the covariance of each pair's motion.
+
+    Pairs of particles that share too little take the consensus motion, and the smallest evidence of the others.
+    """
+    poor = shared < MIN_PAIRS
+    informations = np.where(poor[:, None, None], np.eye(3), informations)
+    covariances = scale * np.linalg.inv(informations)
+    motions[poor] = alignment.transform
+    covariances[poor] = alignment.covariance
+    values, vectors = np.linalg.eigh(0.5 * (covariances + covariances.transpose(0, 2, 1)))
+    factors = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
+    log_evidence = -0.5 * (chi2 / scale + log_dets + 3.0 * shared * math.log(scale))
+    log_evidence += 0.5 * np.linalg.slogdet(np.where(poor[:, None, None], np.eye(3), covariances))[1]
+    if poor.any():
+        log_evidence[poor] = log_evidence[~poor].min() if (~poor).any() else 0.0
+    return log_evidence, factors
+
+
+def _move_landmarks(landmarks: FloatArray, motion: FloatArray) -> None:
+    """Move landmarks (n, 9, M) in place, each particle by its own motion (M, 3); covariances by Eq. 16 corrected."""
+    c, s = np.cos(motion[:, 2]), np.sin(motion[:, 2])
+    x, y = landmarks[:, 0].copy(), landmarks[:, 1].copy()
+    landmarks[:, 0] = c * x - s * y + motion[:, 0]
+    landmarks[:, 1] = s * x + c * y + motion[:, 1]
+    xx, xy, xz, yy, yz = (landmarks[:, i].copy() for i in range(3, 8))
+    landmarks[:, 3] = c * c * xx - 2.0 * c * s * xy + s * s * yy  # Eq. 16 *: R Sigma R^T
+    landmarks[:, 4] = c * s * (xx - yy) + (c * c - s * s) * xy
+    landmarks[:, 5] = c * xz - s * yz
+    landmarks[:, 6] = s * s * xx + 2.0 * c * s * xy + c * c * yy
+    landmarks[:, 7] = s * xz + c * yz
+
+
+def _fuse_rows(
+    a: tuple[FloatArray, BoolArray, IntArray],
+    rows_a: IntArray,
+    b: tuple[FloatArray, BoolArray, IntArray],
+    rows_b: IntArray,
+) -> None:
+    """Fuse b's rows into a's, in place, where a particle holds both; where it holds b's alone, take that.
+
+    Each side is (landmarks (n, 9, M), present (n, M), counts (n, M)).
+    """
+    landmarks_a, landmarks_b = (side[0][rows].transpose(0, 2, 1) for side, rows in ((a, rows_a), (b, rows_b)))
+    in_a, in_b = a[1][rows_a], b[1][rows_b]
+    row, particle = np.nonzero(in_a & in_b)
+    one, two = landmarks_a[row, particle], landmarks_b[row, particle]
+    means, covariances = fuse_landmarks(one[:, :3], one[:, 3:][:, UNPACK], two[:, :3], two[:, 3:][:, UNPACK])
+    fused = np.where((in_b & ~in_a)[..., None], landmarks_b, landmarks_a)
+    fused[row, particle] = np.concatenate([means, covariances[:, *UPPER]], axis=1)
+    a[0][rows_a] = fused.transpose(0, 2, 1)
+    a[1][rows_a] |= in_b
+    a[2][rows_a] += np.where(in_b, b[2][rows_b], 0)
+
+
+@jit
+def _unpack(landmarks: FloatArray, row: int, m: int, matrix: FloatArray) -> None:
+    """Write the covariance of a landmark in a particle as a full matrix."""
+    c = 3
+    for i in range(3):
+        for j in range(i, 3):
+            matrix[i, j] = landmarks[row, c, m]
+            matrix[j, i] = matrix[i, j]
+            c += 1
+
+
+@jit
+def _align_pairs(
+    landmarks_a: FloatArray, present_a: BoolArray, landmarks_b: FloatArray, present_b: BoolArray,
+    from_a: IntArray, from_b: IntArray, initial: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, IntArray]:
+    """Estimate the motion between the maps of each pair of particles by Gauss-Newton on the shared landmarks.
+
+    Args:
+        landmarks_a: (k, 9, M_a) shared landmarks, with `present_a` (k, M_a); those of b in the same order.
+        from_a: (c,) particle of a in each pair; `from_b` likewise.
+        initial: (3,) where to start.
+
+    Returns:
+        Motions (c, 3), information matrices (c, 3, 3), chi^2 (c,), sums of log|2 pi S| (c,), and how many landmarks
+        both particles of a pair hold (c,).
+    """
+    count = len(from_a)
+    motions = np.empty((count, 3))
+    informations = np.zeros((count, 3, 3))
+    chi2 = np.zeros(count)
+    log_dets = np.zeros(count)
+    shared = np.zeros(count, dtype=np.int64)
+    sigma = np.empty((3, 3))
+    sigma_b = np.empty((3, 3))
+    turn = np.eye(3)
+    jacobian = np.zeros((3, 3))
+    residual = np.empty(3)
+    for p in range(count):
+        ma, mb = from_a[p], from_b[p]
+        motions[p] = initial
+        for iteration in range(4):
+            c, s = math.cos(motions[p, 2]), math.sin(motions[p, 2])
+            turn[0, 0], turn[0, 1], turn[1, 0], turn[1, 1] = c, -s, s, c
+            information = np.zeros((3, 3))
+            gradient = np.zeros(3)
+            chi2[p], log_dets[p], shared[p] = 0.0, 0.0, 0
+            for k in range(landmarks_a.shape[0]):
+                if not (present_a[k, ma] and present_b[k, mb]):
+                    continue
+                shared[p] += 1
+                x, y = landmarks_b[k, 0, mb], landmarks_b[k, 1, mb]
+                residual[0] = landmarks_a[k, 0, ma] - (c * x - s * y + motions[p, 0])
+                residual[1] = landmarks_a[k, 1, ma] - (s * x + c * y + motions[p, 1])
+                residual[2] = landmarks_a[k, 2, ma] - landmarks_b[k, 2, mb]
+                _unpack(landmarks_a, k, ma, sigma)
+                _unpack(landmarks_b, k, mb, sigma_b)
+                total = sigma + turn @ sigma_b @ turn.T
+                jacobian[0, 0] = jacobian[1, 1] = 1.0
+                jacobian[0, 2] = -s * x - c * y
+                jacobian[1, 2] = c * x - s * y
+                weighted = np.linalg.solve(total, residual)
+                information += jacobian.T @ np.linalg.solve(total, jacobian)
+                gradient += jacobian.T @ weighted
+                chi2[p] += residual[0] * weighted[0] + residual[1] * weighted[1] + residual[2] * weighted[2]
+                log_dets[p] += math.log(np.linalg.det(total)) + 3.0 * math.log(2.0 * math.pi)
+            informations[p] = information
+            if shared[p] < MIN_PAIRS:
+                break
+            if iteration < 3:
+                motions[p] += np.linalg.solve(information, gradient)
+    return motions, informations, chi2, log_dets, shared
