@@ -15,7 +15,7 @@ from slam_backend.geometry import rotate_covariances, transform_points
 FORMAT = "vslam landmark map"
 FORMAT_VERSION = 1
 # What numpy and zipfile raise on files that are truncated, damaged or of another kind.
-UNREADABLE = (OSError, ValueError, KeyError, EOFError, TypeError, NotImplementedError, zipfile.BadZipFile, zlib.error)
+UNREADABLE = (OSError, ValueError, KeyError, EOFError, TypeError, RuntimeError, zipfile.BadZipFile, zlib.error)
 FIELDS = ("means", "covariances", "descriptors", "counts", "ids")
 
 
@@ -60,7 +60,7 @@ class LandmarkMap:
         values, repeats = np.unique(fields["ids"], return_counts=True)
         if n and repeats.max() > 1:
             raise bad_argument(
-                "ids", "unique ids", f"an id {int(values[repeats.argmax()])} that repeats", "Give each its own name."
+                "ids", "unique ids", f"a repeated id {int(values[repeats.argmax()])}", "Give each its own name."
             )
         for name, array in fields.items():
             array.setflags(write=False)
