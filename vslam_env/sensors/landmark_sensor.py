@@ -12,6 +12,7 @@ from vslam_env.world.spec import Landmarks
 from vslam_env.world.visibility import view_limits, visible_landmarks
 
 NEAREST_FALSE_POINT = 0.5  # [m]
+_STEREO = ("focal_px", "baseline", "sigma_px", "sigma_disparity_px")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -78,6 +79,7 @@ class LandmarkSensor:
         self._descriptors = landmarks.descriptors.astype(np.float64)
         self._robot_radius = check_float("robot_radius", robot_radius, "Give metres.", at_least=0.0)
         self._mount = np.array(config.camera.mount)
+        self._stereo = np.array([getattr(config.camera, name) for name in _STEREO])
         self._view = view_limits(config.camera, config.max_incidence)
         # False points look like landmarks of this world: the common part of all descriptors and a part of their own.
         self._common = self._descriptors.mean(axis=0) if len(landmarks) else np.zeros(landmarks.descriptors.shape[1])
@@ -103,14 +105,14 @@ class LandmarkSensor:
         Returns:
             One frame for each robot. Nothing in the order of its points tells anything about them.
         """
-        config, camera = self.config, self.config.camera
+        config = self.config
         poses = np.ascontiguousarray(poses, dtype=np.float64)
         robots, most = len(poses), config.max_measurements
         visible = self.visible(poses)
         num_false = np.minimum(rng.poisson(config.false_points, robots), most)
         keys = rng.random(visible.shape)
         ids, counts = _choose(visible, keys, config.detection_probability, most - num_false)
-        points = _camera_points(self._landmarks.positions[ids], np.repeat(poses, counts, axis=0), self._mount)
+        points = _seen_from(self._landmarks.positions, ids, counts, poses, self._mount)
         descriptors = self._descriptors[ids]
         if num_false.any():
             at = np.repeat(np.cumsum(counts), num_false)
@@ -118,20 +120,15 @@ class LandmarkSensor:
             points = np.insert(points, at, self._false_points(len(at), rng), axis=0)
             descriptors = np.insert(descriptors, at, self._false_descriptors(len(at), rng), axis=0)
             counts = counts + num_false
-            robot_of = np.repeat(np.arange(robots), counts)
-            order = np.lexsort((rng.random(len(ids)), robot_of))
+            order = np.lexsort((rng.random(len(ids)), np.repeat(np.arange(robots), counts)))
             ids, points, descriptors = ids[order], points[order], descriptors[order]
         noise = rng.standard_normal((len(ids), 3 + descriptors.shape[1]))
-        pixels = camera.project(points) + noise[:, :3] * (camera.sigma_px, camera.sigma_px, camera.sigma_disparity_px)
-        descriptors = descriptors + noise[:, 3:] * (config.descriptor_noise / np.sqrt(descriptors.shape[1]))
-        descriptors /= np.sqrt(np.einsum("nd,nd->n", descriptors, descriptors))[:, None]
-        ends = np.cumsum(counts)
-        frames = []
-        for begin, end in zip(ends - counts, ends, strict=True):
-            rows = slice(int(begin), int(end))
-            if np.any(pixels[rows, 2] <= 0.0):  # at infinity for the matcher of a very noisy pair
-                rows = np.flatnonzero(pixels[rows, 2] > 0.0) + int(begin)
-            frames.append(Frame(Measurements(camera.triangulate(pixels[rows]), descriptors[rows]), ids[rows]))
+        sharp = _add_noise(points, descriptors, noise, self._stereo, config.descriptor_noise)
+        frames, begin = [], 0
+        for end in np.cumsum(counts).tolist():
+            rows = np.arange(begin, end)[sharp[begin:end]]
+            frames.append(Frame(Measurements(points[rows], descriptors[rows]), ids[rows]))
+            begin = end
         return frames
 
     def _false_points(self, count: int, rng: np.random.Generator) -> FloatArray:
@@ -151,12 +148,60 @@ class LandmarkSensor:
         return np.asarray(descriptors / np.linalg.norm(descriptors, axis=1, keepdims=True))
 
 
-def _camera_points(positions: FloatArray, poses: FloatArray, mount: FloatArray) -> FloatArray:
-    """Move points (n, 3) [m] from the world to the camera frame of the robot at `poses` (n, 3), one each."""
-    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-    dx, dy = positions[:, 0] - poses[:, 0], positions[:, 1] - poses[:, 1]
-    ahead, left = c * dx + s * dy - mount[0], c * dy - s * dx - mount[1]
-    return np.stack([-left, mount[2] - positions[:, 2], ahead], axis=1)
+@jit
+def _seen_from(
+    positions: FloatArray, ids: IntArray, counts: IntArray, poses: FloatArray, mount: FloatArray
+) -> FloatArray:
+    """Return landmarks `ids` (n,), `counts` (K,) for each robot in turn, in the robots' camera frames (n, 3) [m]."""
+    points = np.empty((len(ids), 3))
+    i = 0
+    for k in range(len(poses)):
+        c, s = np.cos(poses[k, 2]), np.sin(poses[k, 2])
+        for _ in range(counts[k]):
+            dx, dy = positions[ids[i], 0] - poses[k, 0], positions[ids[i], 1] - poses[k, 1]
+            points[i, 0] = mount[1] - (c * dy - s * dx)
+            points[i, 1] = mount[2] - positions[ids[i], 2]
+            points[i, 2] = c * dx + s * dy - mount[0]
+            i += 1
+    return points
+
+
+@jit
+def _add_noise(
+    points: FloatArray, descriptors: FloatArray, noise: FloatArray, stereo: FloatArray, descriptor_noise: float
+) -> BoolArray:
+    """Replace true points and descriptors, in place, by measured ones.
+
+    Points are projected, their image coordinates and disparities disturbed, and triangulated again.
+
+    Args:
+        points: (n, 3) float64 [m], camera frame.
+        descriptors: (n, d) float64, unit vectors.
+        noise: (n, 3 + d) float64, standard normal.
+        stereo: (4,) float64. Focal length [px], baseline [m], sigmas of image coordinates and disparity [px].
+        descriptor_noise: Root mean square length of the noise of a descriptor.
+
+    Returns:
+        (n,) bool. False where the disparity vanishes in the noise: no matcher reports such a point.
+    """
+    focal, baseline, sigma, sigma_disparity = stereo
+    size = descriptors.shape[1]
+    sharp = np.empty(len(points), dtype=np.bool_)
+    for i in range(len(points)):
+        scale = focal / points[i, 2]
+        disparity = baseline * scale + sigma_disparity * noise[i, 2]
+        sharp[i] = disparity > 0.0
+        if sharp[i]:
+            points[i, 0] = (points[i, 0] * scale + sigma * noise[i, 0]) * baseline / disparity
+            points[i, 1] = (points[i, 1] * scale + sigma * noise[i, 1]) * baseline / disparity
+            points[i, 2] = focal * baseline / disparity
+        square = 0.0
+        for j in range(size):
+            descriptors[i, j] += descriptor_noise / np.sqrt(size) * noise[i, 3 + j]
+            square += descriptors[i, j] ** 2
+        for j in range(size):
+            descriptors[i, j] /= np.sqrt(square)
+    return sharp
 
 
 @jit

@@ -11,6 +11,7 @@ DOOR = (1.1, 1.4)  # [m] least and greatest width
 JAMB = 0.35  # [m] wall left between a door and the end of its wall
 DOOR_CLEARANCE = 1.1  # [m] nothing stands closer than this to the middle of a door
 PASSAGE = 0.75  # [m] left free around things that stand in a room
+FURNISHED = 0.8  # share of rooms, or halves of large ones, in which something stands
 PILASTER = (0.25, 0.35)  # [m] how far one juts into a corridor
 
 Segment = tuple[float, float, float, float]
@@ -91,10 +92,11 @@ class Blueprint:
             x += 0.4
 
     def furnish(self, room: Room) -> None:
-        """Put something into a room, or into both halves of a large one."""
-        width, height = room.size
-        parts = room.halves() if max(width, height) > 4.5 else (room,)
+        """Put something into a room, or into both halves of a large one. Some are left empty."""
+        parts = room.halves() if max(room.size) > 5.0 else (room,)
         for part in parts:
+            if self.rng.random() > FURNISHED:
+                continue
             thing = (self._screen, self._cabinet, self._table)[self.rng.choice(3, p=(0.45, 0.25, 0.3))]
             for _ in range(8):
                 segments = thing(room, part)

@@ -41,7 +41,9 @@ def load_floorplan(
     if image is None:
         raise bad_argument("world", "an image that OpenCV can read", str(path), "Save the plan as PNG.")
     free = _free_part(image, str(path))
-    widest = 2.0 * metres_per_pixel * float(cv2.distanceTransform(np.pad(free, 1), cv2.DIST_L2, 5).max())
+    x, y, width, height = cv2.boundingRect(free)
+    cropped = np.pad(free[y : y + height, x : x + width], 1)
+    widest = 2.0 * metres_per_pixel * float(cv2.distanceTransform(cropped, cv2.DIST_L2, 3).max())
     if widest < 2.5 * robot_radius:
         raise bad_argument(
             "world",
@@ -49,11 +51,12 @@ def load_floorplan(
             f"a widest place of {widest:.2f} m in {path}",
             "Raise metres_per_pixel or draw wider rooms.",
         )
-    outlines = _outlines(free, tolerance_px)
-    segments = np.vstack([np.hstack([line, np.roll(line, -1, axis=0)]) for line in outlines])
-    flip = np.array([1.0, -1.0, 1.0, -1.0])
-    height = np.array([0.0, free.shape[0], 0.0, free.shape[0]])
-    return World(path.stem, metres_per_pixel * (height + flip * segments))
+    corner = np.array([x - 1, y - 1])  # of the cropped part in the image
+    to_metres = metres_per_pixel * np.array([1.0, -1.0])  # rows count downwards, y upwards
+    outlines = [
+        (line + corner - (0, len(free))) * to_metres for line in _outlines(cropped, tolerance_px)
+    ]
+    return World(path.stem, np.vstack([np.hstack([line, np.roll(line, -1, axis=0)]) for line in outlines]))
 
 
 def load_walls_json(path: str | Path) -> World:
@@ -85,7 +88,9 @@ def _existing(path: str | Path) -> Path:
 
 def _free_part(image: Any, path: str) -> Any:
     """Return the free part (H, W) uint8, 1 = free, of an image (H, W, 3) uint8."""
-    coloured = image.max(axis=2).astype(np.int16) - image.min(axis=2) > COLOURED
+    blue, green, red = cv2.split(image)
+    strongest, weakest = cv2.max(cv2.max(blue, green), red), cv2.min(cv2.min(blue, green), red)
+    coloured = cv2.subtract(strongest, weakest) > COLOURED
     grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
     levels = grey[~coloured]
     brightest = float(levels.max()) if levels.size else 0.0
@@ -98,7 +103,7 @@ def _free_part(image: Any, path: str) -> Any:
         )
     free = ((grey >= BRIGHT_SHARE * brightest) | coloured).astype(np.uint8)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(free, connectivity=4)
-    marked = np.bincount(labels[coloured & (free > 0)], minlength=count)
+    marked = np.bincount(labels[coloured], minlength=count)
     sizes = stats[:, cv2.CC_STAT_AREA].astype(np.int64)
     sizes[0] = marked[0] = 0
     part = int(np.argmax(marked if marked.any() else sizes))
@@ -106,16 +111,16 @@ def _free_part(image: Any, path: str) -> Any:
 
 
 def _outlines(free: Any, tolerance_px: float) -> list[FloatArray]:
-    """Return the closed outlines [(n, 2) px, x right and y down] of a mask (H, W), along pixel edges.
+    """Return the closed outlines [(n, 2) px, x right and y down], along pixel edges, of a mask with an empty margin.
 
     OpenCV traces pixel centres. In a mask enlarged threefold these are nearest to the corners of the original pixels,
     so rounding gives the exact edges.
     """
-    enlarged = np.kron(np.pad(free, 1), np.ones((UPSAMPLING, UPSAMPLING), dtype=np.uint8))
+    enlarged = cv2.resize(free, None, fx=UPSAMPLING, fy=UPSAMPLING, interpolation=cv2.INTER_NEAREST)
     contours, _ = cv2.findContours(enlarged, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
     outlines = []
     for contour in contours:
-        corners = np.rint((contour[:, 0].astype(np.float64) + 0.5) / UPSAMPLING).astype(np.int32) - 1
+        corners = np.rint((contour[:, 0].astype(np.float64) + 0.5) / UPSAMPLING).astype(np.int32)
         corners = _without_flat_corners(corners[np.any(corners != np.roll(corners, 1, axis=0), axis=1)])
         straight = cv2.approxPolyDP(corners[:, None], tolerance_px, closed=True)[:, 0]
         straight = _without_flat_corners(straight)

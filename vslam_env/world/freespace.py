@@ -67,9 +67,10 @@ class FreeSpace:
             )
         self.reachable: BoolArray = fits == self._main_part(fits)
         self.open_space: BoolArray = labels == labels[self.reachable][0]
-        squares = np.zeros_like(self.open_space)
-        squares[AREA_STEP // 2 :: AREA_STEP, AREA_STEP // 2 :: AREA_STEP] = True
-        self.free_area_cells: FloatArray = self._centres(squares & self.open_space & (clearance > 0.5 * AREA_STEP * CELL))
+        squares = self.open_space & (clearance > 0.5 * AREA_STEP * CELL)
+        every_second = np.zeros_like(squares)
+        every_second[::AREA_STEP, ::AREA_STEP] = True
+        self.free_area_cells: FloatArray = self._centres(squares & every_second)
 
     def _main_part(self, fits: Any) -> int:
         """Return the label of the part with the world's first start pose, or else of the largest part."""
@@ -81,7 +82,7 @@ class FreeSpace:
     def _centres(self, mask: BoolArray) -> FloatArray:
         """Return the centres (n, 2) [m], world frame, of the cells of a mask (H, W)."""
         rows, columns = np.nonzero(mask)
-        return self.origin + CELL * (np.stack([columns, rows], axis=1) + 0.5)
+        return np.asarray(self.origin + CELL * (np.stack([columns, rows], axis=1) + 0.5))
 
     def contains(self, points: FloatArray) -> BoolArray:
         """Tell which points (n, 2) [m], world frame, lie in the open space."""
@@ -188,7 +189,7 @@ class FreeSpace:
         return float(headings[int(np.argmax(np.array(free) >= VIEW_AHEAD))])
 
     def check_starts(self, start_poses: Any, num_robots: int | None = None) -> FloatArray:
-        """Return start poses as (K, 3) float64 [m, m, rad], theta in [-pi, pi), after a check that robots can stand there.
+        """Check that robots can start there; return (K, 3) float64 [m, m, rad], theta in [-pi, pi).
 
         Args:
             start_poses: (K, 3) [m, m, rad], world frame.

@@ -28,9 +28,9 @@ class LandmarkConfig:
         repeated: Share of the landmarks that copy the descriptor of another one, in [0, 1].
     """
 
-    density: float = 1.3
-    min_height: float = -0.8
-    max_height: float = 1.0
+    density: float = 1.4
+    min_height: float = -0.6
+    max_height: float = 0.8
     min_spacing: float = 0.15
     descriptor_size: int = 64
     distinctness: float = 0.8
@@ -42,9 +42,8 @@ class LandmarkConfig:
         check_float("landmarks.max_height", self.max_height, "Give metres, above min_height.", at_least=self.min_height)
         check_float("landmarks.min_spacing", self.min_spacing, "Give metres.", at_least=0.0)
         check_int("landmarks.descriptor_size", self.descriptor_size, 2, "Use 64 for u-SURF.")
-        check_float(
-            "landmarks.distinctness", self.distinctness, "Unrelated unit vectors differ by 1.41.", above=0.0, at_most=2**0.5
-        )
+        cure = "Unrelated unit vectors differ by 1.41."
+        check_float("landmarks.distinctness", self.distinctness, cure, above=0.0, at_most=2**0.5)
         check_float("landmarks.repeated", self.repeated, "Give a share.", at_least=0.0, at_most=1.0)
 
 
@@ -131,4 +130,4 @@ def draw_descriptors(count: int, config: LandmarkConfig, rng: np.random.Generato
     descriptors = np.sqrt(1.0 - own_share) * common + np.sqrt(own_share) * own
     copies = rng.random(count) < config.repeated
     descriptors[copies] = descriptors[rng.integers(count, size=count)][copies]
-    return descriptors.astype(np.float32)
+    return np.asarray(descriptors, dtype=np.float32)

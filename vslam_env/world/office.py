@@ -7,6 +7,8 @@ import numpy as np
 from vslam_env.world._blueprint import Blueprint, Room
 from vslam_env.world.spec import World
 
+ENOUGH_WALLS = 58  # rooms that come up later stay empty
+
 
 def office(rng: np.random.Generator) -> World:
     """Build a furnished office floor of about 20 x 14 m with 7 to 10 rooms.
@@ -20,8 +22,9 @@ def office(rng: np.random.Generator) -> World:
     """
     plan = Blueprint(rng)
     rooms = _ring(plan) if rng.random() < 0.6 else _spine(plan)
-    for room in rooms:
-        plan.furnish(room)
+    for index in rng.permutation(len(rooms)):
+        if len(plan.segments) < ENOUGH_WALLS:
+            plan.furnish(rooms[index])
     return World("office", plan.finished())
 
 
@@ -61,8 +64,11 @@ def _spine(plan: Blueprint) -> list[Room]:
     low = 0.5 * (height - corridor) + rng.uniform(-0.6, 0.6)
     _shell(plan, width, height)
     rooms = []
-    for y0, y1, corridor_wall, parts in ((0.0, low, low, 4), (low + corridor, height, low + corridor, 4)):
-        ends = plan.split(0.0, width, parts - int(rng.random() < 0.4))
+    for y0, y1, corridor_wall, parts in (
+        (0.0, low, low, 4),
+        (low + corridor, height, low + corridor, int(rng.integers(3, 6))),
+    ):
+        ends = plan.split(0.0, width, parts)
         rooms += _row(plan, ends, y0, y1, corridor_wall, door_between=int(rng.integers(1, len(ends) - 1)))
     plan.pilasters(0.0, width, low, low + corridor)
     return rooms

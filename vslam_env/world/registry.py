@@ -49,7 +49,8 @@ def _load(path: Path, rng: np.random.Generator) -> World:
     if path.is_dir():
         files = sorted(p for p in path.iterdir() if p.suffix.lower() in (*IMAGE_SUFFIXES, ".json"))
         if not files:
-            raise bad_argument("world", "a folder with floor plans", str(path), "Put .png, .jpg, .pgm or .json files there.")
+            cure = "Put .png, .jpg, .pgm or .json files there."
+            raise bad_argument("world", "a folder with floor plans", str(path), cure)
         path = files[int(rng.integers(len(files)))]
     suffix = path.suffix.lower()
     if suffix == ".json":

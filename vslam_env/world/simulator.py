@@ -69,7 +69,8 @@ class Simulator:
         self._space = pymunk.Space()
         self._space.collision_slop = SLOP
         self._space.collision_persistence = 1  # a contact is forgotten in the first substep without it
-        self._space.add(*(pymunk.Segment(self._space.static_body, (a, b), (c, d), 0.0) for a, b, c, d in world.walls.tolist()))
+        ground = self._space.static_body
+        self._space.add(*(pymunk.Segment(ground, (a, b), (c, d), 0.0) for a, b, c, d in world.walls.tolist()))
         self._bodies = []
         self._poses = check_array("start_poses", start_poses, (None, 3), "Give one row x y theta for each robot.")
         _, _, x_max, y_max = world.bounds

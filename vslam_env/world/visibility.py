@@ -77,7 +77,7 @@ def _ray_to_disc(dx: float, dy: float, x: float, y: float, radius: float) -> flo
     inside = radius * radius - (x * x + y * y - along * along)
     if along <= 0.0 or inside <= 0.0:
         return np.inf
-    return max(0.0, along - np.sqrt(inside))
+    return float(max(0.0, along - np.sqrt(inside)))
 
 
 @jit
@@ -116,12 +116,14 @@ def cast_scans(
 
 
 @jit
-def _hidden(x: float, y: float, own_wall: int, near: FloatArray, indices: IntArray) -> bool:
-    """Tell whether a wall other than `own_wall` crosses the sight line from the origin to (x, y)."""
-    length = np.sqrt(x * x + y * y)
-    for i in range(len(near)):
+def _hidden(
+    x: float, y: float, dx: float, dy: float, own_wall: int, walls: FloatArray, indices: IntArray
+) -> bool:
+    """Tell whether a wall other than `own_wall` crosses the sight line from (x, y) to (x + dx, y + dy)."""
+    length = np.sqrt(dx * dx + dy * dy)
+    for i in range(len(walls)):
         if indices[i] != own_wall:
-            t = _ray_to_wall(x, y, near[i, 0], near[i, 1], near[i, 2], near[i, 3])
+            t = _ray_to_wall(dx, dy, walls[i, 0] - x, walls[i, 1] - y, walls[i, 2] - x, walls[i, 3] - y)
             if t * length < length - TOUCH:
                 return True
     return False
@@ -174,7 +176,7 @@ def visible_landmarks(
             distance = np.sqrt(dx * dx + dy * dy + dz * dz)
             if distance > max_range or -(dx * normals[n, 0] + dy * normals[n, 1]) <= cos_incidence * distance:
                 continue
-            if _hidden(ahead, left, own_walls[n], near, indices):
+            if _hidden(0.0, 0.0, ahead, left, own_walls[n], near, indices):
                 continue
             length = np.sqrt(ahead * ahead + left * left)
             free = True
@@ -221,7 +223,7 @@ def seen_from_somewhere(
     spacing = 0.2
     max_range, _, tan_vertical, cos_incidence = view
     seen = np.zeros(len(positions), dtype=np.bool_)
-    place = np.zeros(3)
+    indices = np.arange(len(walls))
     for n in range(len(positions)):
         dz = abs(positions[n, 2] - camera_height)
         facing = np.arctan2(normals[n, 1], normals[n, 0])
@@ -233,18 +235,15 @@ def seen_from_somewhere(
                 half = int(np.ceil(widest * radius / spacing))
                 for i in range(-half + 1, half):
                     bearing = facing + i * widest / half
-                    place[0] = positions[n, 0] + radius * np.cos(bearing)
-                    place[1] = positions[n, 1] + radius * np.sin(bearing)
-                    col = int(np.floor((place[0] - origin[0]) / cell))
-                    row = int(np.floor((place[1] - origin[1]) / cell))
-                    if row < 0 or col < 0 or row >= reachable.shape[0] or col >= reachable.shape[1]:
+                    dx, dy = radius * np.cos(bearing), radius * np.sin(bearing)
+                    column = int(np.floor((positions[n, 0] + dx - origin[0]) / cell))
+                    row = int(np.floor((positions[n, 1] + dy - origin[1]) / cell))
+                    if row < 0 or column < 0 or row >= reachable.shape[0] or column >= reachable.shape[1]:
                         continue
-                    if reachable[row, col]:
-                        place[2] = bearing + np.pi
-                        near, indices = walls_in_wedge(place, walls, 0.01, radius)
-                        if not _hidden(radius, 0.0, own_walls[n], near, indices):
-                            seen[n] = True
-                            break
+                    x, y = positions[n, 0], positions[n, 1]
+                    if reachable[row, column] and not _hidden(x + dx, y + dy, -dx, -dy, own_walls[n], walls, indices):
+                        seen[n] = True
+                        break
             radius += spacing
     return seen
 
