@@ -19,7 +19,7 @@ MARGIN_M = 0.4  # [m] of paper around the world
 UNSEEN_PX = 0.3  # a path may be off by so much
 CHI_SQUARE_95 = 5.991  # 95 % of a planar Gaussian lie inside this squared Mahalanobis distance
 FONT = cv2.FONT_HERSHEY_SIMPLEX
-_CORNERS = np.linspace(0.0, 2.0 * np.pi, 18, endpoint=False)
+_CORNERS = np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False)
 _CIRCLE = np.stack([np.cos(_CORNERS), np.sin(_CORNERS)], axis=-1)
 
 
@@ -130,7 +130,7 @@ def ellipse_outlines(means: FloatArray, covariances: FloatArray, view: Viewport,
         smallest: [px] Ellipses whose long half axis is shorter are left out: a dot would hide them.
 
     Returns:
-        (m, 18, 2) [px], m <= n.
+        (m, 16, 2) [px], m <= n.
     """
     variances, axes = np.linalg.eigh(0.5 * (covariances + covariances.swapaxes(-1, -2)))
     half_axes = np.sqrt(CHI_SQUARE_95 * np.maximum(variances, 0.0))

@@ -1,0 +1,108 @@
+import subprocess
+from pathlib import Path
+
+import imageio_ffmpeg
+import numpy as np
+import pytest
+
+from slam_backend.alignment import Alignment
+from slam_backend.reports import MergeEvent
+from training.video import LONGEST_S, VideoWriter, choose_pace, with_slow_flashes
+from vslam_env.rendering import Scene
+
+SIZE = (98, 62)
+
+
+def frames(count: int) -> list[np.ndarray]:
+    """Return grey frames that get brighter."""
+    return [np.full((SIZE[1], SIZE[0], 3), 10 + 20 * k, np.uint8) for k in range(count)]
+
+
+def read_back(path: Path) -> tuple[str, np.ndarray]:
+    """Return ffmpeg's description of a video and its frames (n, height, width, 3)."""
+    arguments = ["-i", str(path), "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
+    done = subprocess.run([imageio_ffmpeg.get_ffmpeg_exe(), *arguments], capture_output=True, check=True)
+    return done.stderr.decode(), np.frombuffer(done.stdout, np.uint8).reshape(-1, SIZE[1], SIZE[0], 3)
+
+
+def test_a_video_holds_the_frames_in_a_form_that_browsers_play(tmp_path: Path) -> None:
+    """What is written is H.264 in 4:2:0 colour with its index in front, and reads back as nearly the same frames."""
+    path = tmp_path / "video.mp4"
+    with VideoWriter(path, SIZE, fps=5) as video:
+        for frame in frames(7):
+            video.add(frame)
+    description, got = read_back(path)
+    for word in ("Video: h264", "yuv420p", "98x62", "5 fps"):
+        assert word in description
+    content = path.read_bytes()
+    assert content.index(b"moov") < content.index(b"mdat")
+    assert len(got) == 7
+    for wanted, frame in zip(frames(7), got, strict=True):
+        assert np.abs(frame.astype(int) - wanted).mean() < 3.0
+
+
+def test_an_interrupted_video_holds_what_came_before(tmp_path: Path) -> None:
+    """An exception in the block leaves a whole, shorter video and nothing else."""
+    path = tmp_path / "video.mp4"
+
+    def interrupted() -> None:
+        with VideoWriter(path, SIZE, fps=5) as video:
+            for frame in frames(3):
+                video.add(frame)
+            raise KeyboardInterrupt("stop")
+
+    with pytest.raises(KeyboardInterrupt, match="stop"):
+        interrupted()
+    assert len(read_back(path)[1]) == 3
+    assert [file.name for file in tmp_path.iterdir()] == ["video.mp4"]
+
+
+def test_a_video_without_frames_leaves_no_file(tmp_path: Path) -> None:
+    """Nothing drawn, nothing left behind."""
+    with VideoWriter(tmp_path / "video.mp4", SIZE):
+        pass
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "size", "fps", "message"),
+    [
+        ("video.avi", (98, 62), 5, r"path: expected a file name ending in \.mp4"),
+        ("no/video.mp4", (98, 62), 5, "path: expected .* in a folder that exists"),
+        ("video.mp4", (97, 62), 5, r"size\[0\]: expected an even number, got 97"),
+        ("video.mp4", (98, 0), 5, r"size\[1\]: expected an int >= 2, got 0"),
+        ("video.mp4", (98, 62), 0, "fps: expected an int >= 1, got 0"),
+    ],
+)
+def test_bad_arguments_are_named(tmp_path: Path, name: str, size: tuple[int, int], fps: int, message: str) -> None:
+    """Each bad argument is refused before a process is started."""
+    with pytest.raises(ValueError, match=message):
+        VideoWriter(tmp_path / name, size, fps)
+
+
+def test_a_frame_of_another_size_is_refused(tmp_path: Path) -> None:
+    """A frame must be as large as the video."""
+    with VideoWriter(tmp_path / "video.mp4", SIZE) as video, pytest.raises(ValueError, match="frame: expected"):
+        video.add(np.zeros((SIZE[0], SIZE[1], 3), np.uint8))
+
+
+@pytest.mark.parametrize("num_steps", [1, 7, 240, 499, 501, 2500, 12345])
+def test_no_episode_makes_a_long_video(num_steps: int) -> None:
+    """Whatever an episode's length, its video stays below the limit, and its speed-up says how fast it runs."""
+    pace = choose_pace(num_steps, 0.1)
+    shown = -(-num_steps // pace.stride)
+    assert shown / pace.fps <= LONGEST_S
+    assert pace.speedup == pytest.approx(num_steps * 0.1 / (num_steps / pace.stride / pace.fps))
+
+
+def test_flashes_last_in_the_time_of_the_viewer() -> None:
+    """A merge 100 ticks ago is 10 ticks old at ten-fold speed; attempts, future and faded merges do not flash."""
+    nothing = np.zeros((0, 4))
+    scene = Scene(nothing, np.zeros((0, 3)), (), 300, 30.0, 0.2, (), (), 0.0)
+    refused = Alignment.refused("too few candidates")
+    events = [
+        MergeEvent(step, kind, (0,), (1, 2), refused)
+        for step, kind in ((10, "merge"), (200, "merge"), (250, "attempt"), (301, "merge"))
+    ]
+    (flash,) = with_slow_flashes(scene, events, 10.0).merges
+    assert (flash.age_ticks, flash.robots_a, flash.robots_b) == (10, (0,), (1, 2))

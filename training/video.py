@@ -1,0 +1,125 @@
+"""Writing an episode as a video that every browser plays: H.264, 4:2:0 colour, its index at the front."""
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import imageio_ffmpeg
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_backend.errors import bad_argument, check_float, check_int
+from slam_backend.reports import MergeEvent
+from vslam_env.rendering import MergeFlash, Scene
+from vslam_env.rendering.flash import FLASH_TICKS
+
+FPS = 25
+SLOWEST_FPS = 5
+LONGEST_S = 20.0
+SHORTEST_S = 12.0  # few frames are shown more slowly, so that an episode lasts about this long
+# Constant quality; larger is smaller and worse. 23 is x264's own middle, 26 still shows single dots.
+QUALITY = 26
+
+
+@dataclass(frozen=True, slots=True)
+class Pace:
+    """Which steps of an episode become frames, and how fast these are shown.
+
+    Attributes:
+        stride: Every `stride`-th step is a frame.
+        fps: Frames per second of video.
+        speedup: Simulated seconds per second of video.
+    """
+
+    stride: int
+    fps: int
+    speedup: float
+
+
+def choose_pace(num_steps: int, step_s: float) -> Pace:
+    """Choose a pace at which an episode of `num_steps` steps of `step_s` [s] takes at most `LONGEST_S`.
+
+    >>> choose_pace(2000, 0.1)
+    Pace(stride=4, fps=25, speedup=10.0)
+    """
+    check_int("num_steps", num_steps, 1, "An episode has at least one step.")
+    check_float("step_s", step_s, "Give the duration of a step in seconds.", above=0.0)
+    stride = max(1, math.ceil(num_steps / (FPS * LONGEST_S)))
+    fps = min(FPS, max(SLOWEST_FPS, math.ceil(num_steps / stride / SHORTEST_S)))
+    return Pace(stride, fps, stride * step_s * fps)
+
+
+def with_slow_flashes(scene: Scene, events: Iterable[MergeEvent], speedup: float) -> Scene:
+    """Let merges flash for as long as a viewer, not a robot, needs: ages run in the time of the video.
+
+    Args:
+        scene: The scene of a step.
+        events: The team's events; their `step` counts ticks as `scene.tick` does.
+        speedup: Simulated seconds per second of video.
+    """
+    ages = [(math.floor((scene.tick - event.step) / speedup), event) for event in events if event.kind == "merge"]
+    flashes = tuple(MergeFlash(age, e.robots_a, e.robots_b) for age, e in ages if 0 <= age < FLASH_TICKS)
+    return replace(scene, merges=flashes)
+
+
+class VideoWriter:
+    """A video file that appears under its name only when it is complete; use it in a `with` block.
+
+    It is completed also when the block is left by an exception, with the frames until then; a video without frames
+    leaves no file.
+
+    Args:
+        path: Of the file, ending in .mp4.
+        size: Width and height [px], both even, as 4:2:0 colour demands.
+        fps: Frames per second.
+
+    Raises:
+        ValueError: If the path ends otherwise, its folder is missing, or a number is out of range.
+    """
+
+    def __init__(self, path: Path, size: tuple[int, int], fps: int = FPS) -> None:
+        if path.suffix != ".mp4" or not path.parent.is_dir():
+            raise bad_argument("path", "a file name ending in .mp4 in a folder that exists", str(path), "Change it.")
+        for name, length in zip(("size[0]", "size[1]"), size, strict=True):
+            if check_int(name, length, 2, "Give the picture's size in pixels.") % 2:
+                raise bad_argument(name, "an even number", length, "Add one pixel.")
+        check_int("fps", fps, 1, "Show at least one frame a second.")
+        self._path, self._size = path, size
+        self._partial = path.with_name(f".{path.stem}.partial.mp4")
+        self._frames = 0
+        self._sink: Any = imageio_ffmpeg.write_frames(
+            self._partial,
+            size,
+            fps=fps,
+            codec="libx264",
+            pix_fmt_in="rgb24",
+            pix_fmt_out="yuv420p",
+            macro_block_size=2,
+            quality=None,
+            output_params=["-crf", str(QUALITY), "-preset", "veryfast", "-movflags", "+faststart"],
+        )
+        self._sink.send(None)
+
+    def add(self, frame: NDArray[np.uint8]) -> None:
+        """Append a frame (height, width, 3) uint8, RGB."""
+        width, height = self._size
+        if frame.shape != (height, width, 3) or frame.dtype != np.uint8:
+            got = f"shape {frame.shape} of {frame.dtype}"
+            raise bad_argument("frame", f"an array of shape ({height}, {width}, 3) of uint8", got, "Draw it so large.")
+        self._sink.send(np.ascontiguousarray(frame))
+        self._frames += 1
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._sink.close()
+        if self._frames:
+            self._partial.replace(self._path)
+        else:
+            self._partial.unlink(missing_ok=True)
