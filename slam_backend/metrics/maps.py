@@ -1,5 +1,6 @@
 """How far an estimated map is from the true landmarks, counting what is missing and what is too much."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -49,28 +50,43 @@ class MapScore:
 
 
 @jit
-def _nearest_claimants(means: FloatArray, claims: IntArray, truths: FloatArray) -> tuple[FloatArray, IntArray, int]:
-    """Return per truth the least squared distance of a claimant (inf: none) and its index, and what is too much.
+def _nearest_claimants(
+    means: FloatArray, claims: IntArray, truths: FloatArray
+) -> tuple[FloatArray, IntArray, int, int]:
+    """Return who holds each truth and what is too much.
 
-    The last number counts false estimates and those whose truth a nearer claimant holds; it is -1 - i if claim i is
-    neither a truth nor a mark.
+    That is, per truth the least squared distance of a claimant (inf: none) and its index (-1: none); the number of
+    false estimates and of those whose truth a nearer claimant holds; and the first row that is not finite or claims
+    what does not exist (-1: none).
     """
     least, holder = np.full(len(truths), np.inf), np.full(len(truths), -1)
     surplus = 0
     for i in range(len(means)):
         claim = claims[i]
-        if claim >= len(truths) or claim < UNCOUNTED:
-            return least, holder, -1 - i
+        finite = math.isfinite(means[i, 0]) and math.isfinite(means[i, 1]) and math.isfinite(means[i, 2])
+        if not finite or claim >= len(truths) or claim < UNCOUNTED:
+            return least, holder, surplus, i
         if claim == FALSE:
             surplus += 1
         elif claim >= 0:
             distance = 0.0
             for axis in range(3):
                 distance += (means[i, axis] - truths[claim, axis]) ** 2
-            surplus += holder[claim] >= 0
+            if holder[claim] >= 0:
+                surplus += 1
             if distance < least[claim]:
                 least[claim], holder[claim] = distance, i
-    return least, holder, surplus
+    return least, holder, surplus, -1
+
+
+@jit
+def _map_error(least: FloatArray, surplus: int, cutoff: float) -> float:
+    """Return E from the squared distances of the holders (inf: missed) and the number of surplus estimates."""
+    squared = cutoff * cutoff
+    total = 0.5 * squared * surplus
+    for square in least:
+        total += 0.5 * squared if square == np.inf else min(square, squared)
+    return math.sqrt(total / len(least))
 
 
 def map_error(means: FloatArray, claims: IntArray, true_positions: FloatArray, cutoff: float = 1.0) -> float:
@@ -99,11 +115,7 @@ def map_error(means: FloatArray, claims: IntArray, true_positions: FloatArray, c
         raise bad_argument("cutoff", "a number > 0", cutoff, "Give the cutoff distance in metres.")
     if not len(least):
         raise bad_argument("true_positions", "at least one landmark", "an array of none", "Use a world with landmarks.")
-    squared = cutoff * cutoff
-    held = least < np.inf
-    missed = len(least) - np.count_nonzero(held)
-    total = np.minimum(least[held], squared).sum() + 0.5 * squared * (missed + surplus)
-    return float(np.sqrt(total / len(least)))
+    return _map_error(least, surplus, cutoff)
 
 
 def _claimed(means: FloatArray, claims: IntArray, truths: FloatArray) -> tuple[FloatArray, IntArray, int]:
@@ -114,12 +126,13 @@ def _claimed(means: FloatArray, claims: IntArray, truths: FloatArray) -> tuple[F
         raise bad_argument("means", f"an array of shape ({len(claims)}, 3)", f"shape {means.shape}", "One per claim.")
     if truths.ndim != 2 or truths.shape[1] != 3:
         raise bad_argument("true_positions", "an array of shape (N, 3)", f"shape {truths.shape}", "One row each.")
-    if not np.isfinite(means).all():
-        raise bad_argument("means", "finite numbers", "NaN or infinity", "Drop landmarks that are not finite.")
-    least, holder, surplus = _nearest_claimants(means, claims, truths)
-    if surplus < 0:
+    least, holder, surplus, bad = _nearest_claimants(means, claims, truths)
+    if bad >= 0:
+        if not np.isfinite(means[bad]).all():
+            cure = "Drop landmarks that are not finite."
+            raise bad_argument("means", "finite numbers", f"NaN or infinity in row {bad}", cure)
         expected = f"indices below {len(truths)}, -1 for false or -2 for uncounted ones"
-        raise bad_argument("claims", expected, int(claims[-1 - surplus]), "Claim landmarks that exist.")
+        raise bad_argument("claims", expected, int(claims[bad]), "Claim landmarks that exist.")
     return least, holder, surplus
 
 
