@@ -144,6 +144,11 @@ class FastSlam:
         return int(np.count_nonzero(self._ids >= 0))
 
     @property
+    def map_size(self) -> int:
+        """Landmarks that the most probable particle holds: the length of `map()`."""
+        return int(np.count_nonzero(self._present[:, self.best_particle]))
+
+    @property
     def descriptor_size(self) -> int:
         """Length of the descriptors in the map, 0 before the first one."""
         return int(self._descriptors.shape[1])

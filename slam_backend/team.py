@@ -119,7 +119,7 @@ class TeamSlam:
                 {
                     "ess": float(group.filter.num_particles) if report is None else report.ess,
                     "nis": float("nan") if report is None else report.nis,
-                    "landmarks": float(len(group.filter.map())),
+                    "landmarks": float(group.filter.map_size),
                     "accepted": float(np.count_nonzero(found >= 0) - new),
                     "new": float(new),
                     "rejected": float(np.count_nonzero(found < 0)),
