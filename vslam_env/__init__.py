@@ -1,1 +1,19 @@
-"""A PettingZoo environment in which robots that do not know where they start build one visual map together."""
+"""A PettingZoo environment in which robots that do not know where they start build one visual map together.
+
+Importing it registers `vslam_env/Exploration-v0` with PettingZoo and `vslam_env/SoloExploration-v0` with Gymnasium.
+"""
+
+import gymnasium
+import pettingzoo
+
+from vslam_env.belief import Belief
+from vslam_env.config import EnvConfig, preset_config
+from vslam_env.environment import ExplorationEnv
+from vslam_env.world import World
+
+__all__ = ["Belief", "EnvConfig", "ExplorationEnv", "World", "preset_config"]
+
+if hasattr(pettingzoo, "register"):  # since 1.27
+    pettingzoo.register("parallel", "vslam_env/Exploration-v0", "vslam_env.vslam_v0:parallel_env")
+    pettingzoo.register("aec", "vslam_env/Exploration-v0", "vslam_env.vslam_v0:env")
+gymnasium.register("vslam_env/SoloExploration-v0", "vslam_env.solo:SoloExplorationEnv")

@@ -1,0 +1,124 @@
+"""Actions become velocity commands: their spaces, their check, and the driving towards `goal` candidates."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from slam_backend.errors import FloatArray, bad_argument
+from vslam_env.belief import Belief
+from vslam_env.navigation import follow_path, plan_path
+from vslam_env.observation import NUM_ACTIONS
+
+MAX_SPEED, MAX_REVERSE, MAX_TURN = 1.0, 0.3, 1.5  # [m/s], [m/s], [rad/s]
+DISCRETE_COMMANDS = np.array([[0.0, 0.0], [MAX_SPEED, 0.0], [0.0, MAX_TURN], [0.0, -MAX_TURN]])  # stay ahead left right
+
+
+def action_space(action_type: str) -> spaces.Space[Any]:
+    """Return the space of one robot's actions of a type."""
+    if action_type == "continuous":
+        return spaces.Box(-1.0, 1.0, (2,), np.float32)
+    return spaces.Discrete(len(DISCRETE_COMMANDS) if action_type == "discrete" else NUM_ACTIONS)
+
+
+def checked_actions(actions: Any, agents: Sequence[str], action_type: str) -> list[Any]:
+    """Return one action per agent, in their order.
+
+    Args:
+        actions: Mapping from agent to action.
+        agents: Those that must act.
+        action_type: Of all of them.
+
+    Returns:
+        (2,) float64 arrays in [-1, 1], or ints.
+
+    Raises:
+        ValueError: If an agent is unknown or missing, or an action is outside its space.
+    """
+    if not isinstance(actions, Mapping):
+        raise bad_argument("actions", "a dict from agent to action", actions, "Pass {agent: action}.")
+    unknown = [agent for agent in actions if agent not in agents]
+    if unknown:
+        raise bad_argument("actions", f"actions of {list(agents)}", unknown[0], "Drop agents that are not there.")
+    missing = [agent for agent in agents if agent not in actions]
+    if missing:
+        raise bad_argument("actions", f"an action of {missing[0]!r}", f"no {missing[0]!r}", "All agents act at once.")
+    check = _checked_box if action_type == "continuous" else _checked_index
+    limit = len(DISCRETE_COMMANDS) if action_type == "discrete" else NUM_ACTIONS
+    return [check(f"actions[{agent!r}]", actions[agent], limit) for agent in agents]
+
+
+def _checked_box(name: str, action: Any, _limit: int) -> FloatArray:
+    cure = "Give (speed, turn) in [-1, 1]."
+    try:
+        array = np.array(action, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise bad_argument(name, "an array of shape (2,)", action, cure) from error
+    if array.shape != (2,):
+        raise bad_argument(name, "an array of shape (2,)", f"shape {array.shape}", cure)
+    if not (np.abs(array) <= 1.0).all():  # false for NaN
+        raise bad_argument(name, "two numbers in [-1, 1]", array.tolist(), cure)
+    return array
+
+
+def _checked_index(name: str, action: Any, limit: int) -> int:
+    value = action.item() if isinstance(action, (np.generic, np.ndarray)) and np.size(action) == 1 else action
+    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < limit:
+        raise bad_argument(name, f"an int from 0 to {limit - 1}", action, "Sample from env.action_space(agent).")
+    return value
+
+
+def command_of(action_type: str, action: Any) -> FloatArray:
+    """Return the velocity command (2,) [m/s, rad/s] of a continuous or discrete action.
+
+    Continuous actions are scaled to the limits of either direction, so that zeros stand still.
+    """
+    if action_type == "discrete":
+        return DISCRETE_COMMANDS[action]
+    speed, turn = action
+    return np.array([speed * (MAX_SPEED if speed > 0.0 else MAX_REVERSE), turn * MAX_TURN])
+
+
+class GoalDriver:
+    """Drives one robot to the candidate that it chose, over the floor of its own grid.
+
+    A path is planned when the goal is set, and again when the robot bumps into something.
+    """
+
+    def __init__(self) -> None:
+        self._goal: FloatArray | None = None
+        self._heading = 0.0
+        self._path: FloatArray | None = None
+
+    def choose(self, belief: Belief, action: int) -> bool:
+        """Head for the candidate of slot `action` - 1, or stay with 0.
+
+        Returns:
+            Whether the action was valid; a masked one acts as 0.
+        """
+        candidates = belief.candidates
+        valid = action == 0 or bool(candidates.valid[action - 1])
+        if action == 0 or not valid:
+            self._goal = None
+        else:
+            self._goal, self._heading = candidates.goals[action - 1], float(candidates.headings[action - 1])
+            self._path = plan_path(belief.grid.cells, belief.pose[:2], self._goal)
+        return valid
+
+    def command(self, pose: FloatArray, cells: NDArray[np.uint8], bumped: bool) -> FloatArray:
+        """Return the velocity command (2,) [m/s, rad/s] for the next tick.
+
+        Args:
+            pose: (3,) float64 [m, m, rad], start frame. As the robot believes.
+            cells: (300, 300) uint8. Of its seen grid.
+            bumped: Whether it bumped into something in the last tick.
+        """
+        if self._goal is None:
+            return np.zeros(2)
+        if bumped:
+            self._path = plan_path(cells, pose[:2], self._goal)
+        if self._path is None:
+            return np.zeros(2)
+        return np.array(follow_path(pose, self._path, MAX_SPEED, MAX_TURN, self._heading))

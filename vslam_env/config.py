@@ -1,0 +1,227 @@
+"""`EnvConfig`: everything that defines an environment, frozen and validated, with presets and a TOML form."""
+
+import dataclasses
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, Self
+
+import numpy as np
+import tomli_w
+from pydantic import ConfigDict, TypeAdapter, ValidationError
+
+from slam_backend.errors import bad_argument, check_choice, check_float, check_int
+from slam_backend.filter_options import FilterOptions
+from slam_backend.motion import OdometryModel
+from vslam_env.belief import BeliefConfig
+from vslam_env.sensors import LandmarkSensorConfig, ScanConfig
+from vslam_env.world import LandmarkConfig, OdometryNoise
+
+ACTION_TYPES = ("continuous", "discrete", "goal")
+OBSERVATION_TYPES = ("dict", "flat")
+SENSORS = ("landmark",)
+PRESETS = ("easy", "standard", "hard")
+MAX_ROBOTS = 8
+TICK = 0.1  # [s]
+GOAL_DECISION_TICKS = 10
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EnvConfig:
+    """An environment. The true noise of the simulator and the noise that the filters assume are set separately.
+
+    Attributes:
+        world: A family name, or the path of a floor plan, of a JSON file of walls or of a folder of these. Of an
+            environment made with a `World` or a function: its name.
+        num_robots: K, at most 8.
+        sensor: What measures landmarks.
+        action_type: `"continuous"`: (speed, turn) in [-1, 1]. `"discrete"`: stay, ahead, left, right. `"goal"`: one of
+            the candidates of the last observation.
+        decision_ticks: Ticks of 0.1 s in an `env.step`; None: 1, or 10 with `goal` actions.
+        max_cycles: After so many calls of `env.step` the episode is truncated.
+        stop_at_recall: The episode terminates when every robot's map holds this share of the landmarks; None: never.
+        observation_type: `"dict"`: named arrays. `"flat"`: one float32 vector.
+        reward: Weights of the named reward terms.
+        oracle_pose: The robots know their poses, each in its own start frame.
+        oracle_association: The robots know which landmark is which.
+        oracle_merge: Groups that share three true landmarks merge with the true transform; none tries by itself.
+        robot_radius: [m].
+        min_start_distance: Between any two robots [m].
+        shared_start_view: Whether two robots may see a common landmark at their starts.
+        map_error_cutoff: c of the map error [m].
+        landmarks: Where the landmarks of worlds without their own are, and how alike they look.
+        odometry: True noise of the odometry.
+        landmark_sensor: True noise of the landmark sensor.
+        scan: The range finder and its true noise.
+        belief: What the robots assume, and how they align their maps.
+    """
+
+    __pydantic_config__ = ConfigDict(extra="forbid")
+
+    world: str = "office"
+    num_robots: int = 3
+    sensor: Literal["landmark"] = "landmark"
+    action_type: Literal["continuous", "discrete", "goal"] = "continuous"
+    decision_ticks: int | None = None
+    max_cycles: int = 1000
+    stop_at_recall: float | None = None
+    observation_type: Literal["dict", "flat"] = "dict"
+    reward: Mapping[str, float] = field(default_factory=lambda: {"map_error": 1.0})
+    oracle_pose: bool = False
+    oracle_association: bool = False
+    oracle_merge: bool = False
+    robot_radius: float = 0.2
+    min_start_distance: float = 5.0
+    shared_start_view: bool = False
+    map_error_cutoff: float = 1.0
+    landmarks: LandmarkConfig = field(default_factory=LandmarkConfig)
+    odometry: OdometryNoise = field(default_factory=OdometryNoise)
+    landmark_sensor: LandmarkSensorConfig = field(default_factory=LandmarkSensorConfig)
+    scan: ScanConfig = field(default_factory=ScanConfig)
+    belief: BeliefConfig = field(default_factory=BeliefConfig)
+
+    def __post_init__(self) -> None:
+        robots = check_int("num_robots", self.num_robots, 1, "Use 1 to 8 robots.")
+        if robots > MAX_ROBOTS:
+            raise bad_argument("num_robots", f"an int from 1 to {MAX_ROBOTS}", robots, "Use 1 to 8 robots.")
+        check_choice("sensor", self.sensor, SENSORS)
+        check_choice("action_type", self.action_type, ACTION_TYPES)
+        check_choice("observation_type", self.observation_type, OBSERVATION_TYPES)
+        if self.decision_ticks is not None:
+            check_int("decision_ticks", self.decision_ticks, 1, "Give a number of ticks of 0.1 s.")
+        check_int("max_cycles", self.max_cycles, 1, "Give a number of steps.")
+        if self.stop_at_recall is not None:
+            check_float("stop_at_recall", self.stop_at_recall, "Give a share or None.", above=0.0, at_most=1.0)
+        for name, weight in self.reward.items():
+            check_float(f"reward[{name!r}]", weight, "Give the weight of the term.")
+        check_float("robot_radius", self.robot_radius, "Give metres.", above=0.0)
+        check_float("min_start_distance", self.min_start_distance, "Give metres.", at_least=0.0)
+        check_float("map_error_cutoff", self.map_error_cutoff, "Give metres.", above=0.0)
+        check_float("scan.half_fov", self.scan.half_fov, "Grids are painted from less than a half circle.", at_most=1.57)
+
+    @property
+    def ticks_per_step(self) -> int:
+        """Ticks in an `env.step`."""
+        if self.decision_ticks is not None:
+            return self.decision_ticks
+        return GOAL_DECISION_TICKS if self.action_type == "goal" else 1
+
+    @property
+    def agents(self) -> list[str]:
+        """Names of the agents: `robot_0`, `robot_1`, ..."""
+        return [f"robot_{robot}" for robot in range(self.num_robots)]
+
+    def replace(self, **changes: Any) -> Self:
+        """Return a validated copy with some fields changed.
+
+        Args:
+            **changes: Fields by name. A nested part can be given as an object or as a dict, which then changes only
+                the fields that it names.
+
+        Raises:
+            ValueError: If a field is unknown or a value is refused; the text names it.
+        """
+        return _validated(type(self), _merged(_plain(self), changes))
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Self:
+        """Build a configuration from nested dicts; what is left out has the value of the `standard` preset."""
+        return _validated(cls, values)
+
+    @classmethod
+    def from_toml(cls, path: str | Path) -> Self:
+        """Read a configuration from a TOML file, as `to_toml` writes it."""
+        try:
+            values = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+        except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+            raise bad_argument("config", "a readable TOML file", str(path), f"The reader says: {error}.") from error
+        return cls.from_dict(values)
+
+    def to_toml(self) -> str:
+        """Return the configuration as TOML. Fields that are None are left out, which means the same."""
+        return tomli_w.dumps(_without_none(_plain(self)))
+
+
+def preset_config(name: str) -> EnvConfig:
+    """Return a preset.
+
+    `standard`: odometry with sigma 5 % of the distance and 2 degrees per metre, and a bias per episode of 2 % and 0.5
+    degrees per metre; 5 landmarks a tick, detected with probability 0.9, 0.02 false points, descriptor noise 0.17.
+    `easy`: odometry noise and bias halved, 10 landmarks a tick detected with probability 0.95, no false points,
+    descriptor noise 0.1.
+    `hard`: odometry noise and bias doubled, 3 landmarks a tick detected with probability 0.8, 0.1 false points,
+    descriptor noise 0.2.
+    The filters assume the odometry noise of their preset.
+
+    Raises:
+        ValueError: If there is no such preset.
+    """
+    check_choice("preset", name, PRESETS)
+    if name == "standard":
+        return EnvConfig()
+    scale = 0.5 if name == "easy" else 2.0
+    odometry, motion = OdometryNoise(), OdometryModel()
+    return EnvConfig(
+        odometry=OdometryNoise(**{f.name: scale * getattr(odometry, f.name) for f in dataclasses.fields(odometry)}),
+        belief=BeliefConfig(
+            filter=FilterOptions(
+                motion=OdometryModel(
+                    sigma_along=scale * motion.sigma_along,
+                    sigma_across=scale * motion.sigma_across,
+                    sigma_heading=scale * motion.sigma_heading,
+                )
+            )
+        ),
+        landmark_sensor=LandmarkSensorConfig(
+            max_measurements=10, detection_probability=0.95, false_points=0.0, descriptor_noise=0.1
+        )
+        if name == "easy"
+        else LandmarkSensorConfig(
+            max_measurements=3, detection_probability=0.8, false_points=0.1, descriptor_noise=0.2
+        ),
+    )
+
+
+def _validated(cls: type[Any], values: Mapping[str, Any]) -> Any:
+    """Build `cls` from nested dicts, or raise the project's one error for the first thing that is wrong."""
+    try:
+        return TypeAdapter(cls).validate_python(dict(values))
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        own = first.get("ctx", {}).get("error")
+        if isinstance(own, ValueError):  # raised by a check of ours, which explains itself
+            raise own from None
+        name = ".".join(str(part) for part in first["loc"])
+        if first["type"] == "unexpected_keyword_argument":
+            raise bad_argument(name, "a known field", first["input"], "Check the spelling.") from None
+        expected = first["msg"].removeprefix("Input should be ")
+        raise bad_argument(name, expected, first["input"], "Correct this value.") from None
+
+
+def _plain(value: Any) -> Any:
+    """Turn nested configurations into dicts, lists and numbers."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+    if isinstance(value, Mapping):
+        return {key: _plain(entry) for key, entry in value.items()}
+    if isinstance(value, tuple):
+        return [_plain(entry) for entry in value]
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def _merged(values: dict[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return nested dicts with some entries changed; weights of rewards are replaced as a whole."""
+    merged = dict(values)
+    for key, change in changes.items():
+        change = _plain(change)
+        nested = isinstance(change, dict) and isinstance(merged.get(key), dict) and key != "reward"
+        merged[key] = _merged(merged[key], change) if nested else change
+    return merged
+
+
+def _without_none(values: Any) -> Any:
+    """Drop entries that are None, which TOML does not know."""
+    if isinstance(values, dict):
+        return {key: _without_none(value) for key, value in values.items() if value is not None}
+    return values

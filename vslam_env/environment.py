@@ -1,0 +1,340 @@
+"""`ExplorationEnv`: the PettingZoo parallel environment."""
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+from pettingzoo import ParallelEnv
+
+from slam_backend.errors import FloatArray, bad_argument, check_choice, check_int
+from slam_backend.reports import MergeEvent
+from vslam_env.actions import GoalDriver, action_space, checked_actions, command_of
+from vslam_env.belief import Belief
+from vslam_env.config import EnvConfig
+from vslam_env.episode import Episode, Recorder
+from vslam_env.errors_of_maps import MapScores
+from vslam_env.observation import flatten, observation_space, observe
+from vslam_env.readings import Readings
+from vslam_env.rendering import Scene, draw_frame
+from vslam_env.reward import RewardSpec, Standing, evaluate, make_terms
+from vslam_env.scenes import scene_of
+from vslam_env.window import Window
+from vslam_env.world import World, WorldSource
+
+AgentID = str
+RENDER_MODES = ("human", "rgb_array")
+STATE_PER_ROBOT = 12
+
+
+class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):
+    """Robots that do not know where they start explore a building, build maps, and merge these when they fit.
+
+    `vslam_v0.parallel_env` describes the arguments; what is observed is described in `vslam_env.observation`.
+
+    Attributes:
+        config: All that defines this environment.
+        max_cycles: After so many steps the episode is truncated; may be assigned.
+        recorder: A function to be called with the readings of every tick, those of the reset included; None: nothing.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {  # type: ignore[misc]   # PettingZoo declares it for instances
+        "name": "vslam_env/Exploration-v0",
+        "render_modes": list(RENDER_MODES),
+        "render_fps": 10,
+        "is_parallelizable": True,
+    }
+
+    def __init__(
+        self,
+        config: EnvConfig,
+        world: WorldSource | None = None,
+        reward: RewardSpec | None = None,
+        render_mode: str | None = None,
+    ) -> None:
+        if render_mode is not None:
+            check_choice("render_mode", render_mode, RENDER_MODES, "Choose one of these, or None.")
+        self.config = config
+        self.render_mode = render_mode
+        self.max_cycles = config.max_cycles
+        self.recorder: Recorder | None = None
+        self._source: WorldSource = config.world if world is None else world
+        self._terms = make_terms(config.reward if reward is None else reward)
+        self.possible_agents = config.agents
+        self.agents: list[AgentID] = []
+        goal, flat = config.action_type == "goal", config.observation_type == "flat"
+        self._observed = observation_space(config.scan.num_rays, config.scan.max_range, goal, flat)
+        self.observation_spaces = dict.fromkeys(self.possible_agents, self._observed)
+        self.action_spaces = {agent: action_space(config.action_type) for agent in self.possible_agents}
+        size = STATE_PER_ROBOT * config.num_robots + 2
+        self.state_space = spaces.Box(-np.inf, np.inf, (size,), np.float32)
+        self._root: np.random.SeedSequence | None = None
+        self._episode: Episode | None = None
+        self._window = Window(self.metadata["name"])
+
+    # ------------------------------------------------------------------ PettingZoo
+
+    def observation_space(self, agent: AgentID) -> spaces.Space[Any]:
+        """Return the space of an agent's observations; always the same object."""
+        return self.observation_spaces[agent]
+
+    def action_space(self, agent: AgentID) -> spaces.Space[Any]:
+        """Return the space of an agent's actions; always the same object."""
+        return self.action_spaces[agent]
+
+    def reset(
+        self, seed: int | None = None, options: Mapping[str, Any] | None = None
+    ) -> tuple[dict[AgentID, Any], dict[AgentID, dict[str, Any]]]:
+        """Build a new world, put the robots at their starts and let them take their first frame.
+
+        Args:
+            seed: Of this episode and, by continuation, of the following ones; None: go on, or begin anywhere.
+            options: `"world_seed"`: int, of the layout and textures only. `"start_poses"`: (K, 3) [m, m, rad], world
+                frame. Others are ignored.
+
+        Returns:
+            Observations and infos by agent.
+
+        Raises:
+            ValueError: If the seed, an option or the world is bad; the text says what would do.
+        """
+        if seed is not None:
+            self._root = np.random.SeedSequence(check_int("seed", seed, 0, "Give an int >= 0, or None."))
+        elif self._root is None:
+            self._root = np.random.SeedSequence()
+        options = {} if options is None else options
+        if not isinstance(options, Mapping):
+            raise bad_argument("options", "a dict or None", options, "E.g. {'world_seed': 3}.")
+        world_seed = options.get("world_seed")
+        if world_seed is not None:
+            check_int("options['world_seed']", world_seed, 0, "Give an int >= 0.")
+        self.agents = []  # a reset that fails leaves no episode to step
+        self._episode = Episode(
+            self.config,
+            self._source,
+            self._root.spawn(1)[0],
+            world_seed,
+            options.get("start_poses"),
+            self.recorder,
+        )
+        self.agents = self.possible_agents[:]
+        self._cycle = 0
+        self._drivers = [GoalDriver() for _ in self.agents]
+        self._take_stock()
+        nothing = np.zeros(len(self.agents))
+        return self._observations(), self._infos({term.name: nothing for term in self._terms}, [0] * len(self.agents))
+
+    def step(
+        self, actions: Mapping[AgentID, Any]
+    ) -> tuple[
+        dict[AgentID, Any],
+        dict[AgentID, float],
+        dict[AgentID, bool],
+        dict[AgentID, bool],
+        dict[AgentID, dict[str, Any]],
+    ]:
+        """Let all robots act for `decision_ticks` ticks.
+
+        Args:
+            actions: One action per agent.
+
+        Returns:
+            Observations, rewards, terminations, truncations and infos by agent.
+
+        Raises:
+            ValueError: If an agent is unknown or missing, or an action is outside its space; nothing has moved then.
+            RuntimeError: Before the first reset, or after the end.
+        """
+        episode = self._running_episode("step")
+        if not self.agents:
+            raise RuntimeError("step: expected a running episode, got one that has ended. Call reset() first.")
+        agents = self.agents
+        chosen = checked_actions(actions, agents, self.config.action_type)
+        invalid = self._drive(episode, chosen)
+        before = self._standing
+        self._take_stock()
+        self._cycle += 1
+
+        terms = evaluate(self._terms, before, self._standing)
+        rewards = np.sum(list(terms.values()), axis=0) if terms else np.zeros(len(agents))
+        goal = self.config.stop_at_recall
+        terminated = goal is not None and bool(self._standing.map_recalls.min() >= goal)
+        truncated = not terminated and self._cycle >= self.max_cycles
+        results = (
+            self._observations(),
+            {agent: float(reward) for agent, reward in zip(agents, rewards, strict=True)},
+            dict.fromkeys(agents, terminated),
+            dict.fromkeys(agents, truncated),
+            self._infos(terms, invalid),
+        )
+        if terminated or truncated:
+            self.agents = []
+        if self.render_mode == "human":
+            self.render()
+        return results
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """Return a picture (720, 960, 3) uint8 with `"rgb_array"`; show it with `"human"` and return None.
+
+        Raises:
+            RuntimeError: Before the first reset.
+        """
+        if self.render_mode is None:
+            return None
+        frame = draw_frame(self.scene())
+        if self.render_mode == "rgb_array":
+            return frame
+        self._window.show(frame)
+        return None
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        self._window.close()
+
+    def state(self) -> NDArray[np.float32]:
+        """Return the truth for centralised critics, as one float32 vector.
+
+        Per robot: true pose (x, y, cos, sin, world frame), pose as estimated (x, y, cos, sin, laid at the true start),
+        map error, map recall, heading error, first robot of its group; then coverage and merges of the team.
+        """
+        episode = self._running_episode("state")
+        true, believed = episode.true_path[-1], episode.believed_poses()
+        rows = [
+            np.column_stack([poses[:, :2], np.cos(poses[:, 2]), np.sin(poses[:, 2])]) for poses in (true, believed)
+        ]
+        standing = self._standing
+        frames = [episode.belief.group(robot)[0] for robot in range(len(true))]
+        scored = np.column_stack([standing.map_errors, standing.map_recalls, self._pose_errors[:, 1], frames])
+        return np.concatenate([np.hstack([*rows, scored]).ravel(), [standing.coverage, standing.merges]]).astype(
+            np.float32
+        )
+
+    # ------------------------------------------------------------------ beyond PettingZoo
+
+    def belief(self, agent: AgentID) -> Belief:
+        """Return what an agent's robot believes; it holds nothing of the truth."""
+        return self._running_episode("belief").belief.belief(self._index(agent))
+
+    @property
+    def events(self) -> tuple[MergeEvent, ...]:
+        """All attempts and merges since the reset, in order."""
+        return self._running_episode("events").belief.events
+
+    @property
+    def readings(self) -> tuple[Readings, ...]:
+        """What each robot perceived in the last tick."""
+        return self._running_episode("readings").readings
+
+    @property
+    def world(self) -> World:
+        """The true world of this episode, its landmarks included."""
+        return self._running_episode("world").world
+
+    @property
+    def true_landmarks(self) -> FloatArray:
+        """(N, 3) float64 [m], world frame. The landmarks that count: those that some robot could ever see."""
+        return self._running_episode("true_landmarks").ledger.true_positions
+
+    @property
+    def true_poses(self) -> FloatArray:
+        """(K, 3) float64 [m, m, rad], world frame."""
+        return self._running_episode("true_poses").true_poses
+
+    @property
+    def true_start_poses(self) -> FloatArray:
+        """(K, 3) float64 [m, m, rad], world frame."""
+        return self._running_episode("true_start_poses").true_starts.copy()
+
+    @property
+    def episode(self) -> Episode:
+        """The running episode, for diagnosis: the simulator's books, paths, seeds."""
+        return self._running_episode("episode")
+
+    def scene(self) -> Scene:
+        """Return what a picture shows now."""
+        return scene_of(self._running_episode("scene"), self._standing)
+
+    # ------------------------------------------------------------------ within
+
+    def _running_episode(self, name: str) -> Episode:
+        if self._episode is None:
+            raise RuntimeError(f"{name}: expected a running episode, got none. Call reset() first.")
+        return self._episode
+
+    def _index(self, agent: AgentID) -> int:
+        if agent not in self.possible_agents:
+            raise bad_argument("agent", f"one of {self.possible_agents}", agent, "Use a name of possible_agents.")
+        return self.possible_agents.index(agent)
+
+    def _drive(self, episode: Episode, chosen: list[Any]) -> list[int]:
+        """Carry out one action per robot; return which were masked (K,)."""
+        config = self.config
+        if config.action_type != "goal":
+            commands = np.array([command_of(config.action_type, action) for action in chosen])
+            for _ in range(config.ticks_per_step):
+                episode.advance(commands)
+            return [0] * len(chosen)
+        beliefs = episode.belief
+        valid = [
+            driver.choose(beliefs.belief(robot), action)
+            for robot, (driver, action) in enumerate(zip(self._drivers, chosen, strict=True))
+        ]
+        for _ in range(config.ticks_per_step):
+            bumps = [readings.bump for readings in episode.readings]
+            episode.advance(
+                [
+                    driver.command(beliefs.pose(robot), beliefs.cells(robot), bumps[robot])
+                    for robot, driver in enumerate(self._drivers)
+                ]
+            )
+        return [int(not ok) for ok in valid]
+
+    def _take_stock(self) -> None:
+        """Score maps and poses as they stand now."""
+        episode = self._running_episode("step")
+        self._scores: list[MapScores] = episode.map_scores()
+        self._pose_errors: FloatArray = episode.pose_errors()
+        self._standing: Standing = episode.standing(self._scores, self._pose_errors)
+
+    def _observations(self) -> dict[AgentID, Any]:
+        episode, config = self._running_episode("step"), self.config
+        goal = config.action_type == "goal"
+        observations: dict[AgentID, Any] = {}
+        for robot, agent in enumerate(self.agents):
+            observation = observe(episode.belief.belief(robot), episode.readings[robot].scan, goal)
+            if config.observation_type == "dict":
+                observations[agent] = observation
+            elif goal:
+                observations[agent] = {"observation": flatten(observation), "action_mask": observation["action_mask"]}
+            else:
+                observations[agent] = flatten(observation)
+        return observations
+
+    def _infos(self, terms: Mapping[str, FloatArray], invalid: list[int]) -> dict[AgentID, dict[str, Any]]:
+        """Return each agent's figures; `map_rmse` is the cutoff of the map error while nothing is matched.
+
+        `collisions` (ticks), `distance` [m], `bytes_sent` and `merges` count since the reset.
+        """
+        standing, belief = self._standing, self._running_episode("step").belief
+        infos: dict[AgentID, dict[str, Any]] = {}
+        for robot, agent in enumerate(self.agents):
+            scores, group = self._scores[robot], belief.group(robot)
+            infos[agent] = {
+                "map_error": scores.error,
+                "map_rmse": scores.rmse,
+                "map_recall": scores.recall,
+                "map_precision": scores.precision,
+                "pose_error": float(self._pose_errors[robot, 0]),
+                "heading_error": float(self._pose_errors[robot, 1]),
+                "coverage": standing.coverage,
+                "group": group[0],
+                "group_size": len(group),
+                "merges": standing.merges,
+                "collisions": int(standing.collisions[robot]),
+                "distance": float(standing.distances[robot]),
+                "bytes_sent": int(standing.bytes_sent[robot]),
+                "invalid_action": invalid[robot],
+            }
+            infos[agent] |= {f"reward/{name}": float(values[robot]) for name, values in terms.items()}
+        return infos

@@ -1,0 +1,28 @@
+"""`Readings`: all that one robot perceives in one tick, and so all that its beliefs and observations can depend on."""
+
+from dataclasses import dataclass, field
+
+from slam_backend.errors import FloatArray, IntArray
+from slam_backend.measurements import Measurements
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Readings:
+    """What one robot's own sensors say in one tick.
+
+    Attributes:
+        odometry: (3,) float64 [m, m, rad], previous robot frame: motion since the last tick; None at a reset.
+        measurements: Landmarks that the camera measured.
+        scan: (R,) float64 [m]. Ranges along the rays of the range finder.
+        bump: Whether something kept the robot from going where it was commanded.
+        pose: (3,) float64 [m, m, rad], own start frame. The true pose if `oracle_pose` is on, else None.
+        identities: (n,) int64. The true landmark behind each measurement, -1 for a false point, if
+            `oracle_association` is on, else None.
+    """
+
+    odometry: FloatArray | None
+    measurements: Measurements
+    scan: FloatArray
+    bump: bool
+    pose: FloatArray | None = field(default=None)
+    identities: IntArray | None = field(default=None)

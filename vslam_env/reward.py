@@ -1,0 +1,123 @@
+"""Rewards as named, weighted terms of what a step changed."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+
+from slam_backend.errors import FloatArray, IntArray, bad_argument, check_float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Standing:
+    """How the team stands at one moment, as the simulator knows it.
+
+    Attributes:
+        map_errors: (K,) float64 [m]. E of each robot's map.
+        map_recalls: (K,) float64. Share of the landmarks that each holds.
+        pose_errors: (K,) float64 [m].
+        coverage: Share of the free floor that the team has seen.
+        collisions: (K,) int64. Ticks since the reset in which each robot was kept from moving as commanded.
+        distances: (K,) float64 [m]. Way that each has gone since the reset.
+        bytes_sent: (K,) int64. Since the reset.
+        merges: Since the reset.
+    """
+
+    map_errors: FloatArray
+    map_recalls: FloatArray
+    pose_errors: FloatArray
+    coverage: float
+    collisions: IntArray
+    distances: FloatArray
+    bytes_sent: IntArray
+    merges: int
+
+
+@runtime_checkable
+class RewardTerm(Protocol):
+    """One part of the reward. A term of your own is any object with these three.
+
+    Attributes:
+        name: Shown in infos as `reward/<name>`.
+        weight: What the term is multiplied with.
+    """
+
+    name: str
+    weight: float
+
+    def __call__(self, before: Standing, after: Standing) -> FloatArray:
+        """Return what each robot gains (K,) by a step, unweighted."""
+
+
+@dataclass(frozen=True, slots=True)
+class _NamedTerm:
+    name: str
+    weight: float
+
+    def __call__(self, before: Standing, after: Standing) -> FloatArray:
+        return TERMS[self.name](before, after)
+
+
+def _map_error(before: Standing, after: Standing) -> FloatArray:
+    return before.map_errors - after.map_errors
+
+
+def _coverage(before: Standing, after: Standing) -> FloatArray:
+    return np.full(len(after.map_errors), after.coverage - before.coverage)
+
+
+def _collisions(before: Standing, after: Standing) -> FloatArray:
+    return (before.collisions - after.collisions).astype(np.float64)
+
+
+TERMS: dict[str, Callable[[Standing, Standing], FloatArray]] = {
+    "map_error": _map_error,  # [m]; telescopes: an episode's return is the first error minus the last
+    "coverage": _coverage,  # the team's gain, for each robot
+    "collisions": _collisions,  # -1 for each tick of pushing against something
+}
+
+RewardSpec = Mapping[str, float] | Sequence[RewardTerm]
+
+
+def make_terms(reward: RewardSpec) -> tuple[RewardTerm, ...]:
+    """Turn names with weights, or ready-made terms, into terms.
+
+    Raises:
+        ValueError: If a name is unknown or repeats, or an object is no term.
+    """
+    if isinstance(reward, Mapping):
+        terms: list[RewardTerm] = []
+        for name, weight in reward.items():
+            if name not in TERMS:
+                names = "one of " + ", ".join(repr(known) for known in TERMS)
+                raise bad_argument("reward", names, name, "Choose one of these names, or pass a term of your own.")
+            terms.append(_NamedTerm(name, check_float(f"reward[{name!r}]", weight, "Give the weight of the term.")))
+        return tuple(terms)
+    if isinstance(reward, (str, bytes)) or not isinstance(reward, Sequence):
+        raise bad_argument("reward", "weights by name, or a list of terms", reward, "E.g. {'map_error': 1.0}.")
+    for term in reward:
+        if not isinstance(term, RewardTerm):
+            raise bad_argument("reward", "terms with name, weight and a call", term, "See vslam_env.reward.RewardTerm.")
+    names_used = [term.name for term in reward]
+    if len(set(names_used)) < len(names_used):
+        raise bad_argument("reward", "terms with different names", names_used, "Rename one of them.")
+    return tuple(reward)
+
+
+def evaluate(terms: Sequence[RewardTerm], before: Standing, after: Standing) -> dict[str, FloatArray]:
+    """Return the weighted reward (K,) of each term for a step, by name.
+
+    Raises:
+        ValueError: If a term returns anything but one finite number for each robot.
+    """
+    robots = len(after.map_errors)
+    rewards = {}
+    for term in terms:
+        value = np.asarray(term(before, after), dtype=np.float64)
+        if value.shape != (robots,) or not np.isfinite(value).all():
+            raise bad_argument(
+                f"reward term {term.name!r}", f"{robots} finite numbers", value, "Return one number for each robot."
+            )
+        rewards[term.name] = term.weight * value
+    return rewards

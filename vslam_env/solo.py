@@ -1,0 +1,62 @@
+"""`SoloExplorationEnv`: the environment of one robot, as Gymnasium has it."""
+
+from typing import Any, ClassVar
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_backend.errors import bad_argument
+from vslam_env.environment import ExplorationEnv
+from vslam_env.vslam_v0 import parallel_env
+
+AGENT = "robot_0"
+
+
+class SoloExplorationEnv(gymnasium.Env[Any, Any]):
+    """One robot that does not know where it starts explores a building and maps it.
+
+    Args:
+        render_mode: `"human"`, `"rgb_array"` or None.
+        **kwargs: As of `parallel_env`, without `num_robots`.
+
+    Attributes:
+        parallel: The parallel environment of one robot behind it, with `belief`, `events` and `scene`.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {  # type: ignore[misc]   # Gymnasium declares it for instances
+        "render_modes": ExplorationEnv.metadata["render_modes"],
+        "render_fps": ExplorationEnv.metadata["render_fps"],
+    }
+
+    def __init__(self, render_mode: str | None = None, **kwargs: Any) -> None:
+        if kwargs.get("num_robots", 1) != 1:
+            raise bad_argument("num_robots", "1", kwargs["num_robots"], "Use vslam_v0.parallel_env for a team.")
+        self.parallel = parallel_env(**kwargs | {"num_robots": 1, "render_mode": render_mode})
+        self.render_mode = render_mode
+        self.observation_space = self.parallel.observation_space(AGENT)
+        self.action_space = self.parallel.action_space(AGENT)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Start an episode; see `ExplorationEnv.reset`."""
+        super().reset(seed=seed)
+        observations, infos = self.parallel.reset(seed, options)
+        return observations[AGENT], infos[AGENT]
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Act; see `ExplorationEnv.step`."""
+        observations, rewards, terminations, truncations, infos = self.parallel.step({AGENT: action})
+        return observations[AGENT], rewards[AGENT], terminations[AGENT], truncations[AGENT], infos[AGENT]
+
+    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]   # frames are never returned as a list
+        """Return a picture or show it; see `ExplorationEnv.render`."""
+        return self.parallel.render()
+
+    def action_masks(self) -> NDArray[np.bool_]:
+        """Return which `goal` actions are valid (17,) bool, under the name that sb3-contrib's MaskablePPO asks for."""
+        valid = self.parallel.belief(AGENT).candidates.valid
+        return np.concatenate([[True], valid])
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        self.parallel.close()

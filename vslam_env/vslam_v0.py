@@ -1,0 +1,103 @@
+"""Version 0 of the environment under PettingZoo's names: `parallel_env`, `env`, `raw_env`."""
+
+from pathlib import Path
+from typing import Any
+
+from pettingzoo import AECEnv
+from pettingzoo.utils.conversions import parallel_to_aec
+from pettingzoo.utils.wrappers import OrderEnforcingWrapper
+
+from slam_backend.errors import bad_argument
+from vslam_env.config import EnvConfig, preset_config
+from vslam_env.environment import ExplorationEnv
+from vslam_env.reward import RewardSpec
+from vslam_env.world import World, WorldSource
+
+
+def parallel_env(
+    world: WorldSource | None = None,
+    num_robots: int | None = None,
+    sensor: str | None = None,
+    action_type: str | None = None,
+    decision_ticks: int | None = None,
+    num_particles: int | None = None,
+    max_cycles: int | None = None,
+    preset: str | None = None,
+    reward: RewardSpec | None = None,
+    observation_type: str | None = None,
+    oracle_pose: bool | None = None,
+    oracle_association: bool | None = None,
+    oracle_merge: bool | None = None,
+    stop_at_recall: float | None = None,
+    render_mode: str | None = None,
+    config: EnvConfig | str | Path | None = None,
+) -> ExplorationEnv:
+    """Make the parallel environment. An argument that is None leaves what the configuration or preset says.
+
+    Args:
+        world: `"office"` (default), `"fig5"`, the path of a floor plan (.png, .jpg, .pgm), of a .json file of walls or
+            of a folder of these, a `World`, or a function of a generator that returns one.
+        num_robots: 1 to 8; default 3.
+        sensor: `"landmark"`.
+        action_type: `"continuous"` (default): (speed, turn) in [-1, 1], zeros stand still. `"discrete"`: stay, ahead,
+            left, right. `"goal"`: 0 stays, 1 to 16 drive to a candidate of the last observation.
+        decision_ticks: Ticks of 0.1 s per step; default 1, with `goal` 10.
+        num_particles: Of each filter; default 100.
+        max_cycles: Steps until the episode is truncated; default 1000.
+        preset: `"easy"`, `"standard"` (default) or `"hard"`; see `preset_config`.
+        reward: Weights of terms by name (default `{"map_error": 1.0}`), or a list of terms of your own.
+        observation_type: `"dict"` (default) or `"flat"`.
+        oracle_pose: The robots know their poses in their own start frames.
+        oracle_association: They know which landmark is which.
+        oracle_merge: Groups that share three landmarks merge with the true transform.
+        stop_at_recall: Terminate when each map holds this share of the landmarks; default never.
+        render_mode: `"human"`, `"rgb_array"` or None.
+        config: An `EnvConfig` or the path of its TOML file, instead of a preset.
+
+    Raises:
+        ValueError: If an argument is refused; the text names it, what was expected and the cure.
+    """
+    if config is not None and preset is not None:
+        raise bad_argument("preset", "None beside a config", preset, "Give one of the two.")
+    if isinstance(config, (str, Path)):
+        config = EnvConfig.from_toml(config)
+    elif config is None:
+        config = preset_config("standard" if preset is None else preset)
+    elif not isinstance(config, EnvConfig):
+        raise bad_argument("config", "an EnvConfig, a path or None", config, "Build one with EnvConfig(...).")
+    changes: dict[str, Any] = {
+        "world": None if world is None else _world_name(world),
+        "num_robots": num_robots,
+        "sensor": sensor,
+        "action_type": action_type,
+        "decision_ticks": decision_ticks,
+        "max_cycles": max_cycles,
+        "observation_type": observation_type,
+        "oracle_pose": oracle_pose,
+        "oracle_association": oracle_association,
+        "oracle_merge": oracle_merge,
+        "stop_at_recall": stop_at_recall,
+        "reward": reward if isinstance(reward, dict) else None,
+        "belief": None if num_particles is None else {"filter": {"num_particles": num_particles}},
+    }
+    config = config.replace(**{name: value for name, value in changes.items() if value is not None})
+    return ExplorationEnv(config, world=world, reward=reward, render_mode=render_mode)
+
+
+def raw_env(**kwargs: Any) -> AECEnv[str, Any, Any]:
+    """Make the turn-based (AEC) environment, unwrapped; arguments as of `parallel_env`."""
+    return parallel_to_aec(parallel_env(**kwargs))
+
+
+def env(**kwargs: Any) -> AECEnv[str, Any, Any]:
+    """Make the turn-based (AEC) environment with PettingZoo's checks of the order of calls."""
+    return OrderEnforcingWrapper(raw_env(**kwargs))
+
+
+def _world_name(world: WorldSource) -> str:
+    """Return what the configuration calls a world."""
+    if isinstance(world, (str, Path)):
+        return str(world)
+    if isinstance(world, World):
+        return world.name
+    return getattr(world, "__name__", type(world).__name__)
