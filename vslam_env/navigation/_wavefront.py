@@ -43,7 +43,7 @@ def known_box(cells: Any, row: int, col: int, height: int, width: int) -> Any:
 
 @jit
 def _squared_clearance(box: Any, span: int) -> Any:
-    """Return each cell's squared distance to the nearest occupied one, (h, w) int16, exact up to `span` cells."""
+    """Return each cell's squared distance to the nearest occupied one, (h, w) int16, if at most `span`; else more."""
     height, width = box.shape
     along_row = np.empty((height, width), np.int16)
     for r in range(height):
@@ -58,9 +58,11 @@ def _squared_clearance(box: Any, span: int) -> Any:
     squared = along_row.copy()
     for r in range(height):
         for other in range(max(r - span, 0), min(r + span + 1, height)):
-            rise = np.int16((other - r) * (other - r))
+            rise = (other - r) * (other - r)
             for c in range(width):
-                squared[r, c] = min(squared[r, c], along_row[other, c] + rise)
+                through = np.int16(along_row[other, c] + rise)
+                if through < squared[r, c]:  # unlike min(), this becomes vector code
+                    squared[r, c] = through
     return squared
 
 
@@ -76,7 +78,7 @@ def weigh(box: Any, reach: float) -> Any:
         (h, w) uint8: 0 where a robot may not be (occupied, unknown, too near to a wall, or at the edge of the box),
         `CLOSE` within one more cell of that, `NEAR` within two or beside the unknown, else `OPEN`.
     """
-    clearance = _squared_clearance(box, math.ceil(reach + 2.0))
+    clearance = _squared_clearance(box, math.ceil(reach + 1.0))
     weights = np.zeros(box.shape, np.uint8)
     for r in range(1, box.shape[0] - 1):
         for c in range(1, box.shape[1] - 1):
@@ -142,7 +144,7 @@ def wavefront(weights: Any, row: int, col: int) -> tuple[Any, Any]:
 
     Args:
         weights: (h, w) uint8, 0 = closed. The outermost cells must be closed.
-        row: The first cell, open.
+        row: The first cell, open; -1 if there is none, and nothing is reached.
         col: See `row`.
 
     Returns:
@@ -152,15 +154,24 @@ def wavefront(weights: Any, row: int, col: int) -> tuple[Any, Any]:
     width = weights.shape[1]
     weight = weights.ravel()
     cost = np.full(weight.size, UNREACHED, np.int32)
-    cost[weight == 0] = -1  # below all costs, so that one comparison passes over closed and settled cells alike
+    for cell in range(weight.size):
+        if weight[cell] == 0:
+            cost[cell] = -1  # below all costs, so that one comparison passes over closed and settled cells alike
     parent = np.full(weight.size, -1, np.int32)
     entries = np.empty(8 * weight.size + 1, np.int32)  # a cost falls at most once per neighbour
     following = np.empty(8 * weight.size + 1, np.int32)
     heads = np.full(NUM_BUCKETS, -1, np.int32)
 
-    cost[row * width + col] = 0
-    entries[0], following[0], heads[0] = row * width + col, -1, 0
-    used, waiting, current = 1, 1, 0
+    # the eight neighbours: four straight, then four diagonal ones, and the cells that these pass between
+    offsets = np.array([1, width, -1, -width, 1 + width, width - 1, -1 - width, 1 - width])
+    one_side = np.array([0, 0, 0, 0, 1, width, -1, -width])
+    other_side = np.array([0, 0, 0, 0, width, -1, -width, 1])
+
+    used, waiting, current = 0, 0, 0
+    if row >= 0:
+        cost[row * width + col] = 0
+        entries[0], following[0], heads[0] = row * width + col, -1, 0
+        used = waiting = 1
     while waiting > 0:
         bucket = current & (NUM_BUCKETS - 1)
         while heads[bucket] >= 0:
@@ -169,39 +180,24 @@ def wavefront(weights: Any, row: int, col: int) -> tuple[Any, Any]:
             waiting -= 1
             if cost[cell] != current:
                 continue
-            for vertical in (-width, 0, width):
-                for horizontal in (-1, 0, 1):
-                    neighbour = cell + vertical + horizontal
-                    diagonal = vertical != 0 and horizontal != 0
-                    step = DIAGONAL if diagonal else STRAIGHT
-                    through = current + step * (np.int64(weight[cell]) + weight[neighbour])
-                    if through >= cost[neighbour]:
-                        continue
-                    if diagonal and (weight[cell + vertical] == 0 or weight[cell + horizontal] == 0):
-                        continue
-                    cost[neighbour], parent[neighbour] = through, cell
-                    target = through & (NUM_BUCKETS - 1)
-                    entries[used], following[used], heads[target] = neighbour, heads[target], used
-                    used += 1
-                    waiting += 1
+            for k in range(8):
+                neighbour = cell + offsets[k]
+                step = STRAIGHT if k < 4 else DIAGONAL
+                through = current + step * (np.int64(weight[cell]) + weight[neighbour])
+                if through >= cost[neighbour]:
+                    continue
+                if k >= 4 and (weight[cell + one_side[k]] == 0 or weight[cell + other_side[k]] == 0):
+                    continue
+                cost[neighbour], parent[neighbour] = through, cell
+                target = through & (NUM_BUCKETS - 1)
+                entries[used], following[used], heads[target] = neighbour, heads[target], used
+                used += 1
+                waiting += 1
         current += 1
-    cost[weight == 0] = UNREACHED
+    for cell in range(weight.size):
+        if weight[cell] == 0:
+            cost[cell] = UNREACHED
     return cost.reshape(weights.shape), parent.reshape(weights.shape)
-
-
-@jit
-def path_lengths(parent: Any, goals: Any) -> Any:
-    """Measure the ways to reached cells (n, 2) int64, rows (row, column): (n,) float64, in cells."""
-    width = parent.shape[1]
-    before = parent.ravel()
-    lengths = np.zeros(len(goals))
-    for i in range(len(goals)):
-        cell = goals[i, 0] * width + goals[i, 1]
-        while before[cell] >= 0:
-            step = abs(cell - before[cell])
-            lengths[i] += 1.0 if step in (1, width) else math.sqrt(2.0)
-            cell = before[cell]
-    return lengths
 
 
 @jit

@@ -1,5 +1,6 @@
 """Where the seen floor ends: frontiers, and the 16 slots that hand them to a policy under stable numbers."""
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -8,22 +9,27 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import linear_sum_assignment
 
 from slam_backend._jit import jit
-from slam_backend.errors import BoolArray, FloatArray, bad_argument, check_array
-from vslam_env.navigation._painting import CELL, FREE, GRID_SIZE, UNKNOWN
-from vslam_env.navigation._wavefront import UNREACHED, path_lengths
+from slam_backend.errors import BoolArray, FloatArray, check_array
+from vslam_env.navigation._arguments import pose_floats, positions_array
+from vslam_env.navigation._painting import CELL, FREE, GRID_SIZE, HALF_WIDTH, UNKNOWN
+from vslam_env.navigation._wavefront import UNREACHED
 from vslam_env.navigation.planning import distance_map
-from vslam_env.navigation.seen_grid import centre_of
 
 NUM_SLOTS = 16
+ROBOT_RADIUS = 0.2  # [m]
 MIN_CELLS = 3  # a robot needs 0.4 m; what is smaller is a speck or the corner of a wall
 MAX_CELLS = 20  # longer frontiers are cut, as one goal cannot stand for them
 SIGHT_CELLS = 3  # the unknown this near to a goal tells where to look from it
 
 SAME_GOAL = 1.0  # [m] between updates the goal of a living candidate moves less than this
 AT_GOAL = 0.5  # [m]
-PATIENCE = 5  # updates with somebody at the goal, after which what is still unseen there never will be seen
+LOOKING = 0.6  # [rad] a robot whose heading is this near to a candidate's looks at the unknown
+LOOK_COUNTS = 4  # times as much as a visit without a look, for a teammate's direction is not told
+PATIENCE = 16  # visits, after which what is still unseen there never will be seen
 GIVEN_UP = 0.8  # [m] radius of what is then left out
 NO_TEAMMATE = 60.0  # [m] stands for the distance of a teammate when there is none
+
+XY, HEADING, SIZE, LENGTH, NUM_COLUMNS = slice(0, 2), 2, 3, 4, 5  # columns of the rows that describe candidates
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -85,11 +91,35 @@ def _goal_beside(members: Any, cost: Any) -> tuple[int, int]:
 
 
 @jit
-def _find(box: Any, cost: Any, ignored: Any, row: int, col: int) -> Any:
-    """Collect the frontiers of a padded box whose first cell is the grid's (row, col).
+def _path_length(parent: Any, row: int, col: int) -> float:
+    """Measure the way to a reached cell [m]."""
+    width = parent.shape[1]
+    before = parent.ravel()
+    cell, length = row * width + col, 0.0
+    while before[cell] >= 0:
+        step = abs(cell - before[cell])
+        length += CELL if step in (1, width) else math.sqrt(2.0) * CELL
+        cell = before[cell]
+    return length
+
+
+@jit
+def _heading_to_unknown(box: Any, row: int, col: int) -> float:
+    """Return the direction from a cell to the unknown cells around it [rad]."""
+    up = right = 0
+    for r in range(max(row - SIGHT_CELLS, 0), min(row + SIGHT_CELLS + 1, box.shape[0])):
+        for c in range(max(col - SIGHT_CELLS, 0), min(col + SIGHT_CELLS + 1, box.shape[1])):
+            if box[r, c] == UNKNOWN:
+                up, right = up + r - row, right + c - col
+    return math.atan2(up, right)
+
+
+@jit
+def _find(box: Any, cost: Any, parent: Any, ignored: Any, row: int, col: int) -> Any:
+    """Collect the frontiers of a box whose first cell is the grid's (row, col).
 
     Returns:
-        (n, 4) float64 rows (row and column of the goal in the box, heading, number of cells).
+        (n, 5) float64 rows (x, y, heading, size, length), by increasing length.
     """
     height, width = box.shape
     mark = np.zeros((height, width), np.int8)  # 1: unseen beside free floor; 2: its component known; 3: in a piece
@@ -99,7 +129,7 @@ def _find(box: Any, cost: Any, ignored: Any, row: int, col: int) -> Any:
             if at_edge and box[r, c] == UNKNOWN and not ignored[row + r, col + c]:
                 mark[r, c] = 1
 
-    found = np.empty((height * width // MIN_CELLS + 1, 4))
+    found = np.empty((height * width // MIN_CELLS + 1, NUM_COLUMNS))
     count = 0
     whole = np.empty((height * width, 2), np.int64)
     piece = np.empty((MAX_CELLS, 2), np.int64)
@@ -108,29 +138,29 @@ def _find(box: Any, cost: Any, ignored: Any, row: int, col: int) -> Any:
             if mark[r, c] != 1:
                 continue
             size = _flood(mark, 1, 2, r, c, height * width, whole)
-            if size < MIN_CELLS:
-                continue
             num_pieces = (size + MAX_CELLS - 1) // MAX_CELLS
             share = (size + num_pieces - 1) // num_pieces
             for k in range(size - 1, -1, -1):  # from the far end, so that a line is cut piece by piece
                 if mark[whole[k, 0], whole[k, 1]] != 2:
                     continue
                 num = _flood(mark, 2, 3, whole[k, 0], whole[k, 1], share, piece)
-                if num < MIN_CELLS:
-                    continue
                 goal_row, goal_col = _goal_beside(piece[:num], cost)
-                if goal_row < 0:
+                if num < MIN_CELLS or goal_row < 0:
                     continue
-                look_row = look_col = 0
-                for i in range(max(goal_row - SIGHT_CELLS, 0), min(goal_row + SIGHT_CELLS + 1, height)):
-                    for j in range(max(goal_col - SIGHT_CELLS, 0), min(goal_col + SIGHT_CELLS + 1, width)):
-                        if box[i, j] == UNKNOWN:
-                            look_row, look_col = look_row + i - goal_row, look_col + j - goal_col
-                found[count, 0], found[count, 1] = goal_row, goal_col
-                found[count, 2] = np.arctan2(look_row, look_col)
-                found[count, 3] = num
+                found[count, 0] = (col + goal_col + 0.5) * CELL - HALF_WIDTH
+                found[count, 1] = (row + goal_row + 0.5) * CELL - HALF_WIDTH
+                found[count, HEADING] = _heading_to_unknown(box, goal_row, goal_col)
+                found[count, SIZE] = num * CELL
+                found[count, LENGTH] = _path_length(parent, goal_row, goal_col)
                 count += 1
-    return found[:count]
+    return found[:count][np.argsort(found[:count, LENGTH], kind="mergesort")]
+
+
+def _frontier_rows(cells: NDArray[np.uint8], start_xy: ArrayLike, radius: float, ignored: BoolArray) -> FloatArray:
+    """Return what `find_frontiers` finds as (n, 5) rows (x, y, heading, size, length)."""
+    ways = distance_map(cells, start_xy, radius)
+    rows: FloatArray = _find(ways.box, ways.cost, ways.parent, ignored, *ways.corner)
+    return rows
 
 
 def find_frontiers(
@@ -151,39 +181,65 @@ def find_frontiers(
         The frontiers, nearest first; none if nothing is left to explore.
 
     Raises:
-        ValueError: If the cells are not a grid's, or a number is not finite.
+        ValueError: If an array has the wrong shape, or a number is not finite.
     """
     if ignored is None:
         ignored = np.zeros((GRID_SIZE, GRID_SIZE), np.bool_)
-    ways = distance_map(cells, start_xy, radius)
-    found = _find(ways.box, ways.cost, ignored, *ways.corner)
-    goals = found[:, :2].astype(np.int64)
-    lengths = path_lengths(ways.parent, goals) * CELL
-    order = np.argsort(lengths, kind="stable")
+    mask = check_array("ignored", ignored, (GRID_SIZE, GRID_SIZE), "Mark cells of the grid.", dtype=np.bool_)
+    rows = _frontier_rows(cells, start_xy, radius, mask)
     return Frontiers(
-        goals=centre_of(goals[order] + np.array(ways.corner)),
-        headings=found[order, 2],
-        sizes=found[order, 3] * CELL,
-        lengths=lengths[order],
+        goals=rows[:, XY].copy(),
+        headings=rows[:, HEADING].copy(),
+        sizes=rows[:, SIZE].copy(),
+        lengths=rows[:, LENGTH].copy(),
     )
 
 
 @jit
-def _features(
-    valid: Any, goals: Any, lengths: Any, sizes: Any, x: float, y: float, theta: float, teammates: FloatArray
-) -> Any:
-    """Compute `CandidateSlots.features`."""
+def _distances(goals: Any, places: Any) -> Any:
+    """Return the distances (m, n) between goals (m, 2 or more), NaN where there is none, and places (n, 2 or more)."""
+    distances = np.empty((len(goals), len(places)))
+    for i in range(len(goals)):
+        for j in range(len(places)):
+            distances[i, j] = np.hypot(goals[i, 0] - places[j, 0], goals[i, 1] - places[j, 1])
+    return distances
+
+
+@jit
+def _refill(costs: Any, slots: Any, sources: Any, found: Any, visits: Any) -> tuple[Any, Any]:
+    """Return the next rows and visits of the slots: old candidates stay where they were, new ones fill the gaps."""
+    rows = np.full((NUM_SLOTS, NUM_COLUMNS), np.nan)
+    next_visits = np.zeros_like(visits)
+    is_new = np.ones(len(found), np.bool_)
+    for k in range(len(slots)):
+        if costs[slots[k], sources[k]] < SAME_GOAL:
+            rows[slots[k]], next_visits[slots[k]] = found[sources[k]], visits[slots[k]]
+            is_new[sources[k]] = False
+    slot = 0
+    for source in np.flatnonzero(is_new):
+        while slot < NUM_SLOTS and not np.isnan(rows[slot, 0]):
+            slot += 1
+        if slot == NUM_SLOTS:
+            break
+        rows[slot] = found[source]
+    return rows, next_visits
+
+
+@jit
+def _features(slots: Any, x: float, y: float, theta: float, teammates: Any) -> Any:
+    """Compute `CandidateSlots.features` from the rows of the slots."""
     features = np.zeros((NUM_SLOTS, 5), np.float32)
-    c, s = np.cos(theta), np.sin(theta)
+    distances = _distances(slots, teammates)
+    c, s = math.cos(theta), math.sin(theta)
     for i in range(NUM_SLOTS):
-        if not valid[i]:
+        if np.isnan(slots[i, 0]):
             continue
-        u, v = goals[i, 0] - x, goals[i, 1] - y
+        u, v = slots[i, 0] - x, slots[i, 1] - y
         nearest = NO_TEAMMATE
         for k in range(len(teammates)):
-            nearest = min(nearest, np.hypot(goals[i, 0] - teammates[k, 0], goals[i, 1] - teammates[k, 1]))
+            nearest = min(nearest, distances[i, k])
         features[i, 0], features[i, 1] = c * u + s * v, c * v - s * u
-        features[i, 2], features[i, 3], features[i, 4] = lengths[i], sizes[i], nearest
+        features[i, 2], features[i, 3], features[i, 4] = slots[i, LENGTH], slots[i, SIZE], nearest
     return features
 
 
@@ -192,27 +248,41 @@ class CandidateSlots:
 
     At an update, old candidates are paired with the frontiers found now, at least total distance, and live on where a
     pair is less than 1 m apart; others die. New frontiers fill free slots, nearest first. A frontier that stays though
-    somebody has been at its goal for 5 updates cannot be seen (a speck of noise, a nook behind a corner): what is
-    unknown within 0.8 m of the goal is given up for good, so exploration ends. The arrays are replaced, never changed.
-
-    Attributes:
-        goals: (16, 2) float64 [m], start frame. Where to go; NaN in empty slots.
-        headings: (16,) float64 [rad], start frame. Where to look from there; NaN in empty slots.
-        sizes: (16,) float64 [m]. Length of the frontier; 0 in empty slots.
-        lengths: (16,) float64 [m]. Of the path from the robot to the goal at the last update; 0 in empty slots.
-        valid: (16,) bool. Which slots hold a candidate; none when nothing is left to explore.
+    the robot looked at it from its goal at 4 updates (or somebody was there at 16) cannot be seen, as it is a speck of
+    noise or a nook behind a corner: what is unknown within 0.8 m of the goal is given up, so that exploration ends.
     """
 
-    __slots__ = ("_given_up", "_visits", "goals", "headings", "lengths", "sizes", "valid")
+    __slots__ = ("_given_up", "_rows", "_visits")
 
     def __init__(self) -> None:
-        self.goals: FloatArray = np.full((NUM_SLOTS, 2), np.nan)
-        self.headings: FloatArray = np.full(NUM_SLOTS, np.nan)
-        self.sizes: FloatArray = np.zeros(NUM_SLOTS)
-        self.lengths: FloatArray = np.zeros(NUM_SLOTS)
-        self.valid: BoolArray = np.zeros(NUM_SLOTS, np.bool_)
+        self._rows: FloatArray = np.full((NUM_SLOTS, NUM_COLUMNS), np.nan)
         self._visits = np.zeros(NUM_SLOTS, np.int64)
         self._given_up = np.zeros((GRID_SIZE, GRID_SIZE), np.bool_)
+
+    @property
+    def valid(self) -> BoolArray:
+        """Which slots hold a candidate, (16,) bool; none when nothing is left to explore."""
+        return ~np.isnan(self._rows[:, 0])
+
+    @property
+    def goals(self) -> FloatArray:
+        """Where to go, (16, 2) float64 [m], start frame; NaN in empty slots."""
+        return self._rows[:, XY].copy()
+
+    @property
+    def headings(self) -> FloatArray:
+        """Where to look from the goals, (16,) float64 [rad], start frame; NaN in empty slots."""
+        return self._rows[:, HEADING].copy()
+
+    @property
+    def sizes(self) -> FloatArray:
+        """How long the frontiers are, (16,) float64 [m]; NaN in empty slots."""
+        return self._rows[:, SIZE].copy()
+
+    @property
+    def lengths(self) -> FloatArray:
+        """How long the robot's paths to the goals were at the last update, (16,) float64 [m]; NaN in empty slots."""
+        return self._rows[:, LENGTH].copy()
 
     def update(self, cells: NDArray[np.uint8], pose: ArrayLike, teammates: ArrayLike = ()) -> None:
         """Bring the candidates up to date; meant to be called once a second.
@@ -225,39 +295,26 @@ class CandidateSlots:
         Raises:
             ValueError: If an array has the wrong shape or is not finite.
         """
-        robot = check_array("pose", pose, (3,), "Give (x, y, theta).")[:2]
-        self._count_visits(np.vstack([robot, _positions(teammates)]))
-        found = find_frontiers(cells, robot, ignored=self._given_up)
+        x, y, theta = pose_floats(pose)
+        self._count_visits(x, y, theta, positions_array(teammates, "teammates"))
+        found = _frontier_rows(cells, (x, y), ROBOT_RADIUS, self._given_up)
 
-        slots = np.flatnonzero(self.valid)
-        distances = np.linalg.norm(self.goals[slots, None] - found.goals[None], axis=-1)
-        rows, columns = linear_sum_assignment(np.minimum(distances, SAME_GOAL))
-        alive = distances[rows, columns] < SAME_GOAL
-        kept, source = slots[rows[alive]], columns[alive]
-        free = np.setdiff1d(np.arange(NUM_SLOTS), kept)
-        new = np.setdiff1d(np.arange(len(found.goals)), source)[: len(free)]
-        taken = np.concatenate([kept, free[: len(new)]])
-        source = np.concatenate([source, new])
+        costs = np.fmin(_distances(self._rows, found), SAME_GOAL)  # NaN, of empty slots, becomes SAME_GOAL
+        slots, sources = linear_sum_assignment(costs)
+        self._rows, self._visits = _refill(costs, slots, sources, found, self._visits)
 
-        visits = np.zeros(NUM_SLOTS, np.int64)
-        visits[kept] = self._visits[kept]
-        self._visits = visits
-        self.goals = np.full((NUM_SLOTS, 2), np.nan)
-        self.headings = np.full(NUM_SLOTS, np.nan)
-        self.sizes, self.lengths = np.zeros(NUM_SLOTS), np.zeros(NUM_SLOTS)
-        self.valid = np.zeros(NUM_SLOTS, np.bool_)
-        self.goals[taken], self.headings[taken] = found.goals[source], found.headings[source]
-        self.sizes[taken], self.lengths[taken] = found.sizes[source], found.lengths[source]
-        self.valid[taken] = True
-
-    def _count_visits(self, visitors: FloatArray) -> None:
-        """Count who is at a goal, and give up what is unknown around goals that were visited too often."""
-        distances = np.linalg.norm(self.goals[:, None] - visitors[None], axis=-1).min(axis=1)
-        self._visits = self._visits + (distances <= AT_GOAL)  # NaN, of empty slots, compares false
+    def _count_visits(self, x: float, y: float, theta: float, teammates: FloatArray) -> None:
+        """Count who is at a goal, and give up what is unknown around goals where patience has run out."""
+        here = np.array([[x, y]])
+        at_goal = (_distances(self._rows, np.vstack([here, teammates])) <= AT_GOAL).any(axis=1)
+        looking = np.cos(self._rows[:, HEADING] - theta) > math.cos(LOOKING)
+        looked = looking & (_distances(self._rows, here)[:, 0] <= AT_GOAL)
+        self._visits = self._visits + at_goal + (LOOK_COUNTS - 1) * looked
         for slot in np.flatnonzero(self._visits >= PATIENCE):
-            along = (np.arange(GRID_SIZE) + 0.5) * CELL - 0.5 * GRID_SIZE * CELL
-            x, y = self.goals[slot]
-            self._given_up |= (along[None] - x) ** 2 + (along[:, None] - y) ** 2 <= GIVEN_UP**2
+            along = (np.arange(GRID_SIZE) + 0.5) * CELL - HALF_WIDTH
+            goal_x, goal_y = self._rows[slot, XY]
+            self._given_up |= (along - goal_x) ** 2 + (along[:, None] - goal_y) ** 2 <= GIVEN_UP**2
+            self._visits[slot] = 0
 
     def features(self, pose: ArrayLike, teammates: ArrayLike = ()) -> NDArray[np.float32]:
         """Describe the candidates to a policy.
@@ -271,29 +328,16 @@ class CandidateSlots:
             size of the frontier, and distance from the goal to the nearest teammate, 60 if there is none. Zeros in
             empty slots.
         """
-        x, y, theta = np.asarray(pose, dtype=np.float64).tolist()
-        features: NDArray[np.float32] = _features(
-            self.valid, self.goals, self.lengths, self.sizes, x, y, theta, _positions(teammates)
-        )
+        x, y, theta = pose_floats(pose)
+        features: NDArray[np.float32] = _features(self._rows, x, y, theta, positions_array(teammates, "teammates"))
         return features
 
     def get_state(self) -> dict[str, Any]:
         """Return a copy of all that `set_state` needs to continue bit by bit."""
-        return {name: getattr(self, name).copy() for name in self.__slots__}
+        return {"rows": self._rows.copy(), "visits": self._visits.copy(), "given_up": self._given_up.copy()}
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Restore what `get_state` returned."""
-        for name in self.__slots__:
-            setattr(self, name, state[name].copy())
-
-
-def _positions(teammates: ArrayLike) -> FloatArray:
-    """Return positions as an array (k, 2), or raise."""
-    positions = np.asarray(teammates, dtype=np.float64)
-    if positions.size == 0:
-        return np.empty((0, 2))
-    if positions.ndim != 2 or positions.shape[1] != 2:
-        raise bad_argument(
-            "teammates", "an array of shape (k, 2)", f"shape {positions.shape}", "Give one (x, y) per teammate."
-        )
-    return positions
+        self._rows = state["rows"].copy()
+        self._visits = state["visits"].copy()
+        self._given_up = state["given_up"].copy()

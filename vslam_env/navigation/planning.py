@@ -11,21 +11,21 @@ scipy's `dijkstra` is the oracle of its tests.
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from slam_backend._jit import jit
-from slam_backend.errors import FloatArray, bad_argument, check_array, check_float
-from vslam_env.navigation._painting import CELL, GRID_SIZE, HALF_WIDTH
+from slam_backend.errors import FloatArray, bad_argument, check_float
+from vslam_env.navigation._arguments import check_cells, point_floats, pose_floats
+from vslam_env.navigation._painting import CELL, HALF_WIDTH
 from vslam_env.navigation._wavefront import (
     PAD,
     UNREACHED,
     known_box,
     nearest_open,
-    path_lengths,
     straight_path,
     wavefront,
     weigh,
@@ -63,17 +63,14 @@ class DistanceMap:
     cost: NDArray[np.int32]
     parent: NDArray[np.int32]
 
-    def cell_of(self, x: float, y: float) -> tuple[int, int]:
-        """Return the arrays' (row, column) in which a point [m] lies; it may be outside the arrays."""
-        row, col = (math.floor((v + HALF_WIDTH) / CELL) for v in (y, x))
-        return row - self.corner[0], col - self.corner[1]
+    def cell_of(self, xy: ArrayLike) -> tuple[int, int]:
+        """Return the arrays' (row, column) in which a point (2,) [m] lies; it may be outside the arrays."""
+        return _cell_in_box(self.corner, *point_floats(xy, "xy"))
 
-    def length_to(self, xy: ArrayLike) -> float:
-        """Return the length [m] of the way to a point (2,) [m], infinite if none leads to its cell."""
-        row, col = self.cell_of(*check_array("xy", xy, (2,), "Give (x, y) in metres."))
-        if not (0 <= row < self.box.shape[0] and 0 <= col < self.box.shape[1]) or self.cost[row, col] == UNREACHED:
-            return math.inf
-        return float(path_lengths(self.parent, np.array([[row, col]]))[0]) * CELL
+
+def _cell_in_box(corner: tuple[int, int], x: float, y: float) -> tuple[int, int]:
+    """Return the row and column of a point [m] in a box whose first cell is the grid's `corner`."""
+    return math.floor((y + HALF_WIDTH) / CELL) - corner[0], math.floor((x + HALF_WIDTH) / CELL) - corner[1]
 
 
 def distance_map(cells: NDArray[np.uint8], start_xy: ArrayLike, radius: float = 0.2) -> DistanceMap:
@@ -91,27 +88,17 @@ def distance_map(cells: NDArray[np.uint8], start_xy: ArrayLike, radius: float = 
     Raises:
         ValueError: If the cells are not a grid's, or a number is not finite.
     """
-    if not isinstance(cells, np.ndarray) or cells.shape != (GRID_SIZE, GRID_SIZE) or cells.dtype != np.uint8:
-        got = f"shape {cells.shape} of {cells.dtype}" if isinstance(cells, np.ndarray) else cells
-        raise bad_argument("cells", "an array of shape (300, 300) of uint8", got, "Pass SeenGrid.cells.")
-    start = check_array("start_xy", start_xy, (2,), "Give (x, y) in metres.")
+    check_cells(cells)
+    start = point_floats(start_xy, "start_xy")
     radius = check_float("radius", radius, "Give the robot's radius in metres.", above=0.0, at_most=1.0)
 
     column, row, width, height = cv2.boundingRect(cells)
     box = known_box(cells, row, column, height, width)
     weights = weigh(box, radius / CELL + 0.5)
-    ways = DistanceMap(
-        corner=(row - PAD, column - PAD),
-        box=box,
-        weights=weights,
-        cost=np.full(box.shape, UNREACHED, np.int32),
-        parent=np.full(box.shape, -1, np.int32),
-    )
-    first = nearest_open(box, weights, *ways.cell_of(*start), ESCAPE_CELLS)
-    if first[0] < 0:
-        return ways
+    corner = row - PAD, column - PAD
+    first = nearest_open(box, weights, *_cell_in_box(corner, *start), ESCAPE_CELLS)
     cost, parent = wavefront(weights, *first)
-    return replace(ways, cost=cost, parent=parent)
+    return DistanceMap(corner=corner, box=box, weights=weights, cost=cost, parent=parent)
 
 
 def plan_path(
@@ -131,16 +118,15 @@ def plan_path(
     Raises:
         ValueError: If the cells are not a grid's, or a number is not finite.
     """
-    start = check_array("start_xy", start_xy, (2,), "Give (x, y) in metres.")
-    goal = check_array("goal_xy", goal_xy, (2,), "Give (x, y) in metres.")
+    start, goal = point_floats(start_xy, "start_xy"), point_floats(goal_xy, "goal_xy")
     ways = distance_map(cells, start, radius)
-    goal_cell = ways.cell_of(*goal)
+    goal_cell = ways.cell_of(goal)
     end_cell = nearest_open(ways.box, ways.weights, *goal_cell, GOAL_CELLS)
     if end_cell[0] < 0 or ways.cost[end_cell] == UNREACHED:
         return None
     corners = straight_path(ways.weights, ways.cost, ways.parent, *end_cell)
     centres = centre_of(corners + np.array(ways.corner))
-    between = centres[1:-1] if tuple(corners[0]) == ways.cell_of(*start) else centres[:-1]
+    between = centres[1:-1] if tuple(corners[0]) == ways.cell_of(start) else centres[:-1]
     return np.vstack([start, between, goal if end_cell == goal_cell else centres[-1]])
 
 
@@ -193,14 +179,12 @@ def follow_path(
     Raises:
         ValueError: If the pose or the path has the wrong shape.
     """
-    pose_array, path_array = np.asarray(pose, dtype=np.float64), np.ascontiguousarray(path, dtype=np.float64)
-    if pose_array.shape != (3,):
-        raise bad_argument("pose", "an array of shape (3,)", f"shape {pose_array.shape}", "Give (x, y, theta).")
+    x, y, theta = pose_floats(pose)
+    path_array = np.ascontiguousarray(path, dtype=np.float64)
     if path_array.ndim != 2 or path_array.shape[1] != 2 or len(path_array) == 0:
         raise bad_argument(
             "path", "an array of shape (n, 2), n >= 1", f"shape {path_array.shape}", "Give what plan_path returned."
         )
-    x, y, theta = pose_array.tolist()
     target_x, target_y, left = _pursue(x, y, path_array)
     left = max(left, math.hypot(path_array[-1, 0] - x, path_array[-1, 1] - y))
     if left < ARRIVED:

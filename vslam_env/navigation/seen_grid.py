@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from slam_backend.errors import FloatArray, IntArray, bad_argument, check_array, check_float
 from vslam_env.navigation import _painting
+from vslam_env.navigation._arguments import pose_floats
 from vslam_env.navigation._painting import CELL, FREE, GRID_SIZE, HALF_WIDTH, OCCUPIED, UNKNOWN
 
 __all__ = ["CELL", "FREE", "GRID_SIZE", "OCCUPIED", "UNKNOWN", "SeenGrid", "cell_of", "centre_of"]
@@ -79,7 +80,8 @@ class SeenGrid:
             ValueError: If the pose is not finite, or ranges or angles are not as described.
             RuntimeError: If the grid is a read-only view.
         """
-        x, y, theta = self._pose(pose)
+        self._refuse_if_read_only()
+        x, y, theta = pose_floats(pose)
         ranges = np.ascontiguousarray(ranges, dtype=np.float64)
         angles = np.ascontiguousarray(angles, dtype=np.float64)
         if ranges.ndim != 1 or ranges.shape != angles.shape or len(ranges) < 2:
@@ -104,7 +106,8 @@ class SeenGrid:
             pose: (3,) float64 [m, m, rad], start frame.
             radius: Of the robot [m]. Occupied cells at its rim stay: they hold the wall that the robot touches.
         """
-        x, y, _ = self._pose(pose)
+        self._refuse_if_read_only()
+        x, y, _ = pose_floats(pose)
         radius = check_float("radius", radius, "Give the robot's radius in metres.", above=0.0)
         _painting.paint_disc(self._evidence, self._cells, x, y, radius)
 
@@ -117,9 +120,10 @@ class SeenGrid:
             pose: (3,) float64 [m, m, rad], start frame.
             radius: Of the robot [m].
         """
-        x, y, theta = self._pose(pose)
+        self._refuse_if_read_only()
+        x, y, theta = pose_floats(pose)
         ahead = radius + 0.5 * CELL
-        row, col = cell_of([x + ahead * math.cos(theta), y + ahead * math.sin(theta)])
+        row, col = cell_of([x + ahead * math.cos(theta), y + ahead * math.sin(theta)]).tolist()
         if 0 <= row < GRID_SIZE and 0 <= col < GRID_SIZE:
             self._evidence[row, col] = max(self._evidence[row, col], 2 * _painting.HIT)
             self._cells[row, col] = OCCUPIED
@@ -131,7 +135,8 @@ class SeenGrid:
             other: It stays as it is.
             self_from_other: (3,) float64 [m, m, rad]. The other's start pose in this robot's start frame.
         """
-        x, y, theta = self._pose(self_from_other, "self_from_other")
+        self._refuse_if_read_only()
+        x, y, theta = pose_floats(self_from_other, "self_from_other")
         _painting.paint_grid(self._evidence, self._cells, other._evidence.copy(), x, y, theta)
 
     def copy(self) -> "SeenGrid":
@@ -161,14 +166,3 @@ class SeenGrid:
     def _refuse_if_read_only(self) -> None:
         if self._read_only:
             raise RuntimeError("SeenGrid: this is a read-only view. Make a copy() to write to.")
-
-    def _pose(self, pose: ArrayLike, name: str = "pose") -> tuple[float, float, float]:
-        """Return a pose as three finite floats, after making sure that this grid may be written to."""
-        self._refuse_if_read_only()
-        values = np.asarray(pose, dtype=np.float64)
-        if values.shape != (3,):
-            raise bad_argument(name, "an array of shape (3,)", f"shape {values.shape}", "Give (x, y, theta).")
-        x, y, theta = values.tolist()
-        if not math.isfinite(x + y + theta):
-            raise bad_argument(name, "finite numbers", values, "Give (x, y, theta) in metres and radians.")
-        return x, y, theta
