@@ -122,7 +122,8 @@ class Blueprint:
         if part.x1 - part.x0 < width + 2.0 * PASSAGE or room.size[1] < depth + 1.4:
             return []
         x = self.rng.uniform(part.x0 + PASSAGE, part.x1 - PASSAGE - width)
-        y, inward = (room.y1, -depth) if self.rng.random() < 0.5 else (room.y0, depth)
+        at_top = part.y1 == room.y1 and (part.y0 != room.y0 or self.rng.random() < 0.5)
+        y, inward = (room.y1, -depth) if at_top else (room.y0, depth)
         return _chain([(x, y), (x, y + inward), (x + width, y + inward), (x + width, y)])
 
     def _table(self, room: Room, part: Room) -> list[Segment]:

@@ -129,5 +129,7 @@ def draw_descriptors(count: int, config: LandmarkConfig, rng: np.random.Generato
     own /= np.linalg.norm(own, axis=1, keepdims=True)
     descriptors = np.sqrt(1.0 - own_share) * common + np.sqrt(own_share) * own
     copies = rng.random(count) < config.repeated
-    descriptors[copies] = descriptors[rng.integers(count, size=count)][copies]
+    copies[0] = False  # there is always one to copy
+    originals = np.flatnonzero(~copies)
+    descriptors[copies] = descriptors[originals[rng.integers(len(originals), size=count)]][copies]
     return np.asarray(descriptors, dtype=np.float32)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from slam_backend.errors import FloatArray, check_float
-from slam_backend.geometry import between, wrap_angle
+from slam_backend.geometry import wrap_angle
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,17 +60,18 @@ def read_odometry(
     Returns:
         (K, 3) float64 [m, m, rad], each robot's previous frame: (dx, dy, dtheta).
     """
-    motion = between(previous_poses, poses)
-    distance = np.hypot(motion[:, 0], motion[:, 1])
-    draws = rng.standard_normal((len(motion), 2))
+    moved = np.asarray(poses) - previous_poses
+    distance = np.hypot(moved[:, 0], moved[:, 1])
+    draws = rng.standard_normal((len(moved), 2))
     stretch = 1.0 + bias[:, 0] + noise.sigma_distance * draws[:, 0]
     turn = distance * (bias[:, 1] + noise.sigma_heading_per_metre * draws[:, 1])
-    c, s = np.cos(0.5 * turn), np.sin(0.5 * turn)  # half of the misread turn falls before the middle of the way
+    into_robot = 0.5 * turn - previous_poses[:, 2]  # half of the misread turn falls before the middle of the way
+    c, s = np.cos(into_robot), np.sin(into_robot)
     return np.stack(
         [
-            stretch * (c * motion[:, 0] - s * motion[:, 1]),
-            stretch * (s * motion[:, 0] + c * motion[:, 1]),
-            wrap_angle(motion[:, 2] + turn),
+            stretch * (c * moved[:, 0] - s * moved[:, 1]),
+            stretch * (s * moved[:, 0] + c * moved[:, 1]),
+            wrap_angle(moved[:, 2] + turn),
         ],
         axis=1,
     )

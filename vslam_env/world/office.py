@@ -52,8 +52,8 @@ def _ring(plan: Blueprint) -> list[Room]:
     plan.wall(x1, y0, x1, y1)
     for x in ends[1:-1]:
         plan.wall(x, y0, x, y1)
-    plan.pilasters(0.0 if west == 0.0 else west, east, bottom, y0)
-    plan.pilasters(0.0 if west == 0.0 else west, east, y1, top)
+    plan.pilasters(x0, x1, bottom, y0)
+    plan.pilasters(x0, x1, y1, top)
     return rooms + [Room(a, y0, b, y1) for a, b in spans]
 
 

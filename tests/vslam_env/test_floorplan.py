@@ -1,0 +1,143 @@
+"""Buildings: procedural offices and traced floor plans."""
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from slam_backend.camera import StereoCamera
+from vslam_env.world import FreeSpace, World, load_floorplan, make_world, place_landmarks
+from vslam_env.world.spec import World as Spec
+
+
+def area_inside(world: Spec, step: float = 0.05) -> float:
+    """The area that the walls enclose [m^2], by counting crossings of horizontal rays."""
+    xmin, ymin, xmax, ymax = world.bounds
+    x = np.arange(xmin, xmax, step) + 0.5 * step + 1e-7
+    total = 0
+    for y in np.arange(ymin, ymax, step) + 0.5 * step + 1e-7:
+        x1, y1, x2, y2 = world.walls.T
+        cut = (y1 > y) != (y2 > y)
+        crossings = x1[cut] + (y - y1[cut]) / (y2[cut] - y1[cut]) * (x2[cut] - x1[cut])
+        total += int(((crossings[:, None] < x).sum(axis=0) % 2).sum())
+    return total * step * step
+
+
+def write(path: Path, image: Any) -> Path:
+    """Save an image."""
+    assert cv2.imwrite(str(path), np.asarray(image, dtype=np.uint8))
+    return path
+
+
+def test_a_drawn_plan_is_traced_exactly(tmp_path: Path) -> None:
+    """A rectilinear room with a pillar becomes its ten walls, in metres, y upwards, to the pixel's edge."""
+    image = np.zeros((110, 170))
+    image[20:100, 30:150] = 255
+    image[40:60, 50:80] = 0
+    image[20:60, 120:150] = 0
+    world = load_floorplan(write(tmp_path / "plan.png", image), metres_per_pixel=0.1)
+    assert world.name == "plan"
+    assert world.bounds == pytest.approx((3.0, 1.0, 15.0, 9.0))
+    assert len(world.walls) == 10
+    corners = {tuple(np.round(corner, 6)) for corner in world.walls.reshape(-1, 2)}
+    outer = {(3.0, 1.0), (15.0, 1.0), (15.0, 5.0), (12.0, 5.0), (12.0, 9.0), (3.0, 9.0)}
+    assert corners == outer | {(5.0, 5.0), (8.0, 5.0), (8.0, 7.0), (5.0, 7.0)}
+    assert area_inside(world, 0.1) == pytest.approx((80 * 120 - 20 * 30 - 40 * 30) * 0.01)
+
+
+def test_slanted_walls_become_few_long_ones(tmp_path: Path) -> None:
+    """The staircase of pixels along a slanted wall is straightened, and nothing else is lost."""
+    image = np.zeros((300, 400), dtype=np.uint8)
+    cv2.fillPoly(image, [np.array([[40, 50], [350, 20], [370, 260], [200, 280], [60, 200]], dtype=np.int32)], 255)
+    world = load_floorplan(write(tmp_path / "slanted.png", image), metres_per_pixel=0.05)
+    assert len(world.walls) < 25
+    assert area_inside(world) == pytest.approx((image > 0).sum() * 0.05**2, rel=0.01)
+
+
+def test_the_marked_part_is_kept(tmp_path: Path) -> None:
+    """The part with the coloured start cell is the world, even if another part is larger."""
+    image = np.full((120, 260, 3), 128)
+    image[20:100, 20:60] = 195
+    image[20:100, 100:240] = 195
+    image[30:40, 30:40] = (0, 216, 255)
+    world = load_floorplan(write(tmp_path / "two.png", image), metres_per_pixel=0.1)
+    assert world.bounds == pytest.approx((2.0, 2.0, 6.0, 10.0))
+
+
+@pytest.mark.parametrize(
+    ("image", "message"),
+    [
+        (np.zeros((50, 60)), "no free space to tell from walls"),
+        (np.full((50, 60), 127), "no free space to tell from walls"),
+        (np.full((50, 60), 255), "no free space to tell from walls"),
+        (np.pad(np.full((4, 30), 255), 10), r"expected free space for robots of radius 0\.2 m, got a widest place"),
+    ],
+)
+def test_plans_without_room_are_refused(tmp_path: Path, image: Any, message: str) -> None:
+    """A plan in which nothing is free, or too little for a robot, is refused."""
+    with pytest.raises(ValueError, match=message):
+        load_floorplan(write(tmp_path / "bad.png", image))
+
+
+def test_what_is_no_image_is_refused(tmp_path: Path) -> None:
+    """A file that is not an image, and a file that is not there, give one clear error each."""
+    (tmp_path / "text.png").write_text("no image")
+    with pytest.raises(ValueError, match="world: expected an image that OpenCV can read"):
+        load_floorplan(tmp_path / "text.png")
+    with pytest.raises(ValueError, match=r"world: expected a file, got .*none\.png"):
+        load_floorplan(tmp_path / "none.png")
+    with pytest.raises(ValueError, match="metres_per_pixel: expected a finite number > 0, got -1"):
+        load_floorplan(tmp_path / "text.png", metres_per_pixel=-1)
+
+
+def test_dungeon_plans_are_traced_whole(data_dir: Path) -> None:
+    """Every sixth dungeon plan becomes a few walls, keeps its free area, and has room for three robots."""
+    for path in sorted((data_dir / "dungeon_maps" / "train").glob("*.png"))[::6]:
+        world = load_floorplan(path)
+        grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        assert 4 <= len(world.walls) < 120
+        assert area_inside(world) == pytest.approx((grey > 160).sum() * 0.045**2, rel=0.01)
+        free = FreeSpace(world)
+        ends = free.free_area_cells
+        farthest = max(np.linalg.norm(ends - end, axis=1).max() for end in ends[::37])
+        assert farthest < 30.0
+        rng = np.random.default_rng(0)
+        marks = place_landmarks(world, rng, None, free)
+        assert free.draw_starts(3, rng, 5.0, StereoCamera(), marks).shape == (3, 3)
+
+
+def test_offices_are_buildings() -> None:
+    """Each of 60 offices has 39 to 66 walls on about 20 x 14 m, and no square metre that a robot cannot visit."""
+    seen = []
+    for seed in range(60):
+        world = make_world("office", np.random.default_rng(seed))
+        width, height = world.bounds[2], world.bounds[3]
+        assert 19.0 <= width <= 21.0
+        assert 13.0 <= height <= 15.0
+        assert 39 <= len(world.walls) <= 66
+        free = FreeSpace(world)
+        assert 0.8 * width * height < 0.04 * len(free.free_area_cells) < 0.97 * width * height
+        seen.append(world.walls.tobytes())
+    assert len(set(seen)) == 60
+
+
+def test_every_room_of_an_office_can_be_reached() -> None:
+    """In 60 offices no space that a robot of radius 0.2 m could turn in is cut off, but inside furniture."""
+    for seed in range(60):
+        world = make_world("office", np.random.default_rng(seed))
+        free = FreeSpace(world)
+        whole = World("shell", np.vstack([world.walls[:4]]))
+        cut_off = len(FreeSpace(whole).free_area_cells) - len(free.free_area_cells)
+        on_walls = 0.04 * cut_off - 0.22 * np.hypot(*(world.walls[4:, :2] - world.walls[4:, 2:]).T).sum()
+        assert on_walls < 8.0  # [m^2] tables and cabinets hold at most six times 1.3
+
+
+def test_a_room_like_fig5_is_open() -> None:
+    """The room has four outer walls and seven inside it that leave a way round."""
+    for seed in range(30):
+        world = make_world("fig5", np.random.default_rng(seed))
+        assert len(world.walls) == 11
+        width, height = world.bounds[2], world.bounds[3]
+        assert 0.04 * len(FreeSpace(world).free_area_cells) > 0.88 * width * height

@@ -1,0 +1,228 @@
+"""The landmark sensor sees what a camera would see, with the errors it is said to have."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from slam_backend.camera import StereoCamera
+from vslam_env.sensors import LandmarkSensor, LandmarkSensorConfig
+from vslam_env.world import FreeSpace, Landmarks, World, make_world, place_landmarks
+
+SHARP = StereoCamera(sigma_px=1e-9, sigma_disparity_px=1e-9)
+PERFECT = LandmarkSensorConfig(
+    camera=SHARP, detection_probability=1.0, false_points=0.0, descriptor_noise=0.0, max_measurements=1000
+)
+WALL = np.array([[4.0, -3.0, 4.0, 3.0]])
+
+
+def on_wall(rows: list[list[float]], size: int = 11) -> Landmarks:
+    """Landmarks at (4, y, z) on WALL, which faces -x."""
+    positions = [[4.0, y, z] for y, z in rows]
+    return Landmarks(positions, [[-1, 0]] * len(rows), [0] * len(rows), np.eye(len(rows), size))
+
+
+def office(seed: int) -> tuple[World, FreeSpace, Landmarks]:
+    """An office with landmarks."""
+    rng = np.random.default_rng(seed)
+    world = make_world("office", rng)
+    free = FreeSpace(world)
+    return world, free, place_landmarks(world, rng, None, free)
+
+
+def test_a_perfect_sensor_reports_the_truth() -> None:
+    """Without noise, points moved to the world are the visible landmarks, all of them, each once."""
+    world, free, marks = office(1)
+    camera = replace(SHARP, mount=(0.1, 0.05, 0.2))
+    sensor = LandmarkSensor(replace(PERFECT, camera=camera), world.walls, marks)
+    rng = np.random.default_rng(0)
+    for _ in range(10):
+        poses = free.draw_starts(3, rng, 1.0)
+        visible = sensor.visible(poses)
+        for pose, seen, frame in zip(poses, visible, sensor.measure(poses, rng), strict=True):
+            assert sorted(frame.true_ids.tolist()) == np.flatnonzero(seen).tolist()
+            local = camera.robot_from_camera(frame.measurements.points)
+            c, s = np.cos(pose[2]), np.sin(pose[2])
+            x, y = pose[0] + c * local[:, 0] - s * local[:, 1], pose[1] + s * local[:, 0] + c * local[:, 1]
+            measured = np.stack([x, y, local[:, 2]], axis=1)
+            np.testing.assert_allclose(measured, marks.positions[frame.true_ids], atol=1e-6)
+            np.testing.assert_allclose(frame.measurements.descriptors, marks.descriptors[frame.true_ids], atol=1e-6)
+            assert frame.measurements.covariances is None
+
+
+def test_visibility_is_the_plain_definition() -> None:
+    """Compiled visibility equals: in the image and range, face not too oblique, no other wall across the sight line."""
+    world, free, marks = office(4)
+    camera = StereoCamera(mount=(0.05, -0.03, 0.1))
+    sensor = LandmarkSensor(replace(PERFECT, camera=camera), world.walls, marks)
+    a, b = world.walls[:, :2], world.walls[:, 2:]
+    for pose in free.draw_starts(12, np.random.default_rng(2), 0.5):
+        c, s = np.cos(pose[2]), np.sin(pose[2])
+        robot_from_world = np.array([[c, s], [-s, c]])
+        local = np.column_stack([(marks.positions[:, :2] - pose[:2]) @ robot_from_world.T, marks.positions[:, 2]])
+        eye = pose[:2] + np.array(camera.mount[:2]) @ robot_from_world
+        expected = camera.sees(camera.camera_from_robot(local))
+        for n in np.flatnonzero(expected):
+            point = marks.positions[n]
+            back = np.array([*(eye - point[:2]), camera.mount[2] - point[2]])
+            expected[n] = back[:2] @ marks.normals[n] > 0.5 * np.linalg.norm(back)
+            for wall in range(len(world.walls)):
+                system = np.column_stack([point[:2] - eye, a[wall] - b[wall]])
+                if wall != marks.walls[n] and abs(np.linalg.det(system)) > 1e-12:
+                    t, u = np.linalg.solve(system, a[wall] - eye)
+                    expected[n] &= not (0.0 < t < 1.0 and 0.0 <= u <= 1.0)
+        np.testing.assert_array_equal(sensor.visible(pose[None])[0], expected)
+
+
+@pytest.mark.parametrize(
+    ("row", "seen"),
+    [
+        ([0.0, 0.0], True),
+        ([1.99, 0.0], True),
+        ([2.01, 0.0], False),  # beyond the image's edge at 26.6 degrees
+        ([0.0, 1.49], True),
+        ([0.0, 1.51], False),  # above the image
+        ([0.0, -1.51], False),  # below it
+    ],
+)
+def test_the_image_has_edges(row: list[float], seen: bool) -> None:
+    """A landmark counts as visible exactly if it projects into the image."""
+    assert LandmarkSensor(PERFECT, WALL, on_wall([row])).visible(np.zeros((1, 3)))[0, 0] == seen
+
+
+def test_range_is_that_of_the_camera() -> None:
+    """Beyond 8 m, in three dimensions, nothing is seen."""
+    sensor = LandmarkSensor(PERFECT, WALL, on_wall([[0.0, 0.0], [0.0, 1.0]]))
+    assert sensor.visible(np.array([[-3.99, 0.0, 0.0]])).tolist() == [[True, False]]
+    assert sensor.visible(np.array([[-4.01, 0.0, 0.0]])).tolist() == [[False, False]]
+
+
+def test_oblique_and_averted_faces_show_nothing() -> None:
+    """A face is read at less than 60 degrees from its normal, and never from behind."""
+    sensor = LandmarkSensor(PERFECT, WALL, on_wall([[0.0, 0.0]]))
+    for degrees, seen in ((59.0, True), (61.0, False), (-59.0, True), (-61.0, False), (180.0, False)):
+        bearing = np.radians(degrees)
+        pose = [4.0 - 2.0 * np.cos(bearing), 2.0 * np.sin(bearing), -bearing]
+        assert sensor.visible(np.array([pose]))[0, 0] == seen
+
+
+def test_walls_and_robots_hide_landmarks() -> None:
+    """A wall in between hides a landmark, and so does a robot; the landmark's own wall does not."""
+    marks = on_wall([[0.0, 0.0], [1.0, 0.0]])
+    behind = LandmarkSensor(PERFECT, np.vstack([WALL, [[2.0, -1.0, 2.0, 0.3]]]), marks)
+    assert behind.visible(np.zeros((1, 3))).tolist() == [[False, True]]
+    free = LandmarkSensor(PERFECT, WALL, marks, robot_radius=0.2)
+    assert free.visible(np.zeros((1, 3))).tolist() == [[True, True]]
+    assert free.visible(np.array([[0.0, 0.0, 0.0], [2.0, 0.1, 0.0]]))[0].tolist() == [False, True]
+    assert free.visible(np.array([[0.0, 0.0, 0.0], [2.0, -0.3, 0.0]]))[0].tolist() == [True, True]
+
+
+def test_noise_is_the_cameras() -> None:
+    """Image coordinates and disparity scatter by the camera's sigmas (within 4 %, 5 sigma), without bias."""
+    camera = StereoCamera(sigma_px=0.3, sigma_disparity_px=0.15)
+    sensor = LandmarkSensor(replace(PERFECT, camera=camera), WALL, on_wall([[0.7, 0.4]]))
+    rng = np.random.default_rng(3)
+    frames = [sensor.measure(np.zeros((1, 3)), rng)[0] for _ in range(8000)]
+    pixels = np.array([camera.project(frame.measurements.points[0]) for frame in frames])
+    true = camera.project(np.array([-0.7, -0.4, 4.0]))
+    np.testing.assert_allclose(pixels.std(axis=0), [0.3, 0.3, 0.15], rtol=0.04)
+    np.testing.assert_array_less(np.abs(pixels.mean(axis=0) - true), 5 * np.array([0.3, 0.3, 0.15]) / np.sqrt(8000))
+
+
+def test_descriptor_noise_has_the_stated_length() -> None:
+    """Descriptors stay unit vectors; they are off by about the stated length."""
+    sensor = LandmarkSensor(replace(PERFECT, descriptor_noise=0.17), WALL, on_wall([[0.0, 0.0]], size=64))
+    rng = np.random.default_rng(4)
+    vectors = np.array([sensor.measure(np.zeros((1, 3)), rng)[0].measurements.descriptors[0] for _ in range(500)])
+    np.testing.assert_allclose(np.linalg.norm(vectors, axis=1), 1.0, atol=1e-5)
+    assert np.linalg.norm(vectors - np.eye(1, 64), axis=1).mean() == pytest.approx(0.17, rel=0.03)
+
+
+def test_detection_and_choice_are_uniform() -> None:
+    """Of 7 visible landmarks, detected with 0.6, at most 3 are reported, each equally often, in each place equally.
+
+    Chi-square with 6 degrees of freedom below 22.5: false alarm rate 0.001 for each of the four.
+    """
+    rows = [[0.2 * i - 0.6, 0.0] for i in range(7)]
+    config = replace(PERFECT, detection_probability=0.6, max_measurements=3)
+    sensor = LandmarkSensor(config, WALL, on_wall(rows))
+    rng = np.random.default_rng(5)
+    frames = [sensor.measure(np.zeros((1, 3)), rng)[0].true_ids for _ in range(6000)]
+    sizes = np.bincount([len(ids) for ids in frames], minlength=4) / 6000
+    few = [(1 - 0.6) ** 7, 7 * 0.6 * 0.4**6, 21 * 0.36 * 0.4**5]
+    np.testing.assert_allclose(sizes[:3], few, atol=0.016)
+    full = np.array([ids for ids in frames if len(ids) == 3])
+    for counts in (np.bincount(full.ravel(), minlength=7), *(np.bincount(full[:, i], minlength=7) for i in range(3))):
+        expected = counts.sum() / 7
+        assert ((counts - expected) ** 2 / expected).sum() < 22.5
+
+
+def test_false_points_come_at_the_stated_rate_and_look_like_the_rest() -> None:
+    """False points appear 0.5 times a frame (within 5 sigma), within B, in the view and at no special place."""
+    world, free, marks = office(2)
+    config = LandmarkSensorConfig(false_points=0.5, max_measurements=5)
+    sensor = LandmarkSensor(config, world.walls, marks)
+    rng = np.random.default_rng(6)
+    poses = free.draw_starts(3, rng, 2.0)
+    frames = [frame for _ in range(1000) for frame in sensor.measure(poses, rng)]
+    ids = [frame.true_ids for frame in frames]
+    assert max(map(len, ids)) <= 5
+    false = np.array([(i < 0).sum() for i in ids])
+    assert false.mean() == pytest.approx(0.5, abs=5 * np.sqrt(0.5 / 3000))
+    mixed = [i for i, n in zip(ids, false, strict=True) if 0 < n < len(i)]
+    places = np.array([np.flatnonzero(i < 0).mean() / (len(i) - 1) for i in mixed])
+    assert places.mean() == pytest.approx(0.5, abs=5 * 0.5 / np.sqrt(len(places)))
+    points = np.vstack([f.measurements.points[f.true_ids < 0] for f in frames])
+    assert replace(StereoCamera(), max_range=12.0, width=330, height=250).sees(points).all()
+    vectors = np.vstack([f.measurements.descriptors[f.true_ids < 0] for f in frames])
+    nearest = np.sqrt(np.maximum(0.0, 2 - 2 * vectors @ marks.descriptors.T)).min(axis=1)
+    assert 0.5 < np.median(nearest) < 0.8  # as far from all landmarks as these are from each other
+
+
+def test_frames_repeat_with_the_seed() -> None:
+    """Equal seeds give equal bytes, another seed gives others."""
+    world, free, marks = office(3)
+    poses = free.draw_starts(2, np.random.default_rng(0), 3.0)
+    sensor = LandmarkSensor(LandmarkSensorConfig(false_points=0.5), world.walls, marks)
+    bundles = []
+    for seed in (7, 7, 8):
+        rng = np.random.default_rng(seed)
+        frames = [frame for _ in range(20) for frame in sensor.measure(poses, rng)]
+        bundles.append(b"".join(f.measurements.points.tobytes() + f.true_ids.tobytes() for f in frames))
+    assert bundles[0] == bundles[1] != bundles[2]
+
+
+def test_an_empty_view_gives_an_empty_frame() -> None:
+    """A robot that looks away reports no points, with descriptors of the usual size."""
+    sensor = LandmarkSensor(PERFECT, WALL, on_wall([[0.0, 0.0]]))
+    frame = sensor.measure(np.array([[0, 0, 3.0]]), np.random.default_rng(0))[0]
+    assert frame.measurements.points.shape == (0, 3)
+    assert frame.measurements.descriptors.shape == (0, 11)
+
+
+def test_very_noisy_disparities_give_no_points_behind_the_camera() -> None:
+    """Where noise swallows the disparity, the point is dropped; all that are reported lie ahead."""
+    camera = StereoCamera(sigma_px=10.0, sigma_disparity_px=8.0)
+    sensor = LandmarkSensor(replace(PERFECT, camera=camera), WALL, on_wall([[0.0, 0.0], [1.0, 0.0]]))
+    rng = np.random.default_rng(9)
+    frames = [sensor.measure(np.zeros((1, 3)), rng)[0] for _ in range(200)]
+    assert all(np.all(frame.measurements.points[:, 2] > 0) for frame in frames)
+    assert 200 < sum(len(frame.true_ids) for frame in frames) < 400
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"camera": None}, r"sensor\.camera: expected a StereoCamera"),
+        ({"max_measurements": 0}, r"sensor\.max_measurements: expected an int >= 1, got 0"),
+        ({"detection_probability": 1.5}, r"sensor\.detection_probability"),
+        ({"false_points": -1.0}, r"sensor\.false_points"),
+        ({"descriptor_noise": np.nan}, r"sensor\.descriptor_noise"),
+        ({"max_incidence": 0.0}, r"sensor\.max_incidence"),
+    ],
+)
+def test_bad_configurations_are_refused(changed: dict[str, Any], message: str) -> None:
+    """Numbers out of range are refused by name."""
+    with pytest.raises(ValueError, match=message):
+        LandmarkSensorConfig(**changed)

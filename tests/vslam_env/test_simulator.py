@@ -1,0 +1,148 @@
+"""Robots go where they are driven, and stop at what they hit."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from slam_backend.geometry import compose
+from vslam_env.world import FreeSpace, Simulator, World, make_world
+from vslam_env.world.visibility import distances_to_walls
+
+RADIUS = 0.2
+# Thin walls with free ends, a slit narrower than a robot, and an acute corner.
+MAZE = World(
+    "maze",
+    [
+        [0, 0, 7, 0],
+        [7, 0, 7, 5],
+        [7, 5, 0, 5],
+        [0, 5, 0, 0],
+        [2, 0, 2, 2],
+        [2, 2.3, 2, 3.5],
+        [2, 3.5, 3.5, 3.7],
+        [4, 1, 5.5, 1],
+        [5.5, 1, 4.2, 1.6],
+        [5, 5, 5.2, 3],
+    ],
+)
+OPEN = World("open", [[-50, -50, 50, -50], [50, -50, 50, 50], [50, 50, -50, 50], [-50, 50, -50, -50]])
+
+
+@given(
+    st.floats(-0.3, 1.0),
+    st.floats(-1.5, 1.5),
+    st.floats(-3.1, 3.1),
+)
+def test_a_free_robot_follows_the_arc(speed: float, turn: float, heading: float) -> None:
+    """What nothing stops ends where the unicycle's arc does, after 1 s."""
+    simulator = Simulator(OPEN, [[1.0, -2.0, heading]])
+    for _ in range(10):
+        simulator.step([[speed, turn]])
+    if abs(turn) > 1e-6:
+        local = np.array([np.sin(turn) / turn, (1.0 - np.cos(turn)) / turn]) * speed
+    else:
+        local = np.array([speed, 0.5 * speed * turn])
+    np.testing.assert_allclose(simulator.poses[0], compose([1.0, -2.0, heading], [*local, turn]), atol=1e-6)
+    assert not simulator.bumped.any()
+    assert np.all((simulator.poses[:, 2] >= -np.pi) & (simulator.poses[:, 2] < np.pi))
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_no_robot_enters_a_wall_or_another(seed: int) -> None:
+    """Over 400 ticks of wild driving no disc is more than 5 mm inside a wall or another disc, and none escapes."""
+    rng = np.random.default_rng(seed)
+    world = MAZE if seed % 2 else make_world("office", rng)
+    free = FreeSpace(world)
+    simulator = Simulator(world, free.draw_starts(4, rng, 0.5))
+    bumps = 0
+    for tick in range(400):
+        if tick % 20 == 0:
+            commands = np.column_stack([rng.choice([-0.3, 0.0, 0.5, 1.0, 1.0], 4), rng.uniform(-1.5, 1.5, 4)])
+            commands[rng.random(4) < 0.5, 1] = 0.0
+        before = simulator.poses
+        simulator.step(commands)
+        poses = simulator.poses
+        gaps = np.linalg.norm(poses[:, None, :2] - poses[None, :, :2], axis=2)[np.triu_indices(4, 1)]
+        assert distances_to_walls(poses[:, :2], world.walls).min() > RADIUS - 0.005
+        assert gaps.min() > 2 * RADIUS - 0.005
+        assert np.linalg.norm(poses[:, :2] - before[:, :2], axis=1).max() < 0.13
+        bumps += int(simulator.bumped.sum())
+    assert free.contains(simulator.poses[:, :2]).all()
+    assert bumps > 20
+
+
+def test_a_robot_against_a_wall_rests_there() -> None:
+    """A robot that presses straight into a wall stands still beside it, reports bumps, and leaves when it backs up."""
+    simulator = Simulator(MAZE, [[6.0, 2.0, 0.0]])
+    for _ in range(20):
+        simulator.step([[1.0, 0.0]])
+    resting = simulator.poses[0]
+    assert RADIUS <= 7.0 - resting[0] < RADIUS + 0.015
+    for _ in range(100):
+        simulator.step([[1.0, 0.0]])
+        assert simulator.bumped[0]
+        np.testing.assert_allclose(simulator.poses[0], resting, atol=1e-6)
+    simulator.step([[-0.3, 0.0]])
+    assert simulator.poses[0, 0] == pytest.approx(resting[0] - 0.03, abs=1e-4)
+    assert not simulator.bumped[0]
+
+
+def test_a_robot_slides_along_a_wall() -> None:
+    """Pressing into a wall at 45 degrees moves a robot along it at cos 45 of its speed: there is no friction."""
+    simulator = Simulator(OPEN, [[0.0, 49.5, np.pi / 4]])
+    for _ in range(10):
+        simulator.step([[1.0, 0.0]])
+    before = simulator.poses[0]
+    for _ in range(20):
+        simulator.step([[1.0, 0.0]])
+    assert simulator.poses[0, 0] - before[0] == pytest.approx(2.0 * np.cos(np.pi / 4), rel=1e-3)
+    assert simulator.bumped[0]
+
+
+def test_a_standing_robot_is_not_pushed_away() -> None:
+    """A robot that stands stops one that drives into it; only the driver reports a bump."""
+    simulator = Simulator(OPEN, [[0.0, 0.0, 0.0], [2.0, 0.02, 1.0]])
+    for _ in range(25):
+        simulator.step([[1.0, 0.0], [0.0, 0.0]])
+    np.testing.assert_allclose(simulator.poses[1, :2], [2.0, 0.02], atol=1e-4)
+    assert simulator.poses[0, 0] < 1.65
+    assert simulator.bumped.tolist() == [True, False]
+
+
+def test_state_continues_bit_by_bit() -> None:
+    """A fresh simulator that takes over in the middle of contacts goes on exactly as the first for 300 ticks."""
+    rng = np.random.default_rng(4)
+    starts = FreeSpace(MAZE).draw_starts(3, rng, 0.6)
+    first, second = Simulator(MAZE, starts), Simulator(MAZE, starts[::-1])
+    commands = np.stack([rng.uniform(-0.3, 1.0, (600, 3)), rng.uniform(-1.0, 1.0, (600, 3))], axis=2)
+    for command in np.repeat(commands[:30], 10, axis=0):
+        first.step(command)
+    assert first.bumped.any()
+    second.set_state(first.get_state())
+    np.testing.assert_array_equal(first.bumped, second.bumped)
+    bumps = 0
+    for command in np.repeat(commands[30:60], 10, axis=0):
+        first.step(command)
+        second.step(command)
+        assert first.poses.tobytes() == second.poses.tobytes()
+        assert first.bumped.tobytes() == second.bumped.tobytes()
+        bumps += int(first.bumped.sum())
+    assert bumps > 100
+
+
+def test_poses_share_no_memory() -> None:
+    """What is handed out or in can be changed without touching the simulator."""
+    starts = np.array([[1.0, 1.0, 0.0]])
+    simulator = Simulator(MAZE, starts)
+    starts[:] = 3.0
+    simulator.poses[:] = 9.0
+    simulator.get_state()["poses"][:] = 9.0
+    np.testing.assert_array_equal(simulator.poses, [[1.0, 1.0, 0.0]])
+
+
+@pytest.mark.parametrize("commands", [[[1.0, 0.0]], [[np.nan, 0.0], [0.0, 0.0]], "fast"])
+def test_bad_commands_are_refused(commands: object) -> None:
+    """Commands of the wrong shape, or not finite, are refused."""
+    with pytest.raises(ValueError, match=r"commands: expected .*Give \(v, omega\) for each robot\."):
+        Simulator(OPEN, [[0, 0, 0], [5, 5, 5]]).step(commands)
