@@ -156,7 +156,7 @@ def _read_table(file: Path, columns: tuple[str, ...], empty: bool = False) -> Fl
 
 def _faults(table: FloatArray, columns: tuple[str, ...]) -> Iterator[tuple[str, BoolArray]]:
     """Yield each rule that rows (n, columns) must keep, with a mask (n,) of those that break it."""
-    yield "finite numbers", ~np.isfinite(table).all(axis=1)
+    yield "finite numbers", np.asarray(~np.isfinite(table).all(axis=1))
     for name, column in zip(columns, table.T, strict=True):
         if name in ("subject", "barcode"):
             yield f"a whole {name}", column != np.round(column)

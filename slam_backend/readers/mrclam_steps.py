@@ -1,6 +1,7 @@
 """A MR.CLAM log becomes steps: odometry between common times, and what each robot saw around each of them."""
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -28,9 +29,9 @@ class SightingNoise:
         height: Standard deviation of the height [m]: all landmarks are taken to stand at the camera's own.
     """
 
-    range_floor: float = 0.08
-    range_share: float = 0.045
-    bearing: float = 0.025
+    range_floor: float = 0.12
+    range_share: float = 0.06
+    bearing: float = 0.04
     height: float = 0.05
 
     def __post_init__(self) -> None:
@@ -88,7 +89,7 @@ def steps(log: MrclamLog, dt: float = 0.25, noise: SightingNoise | None = None) 
     end = max(float(times[-1]) for times in stamps if len(times))
     if (end - start) / dt > MAX_STEPS:
         raise bad_argument("dt", f"at most {MAX_STEPS:,} steps", (end - start) / dt, "Take longer steps.")
-    times = start + dt * np.arange(int(np.ceil((end - start) / dt)) + 1)
+    times = start + dt * np.arange(int(np.ceil((end - start) / dt)) + 1, dtype=np.float64)
     return MrclamSteps(times, tuple(_robot_steps(robot, times, log.subjects, noise) for robot in log.robots))
 
 
@@ -144,7 +145,7 @@ def _robot_steps(log: RobotLog, times: FloatArray, subjects: IntArray, noise: Si
     bounds = np.searchsorted(step, np.arange(len(times) + 1))
     frames = [
         Measurements(points[a:b], descriptors[a:b], covariances[a:b]) if b > a else None
-        for a, b in zip(bounds[:-1], bounds[1:], strict=True)
+        for a, b in pairwise(bounds)
     ]
     return RobotSteps(odometry, tuple(frames))
 

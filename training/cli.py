@@ -1,0 +1,32 @@
+"""The command line `vslam`: it only registers commands; each lives in a module of its own."""
+
+import sys
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+
+from training.replay_command import replay_mrclam
+
+app = typer.Typer(
+    name="vslam",
+    help="Robots that do not know where they start explore, map and merge: runs, replays and figures.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+replay = typer.Typer(help="Run the backend on the log of real robots.", no_args_is_help=True)
+replay.command("mrclam")(replay_mrclam)
+app.add_typer(replay, name="replay")
+
+
+def main() -> None:
+    """Run the command line; bad input becomes one line on stderr and exit status 2."""
+    try:
+        app()
+    except ValueError as error:
+        # Only errors in the project's own form explain themselves; others are faults and keep their traceback.
+        if ": expected " not in str(error):
+            raise
+        Console(stderr=True, soft_wrap=True, highlight=False).print(f"[red]error[/] {escape(str(error))}")
+        sys.exit(2)

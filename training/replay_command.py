@@ -1,0 +1,171 @@
+"""The command `vslam replay mrclam`: options, live progress, a table, and the run folder."""
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+if TYPE_CHECKING:  # what computes is imported when the command runs, so that --help answers at once
+    from slam_backend.readers.mrclam import MrclamLog
+    from training.replay_mrclam import Replay, ReplayConfig
+    from training.run_folder import RunFolder
+
+COMMAND = "replay mrclam"
+DATASET = Path("mrclam") / "MRCLAM_Dataset7"
+
+
+def replay_mrclam(
+    path: Annotated[
+        Path | None, typer.Option(help=f"Folder of the log.  [default: {DATASET} in $VSLAM_DATA]", show_default=False)
+    ] = None,
+    robots: Annotated[
+        str | None, typer.Option(help="Numbers with commas, e.g. 1,2,5.  [default: all]", show_default=False)
+    ] = None,
+    duration: Annotated[
+        float | None, typer.Option(help="Seconds to replay.  [default: all]", show_default=False)
+    ] = None,
+    particles: Annotated[
+        int | None, typer.Option(help="Particles per filter.  [default: 100]", show_default=False)
+    ] = None,
+    estimator: Annotated[
+        str | None, typer.Option(help="fastslam2 or fastslam1.  [default: fastslam2]", show_default=False)
+    ] = None,
+    seed: Annotated[int | None, typer.Option(help="Of all random draws.  [default: 0]", show_default=False)] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="New run folder.  [default: the next runs/replay-mrclam-*]", show_default=False)
+    ] = None,
+    json: Annotated[Path | None, typer.Option(help="Write the metrics to this file too.", show_default=False)] = None,
+    config: Annotated[
+        Path | None,
+        typer.Option(help="config.toml of an earlier run to repeat; other options override it.", show_default=False),
+    ] = None,
+) -> None:
+    """Five real robots with unknown starts: a filter each, maps aligned and merged, one team in the end."""
+    from slam_backend.readers.mrclam import load_mrclam
+    from training.figures_replay import draw_replay
+    from training.replay_mrclam import ReplayConfig, replay
+    from training.replay_scores import score_path, summarise
+    from training.run_folder import RunFolder, read_config, to_json, write_whole
+
+    values: dict[str, Any] = {}
+    if config is not None:
+        values, values["seed"] = read_config(config, COMMAND)
+    given = {
+        "path": None if path is None else str(path),
+        "robots": None if robots is None else parse_numbers(robots),
+        "duration": duration,
+        "particles": particles,
+        "estimator": estimator,
+        "seed": seed,
+    }
+    values |= {name: value for name, value in given.items() if value is not None}
+    chosen = ReplayConfig.from_mapping({"path": str(default_path()), **values} if "path" not in values else values)
+    log = load_mrclam(chosen.path, chosen.robots, chosen.duration)
+    folder = RunFolder.create(out, COMMAND, chosen.to_mapping(), chosen.seed)
+    console = Console()
+    result = _replay_live(console, log, chosen, replay)
+    paths = [score_path(result, robot, own.truth) for robot, own in enumerate(log.robots)]
+    metrics = folder.write_metrics(summarise(result, log, paths))
+    _write_paths(folder, log, result)
+    draw_replay(folder.path / "replay.png", log, result, paths)
+    if json is not None:
+        write_whole(json, to_json(metrics))
+    _print_tables(console, metrics)
+    console.print(f"Run folder: {folder.path}", soft_wrap=True, highlight=False)
+
+
+def parse_numbers(text: str) -> tuple[int, ...]:
+    """Return the numbers of a text such as `1,2,5`.
+
+    Raises:
+        ValueError: If it is none.
+    """
+    from slam_backend.errors import bad_argument
+
+    words = text.split(",")
+    if not all(word.strip().isdecimal() for word in words):
+        raise bad_argument("robots", "numbers with commas between", repr(text), "Write them like 1,2,5.")
+    return tuple(int(word) for word in words)
+
+
+def default_path() -> Path:
+    """Return the folder of the log below the one that the variable VSLAM_DATA names.
+
+    Raises:
+        ValueError: If the variable is not set.
+    """
+    from slam_backend.errors import bad_argument
+
+    data = os.environ.get("VSLAM_DATA")
+    if not data:
+        raise bad_argument("path", "a folder of the MR.CLAM log", "no --path", "Name it, or set VSLAM_DATA.")
+    return Path(data) / DATASET
+
+
+def _replay_live(console: Console, log: "MrclamLog", config: "ReplayConfig", replay: Any) -> "Replay":
+    """Run the replay under a progress bar, and tell of each merge as it comes."""
+    numbers = [own.robot for own in log.robots]
+    columns = (
+        TextColumn("[progress.description]{task.description}"), BarColumn(), TextColumn("{task.percentage:>3.0f} %"),
+        TextColumn("{task.fields[groups]} groups"), TimeElapsedColumn(), TimeRemainingColumn(),
+    )  # fmt: skip
+    with Progress(*columns, console=console) as progress:
+        task = progress.add_task(f"{len(numbers)} robots", total=1.0, groups=len(numbers))
+
+        def on_step(done: float, report: Any) -> None:
+            progress.update(task, completed=done, groups=len(report.groups))
+            for event in report.events:
+                if event.kind == "merge":
+                    sides = [", ".join(str(numbers[r]) for r in side) for side in (event.robots_a, event.robots_b)]
+                    seconds = report.step * config.dt
+                    progress.console.print(f"{seconds:6.1f} s  maps of {sides[0]} and {sides[1]} merged")
+
+        result: Replay = replay(log, config, on_step)
+    return result
+
+
+def _write_paths(folder: "RunFolder", log: "MrclamLog", result: "Replay") -> None:
+    """Write per robot its estimated and reckoned path, own start frame, and its true one, world frame."""
+    from slam_backend.trajectory import Trajectory
+
+    for robot, own in enumerate(log.robots):
+        for kind, poses in (("estimate", result.paths[robot]), ("dead_reckoning", result.reckoned[robot])):
+            folder.write_trajectory(f"robot{own.robot}_{kind}", Trajectory(result.times, poses))
+        if own.truth is not None:
+            folder.write_trajectory(f"robot{own.robot}_truth", own.truth)
+
+
+def _print_tables(console: Console, metrics: dict[str, Any]) -> None:
+    """Print scores of robots and merges."""
+    table = Table(title="Path and map errors [m]")
+    table.add_column("robot", justify="right")
+    for name in ("path\naligned", "dead reckoning\naligned", "path\nfrom start", "dead reckoning\nfrom start"):
+        table.add_column(name, justify="right")
+    for name in ("map RMSE\naligned", "recall", "precision", "map error\nfrom start"):
+        table.add_column(name, justify="right")
+    keys = (
+        "ate_aligned_m", "dead_reckoning_ate_aligned_m", "ate_start_m", "dead_reckoning_ate_start_m",
+        "map_rmse_m", "map_recall", "map_precision", "map_error",
+    )  # fmt: skip
+    for row in metrics["robots"]:
+        table.add_row(str(row["robot"]), *(_number(row[key]) for key in keys))
+    console.print(table)
+    merges = Table(title="Merges")
+    for name in ("time [s]", "group", "with", "shared landmarks", "off by [m]", "off by [deg]"):
+        merges.add_column(name, justify="right")
+    for row in metrics["merges"]:
+        sides = [", ".join(map(str, row[side])) for side in ("robots_a", "robots_b")]
+        merges.add_row(
+            f"{row['time_s']:.1f}", *sides, str(row["inliers"]), _number(row["error_m"]), _number(row["error_deg"])
+        )
+    console.print(merges if metrics["merges"] else "No merge.")
+    console.print("Groups at the end: " + "; ".join(", ".join(map(str, group)) for group in metrics["groups"]))
+
+
+def _number(value: float | None) -> str:
+    """Show a number with two digits, and what is not known as a dash."""
+    return "-" if value is None else f"{value:.2f}"

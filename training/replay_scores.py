@@ -1,0 +1,167 @@
+"""A replay is scored against the true paths and landmarks of its log."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from slam_backend.errors import BoolArray, FloatArray, IntArray
+from slam_backend.geometry import between, compose, inverse, transform_points, wrap_angle
+from slam_backend.landmark_map import LandmarkMap
+from slam_backend.metrics import MapScore, align_se2, ate, map_error, map_rmse
+from slam_backend.readers.mrclam import MrclamLog
+from slam_backend.trajectory import Trajectory
+from training.replay_mrclam import Merge, Replay
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PathScore:
+    """One robot's path against the truth, where there is one.
+
+    Attributes:
+        known: (T,) bool. Steps at which the true pose is known.
+        truth: (known steps, 3) float64 [m, m, rad], world frame.
+        world_from_start: (3,) The start frame put at the true start pose.
+        ate_start: [m] With that pose, without fitting.
+        ate_aligned: [m] After SE(2) alignment of the whole path.
+        world_from_path: (3,) That alignment.
+        reckoned_start: [m] As `ate_start`, of dead reckoning.
+        reckoned_aligned: [m] As `ate_aligned`, of dead reckoning.
+        world_from_reckoned: (3,) Its alignment.
+    """
+
+    known: BoolArray
+    truth: FloatArray
+    world_from_start: FloatArray
+    ate_start: float
+    ate_aligned: float
+    world_from_path: FloatArray
+    reckoned_start: float
+    reckoned_aligned: float
+    world_from_reckoned: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AlignedMap:
+    """A map fitted to the true landmarks by their barcodes.
+
+    Attributes:
+        world_from_map: (3,) float64 [m, m, rad]. The fit, over one landmark per barcode: the one seen most.
+        landmarks: The map in the world frame.
+        claims: (N,) int64. Row in `MrclamLog.positions` of each landmark.
+        score: RMS error, recall and precision after the fit, in the plane.
+    """
+
+    world_from_map: FloatArray
+    landmarks: LandmarkMap
+    claims: IntArray
+    score: MapScore
+
+
+def score_path(replay: Replay, robot: int, truth: Trajectory | None) -> PathScore | None:
+    """Score the path of a robot, counted from 0; None if fewer than two of its steps have a true pose."""
+    if truth is None:
+        return None
+    known = (replay.times >= truth.times[0]) & (replay.times <= truth.times[-1])
+    if np.count_nonzero(known) < 2:
+        return None
+    true = truth.at(replay.times[known])
+    paths = [values[robot][known] for values in (replay.paths, replay.reckoned)]
+    starts = [compose(true[0], inverse(path[0])) for path in paths]
+    errors = [ate(compose(start, path), true) for start, path in zip(starts, paths, strict=True)]
+    fits = [align_se2(true[:, :2], path[:, :2]) for path in paths]
+    return PathScore(
+        known=known,
+        truth=true,
+        world_from_start=starts[0],
+        ate_start=errors[0].start,
+        ate_aligned=errors[0].aligned,
+        world_from_path=fits[0],
+        reckoned_start=errors[1].start,
+        reckoned_aligned=errors[1].aligned,
+        world_from_reckoned=fits[1],
+    )
+
+
+def align_to_truth(landmarks: LandmarkMap, log: MrclamLog) -> AlignedMap | None:
+    """Fit a map to the true landmarks; None if it holds fewer than two different barcodes."""
+    claims = landmarks.descriptors.argmax(axis=1) if len(landmarks) else np.empty(0, dtype=np.int64)
+    by_count = np.argsort(-landmarks.counts, kind="stable")
+    barcodes, first = np.unique(claims[by_count], return_index=True)
+    if len(barcodes) < 2:
+        return None
+    most_seen = by_count[first]
+    fit = align_se2(log.positions[barcodes], landmarks.means[most_seen, :2])
+    moved = landmarks.moved(fit)
+    score = map_rmse(_flat(moved.means), _flat(log.positions), claims.astype(np.int64))
+    return AlignedMap(fit, moved, claims.astype(np.int64), score)
+
+
+def merge_error(merge: Merge, log: MrclamLog) -> tuple[float, float] | None:
+    """Return how far a merge's motion is off [m, rad]; None if one of the maps cannot be fitted to the truth.
+
+    The true motion between two maps is that between their fits to the true landmarks. The true start poses do not
+    give it, because each map is turned about its start by what its first steps got wrong.
+    """
+    fit_a, fit_b = align_to_truth(merge.map_a, log), align_to_truth(merge.map_b, log)
+    if fit_a is None or fit_b is None:
+        return None
+    true = between(fit_a.world_from_map, fit_b.world_from_map)
+    found = merge.event.alignment.transform
+    middle = merge.map_b.means[:, :2].mean(axis=0)  # where the landmarks lie matters, not a far origin
+    offset = transform_points(found, middle) - transform_points(true, middle)
+    return float(np.hypot(*offset)), abs(float(wrap_angle(found[2] - true[2])))
+
+
+def summarise(replay: Replay, log: MrclamLog, paths: Sequence[PathScore | None]) -> dict[str, Any]:
+    """Return the content of `metrics.json`; what cannot be known is NaN, robots carry the numbers of the log."""
+    numbers = [robot.robot for robot in log.robots]
+    named = [[numbers[robot] for robot in group] for group in replay.groups]
+    nan = float("nan")
+    robots = []
+    for robot, path in enumerate(paths):
+        aligned = align_to_truth(replay.maps[robot], log)
+        robots.append(
+            {
+                "robot": numbers[robot],
+                "ate_aligned_m": path.ate_aligned if path else nan,
+                "ate_start_m": path.ate_start if path else nan,
+                "dead_reckoning_ate_aligned_m": path.reckoned_aligned if path else nan,
+                "dead_reckoning_ate_start_m": path.reckoned_start if path else nan,
+                "map_rmse_m": aligned.score.rmse if aligned else nan,
+                "map_recall": aligned.score.recall if aligned else 0.0,
+                "map_precision": aligned.score.precision if aligned else 0.0,
+                "map_error": _start_frame_error(replay.maps[robot], path, log) if path else nan,
+            }
+        )
+    merges = []
+    for merge in replay.merges:
+        error = merge_error(merge, log)
+        merges.append(
+            {
+                "time_s": merge.time,
+                "step": merge.event.step,
+                "robots_a": [numbers[robot] for robot in merge.event.robots_a],
+                "robots_b": [numbers[robot] for robot in merge.event.robots_b],
+                "inliers": len(merge.event.alignment.inliers),
+                "error_m": error[0] if error else nan,
+                "error_deg": float(np.rad2deg(error[1])) if error else nan,
+            }
+        )
+    duration = float(replay.times[-1] - replay.times[0])
+    return {
+        "robots": robots, "merges": merges, "groups": named, "coverage": nan,
+        "attempts": replay.attempts, "duration_s": duration,
+    }  # fmt: skip
+
+
+def _start_frame_error(landmarks: LandmarkMap, path: PathScore, log: MrclamLog) -> float:
+    """Return the map error with the start frame at the true start pose, without any fitting."""
+    claims = landmarks.descriptors.argmax(axis=1).astype(np.int64) if len(landmarks) else np.empty(0, dtype=np.int64)
+    return map_error(_flat(landmarks.moved(path.world_from_start).means), claims, _flat(log.positions))
+
+
+def _flat(points: FloatArray) -> FloatArray:
+    """Return points (n, 2) or (n, 3) as (n, 3) at height 0: the log knows no heights."""
+    return np.column_stack([points[:, :2], np.zeros(len(points))])

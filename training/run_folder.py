@@ -1,0 +1,195 @@
+"""`RunFolder`: one run's results on disk, with all that is needed to repeat it."""
+
+import json
+import math
+import os
+import platform
+import tempfile
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import tomli_w
+
+from slam_backend.errors import bad_argument, check_int
+from slam_backend.trajectory import Trajectory
+
+PACKAGES = ("vslam-env", "numpy", "scipy", "numba", "opencv-python-headless", "pymunk", "gymnasium", "pettingzoo")
+CONFIG_FILE = "config.toml"
+METRICS_FILE = "metrics.json"
+
+
+@dataclass(frozen=True, slots=True)
+class RunFolder:
+    """A folder that belongs to one run alone.
+
+    Attributes:
+        path: The folder; it exists.
+        command: The command that made it, e.g. `"replay mrclam"`.
+        config: Arguments that repeat the run, as `plain` leaves them.
+        seed: Of all random draws.
+        versions: Of Python and the packages that decide the results.
+    """
+
+    path: Path
+    command: str
+    config: dict[str, Any]
+    seed: int
+    versions: dict[str, str]
+
+    @classmethod
+    def create(cls, out: Path | None, command: str, config: Mapping[str, Any], seed: int) -> Self:
+        """Make the folder and write `config.toml`; no file is ever overwritten.
+
+        Args:
+            out: The folder; it may exist if it is empty. None: the next free `runs/<command>-<seed>-<n>`.
+            command: The command that runs, without the leading `vslam`.
+            config: Arguments of the command; nested mappings become tables, None means "not given".
+            seed: Of all random draws.
+
+        Raises:
+            ValueError: If `out` is a file, holds files, or cannot be written.
+        """
+        seed = check_int("seed", seed, 0, "Use 0 or a positive number.")
+        folder = _next_free(Path("runs"), f"{command.replace(' ', '-')}-{seed}") if out is None else _claim(Path(out))
+        run = cls(folder, command, _drop_none(plain(config)), seed, installed_versions())
+        content = {"command": command, "seed": seed, "config": run.config, "versions": run.versions}
+        run.write_text(CONFIG_FILE, tomli_w.dumps(content))
+        return run
+
+    def write_metrics(self, metrics: Mapping[str, Any]) -> dict[str, Any]:
+        """Write `metrics.json` with the run's config, seed and versions added; return what was written."""
+        about = {"config": self.config, "seed": self.seed, "versions": self.versions}
+        content: dict[str, Any] = plain({**metrics, **about})
+        self.write_text(METRICS_FILE, to_json(content))
+        return content
+
+    def write_trajectory(self, name: str, trajectory: Trajectory) -> Path:
+        """Write a path as `<name>.tum`."""
+        file = self.path / f"{name}.tum"
+        trajectory.save_tum(file)
+        return file
+
+    def write_text(self, name: str, text: str) -> Path:
+        """Write a text file so that a reader finds it whole or not at all."""
+        return write_whole(self.path / name, text)
+
+
+def read_config(path: Path, command: str) -> tuple[dict[str, Any], int]:
+    """Read the config and seed of an earlier run.
+
+    Args:
+        path: Its `config.toml`, or the run folder.
+        command: The command that wants to repeat it.
+
+    Raises:
+        ValueError: If the file is missing or damaged, or another command wrote it.
+    """
+    file = path / CONFIG_FILE if path.is_dir() else path
+    expected = f"the {CONFIG_FILE} of an earlier run"
+    if not file.is_file():
+        raise bad_argument("config", expected, f"no file {str(file)!r}", "Name a run folder or the file in it.")
+    try:
+        content = tomllib.loads(file.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise bad_argument("config", expected, f"a broken file ({error})", f"Correct {file}.") from error
+    if content.get("command") != command:
+        raise bad_argument("config", f"a run of {command!r}", content.get("command"), "Use the command that wrote it.")
+    config, seed = content.get("config"), content.get("seed")
+    if not isinstance(config, dict) or not isinstance(seed, int):
+        raise bad_argument("config", "a table [config] and a whole number seed", f"a file {str(file)!r}", "Add them.")
+    return config, seed
+
+
+def plain(value: Any) -> Any:
+    """Turn numpy values, tuples and paths into what JSON and TOML know; numbers that are not finite become None.
+
+    >>> plain({"rmse": np.float64("nan"), "robots": (np.int64(1), 2)})
+    {'rmse': None, 'robots': [1, 2]}
+    """
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return str(value) if isinstance(value, Path) else value
+
+
+def to_json(content: Any) -> str:
+    """Return indented JSON text of a plain value, a number that is not finite being an error."""
+    return json.dumps(content, indent=2, allow_nan=False) + "\n"
+
+
+def write_whole(file: Path, text: str) -> Path:
+    """Write a text file by way of a temporary one beside it, so that no reader ever finds a part."""
+    try:
+        handle, temporary = tempfile.mkstemp(dir=file.parent, prefix=f".{file.name}-")
+        with os.fdopen(handle, "w", encoding="utf-8") as stream:
+            stream.write(text)
+        Path(temporary).chmod(0o666 & ~_umask())  # mkstemp makes files that only their owner can read
+        Path(temporary).replace(file)
+    except OSError as error:
+        raise bad_argument("out", "a place that can be written", f"a failure ({error})", "Choose another.") from error
+    return file
+
+
+def installed_versions() -> dict[str, str]:
+    """Return the versions of Python and of `PACKAGES`, as far as these are installed."""
+    versions = {"python": platform.python_version()}
+    for package in PACKAGES:
+        try:
+            versions[package] = version(package)
+        except PackageNotFoundError:
+            continue
+    return versions
+
+
+def _umask() -> int:
+    """Return the process's mask of file permissions, which can only be read by setting it."""
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+def _drop_none(value: Any) -> Any:
+    """Leave out the keys that are None, which TOML cannot say."""
+    if isinstance(value, dict):
+        return {key: _drop_none(item) for key, item in value.items() if item is not None}
+    return value
+
+
+def _claim(folder: Path) -> Path:
+    """Make `folder`, or take it if it is empty."""
+    cure = "Choose a new folder, or leave --out away."
+    if folder.is_file():
+        raise bad_argument("out", "a folder", f"a file {str(folder)!r}", cure)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        full = any(folder.iterdir())
+    except OSError as error:
+        raise bad_argument("out", "a folder that can be written", f"a failure ({error})", cure) from error
+    if full:
+        raise bad_argument("out", "a new or empty folder", f"a folder with files, {str(folder)!r}", cure)
+    return folder
+
+
+def _next_free(parent: Path, stem: str) -> Path:
+    """Make the folder `<stem>-<n>` with the smallest n that nobody has taken."""
+    for n in range(1, 1_000_000):
+        folder = parent / f"{stem}-{n}"
+        try:
+            folder.mkdir(parents=True)
+        except FileExistsError:
+            continue
+        except OSError as error:
+            cure = "Name another folder with --out."
+            raise bad_argument("out", "a folder that can be written", f"a failure ({error})", cure) from error
+        return folder
+    raise bad_argument("out", "a free number", f"a million folders {stem!r}", "Clean up runs.")
