@@ -55,20 +55,29 @@ def _on_one_line(a: Any, b: Any, c: Any) -> bool:
 
 
 @jit
-def _join_hits(hits: Any, is_hit: Any) -> Any:
-    """Tell for each pair of neighbouring rays whether they see one surface without a gap to drive through."""
+def _surfaces(hits: Any, is_hit: Any) -> tuple[Any, Any]:
+    """Find which neighbouring rays see one surface without a gap to drive through.
+
+    Returns:
+        For each pair of rays, whether it does, (n - 1,) bool; and of the line through its two hits the unit normal
+        towards the robot and the robot's distance, (n - 1, 3) float64.
+    """
     count = len(is_hit)
     joined = np.zeros(count - 1, np.bool_)
+    lines = np.zeros((count - 1, 3))
     for i in range(count - 1):
         if not (is_hit[i] and is_hit[i + 1]):
             continue
-        gap = math.hypot(hits[i + 1, 0] - hits[i, 0], hits[i + 1, 1] - hits[i, 1])
+        along_x, along_y = hits[i + 1, 0] - hits[i, 0], hits[i + 1, 1] - hits[i, 1]
+        gap = math.hypot(along_x, along_y)
         if gap < 1e-6 or gap > STRAIGHT_GAP:
             continue
         before = i > 0 and is_hit[i - 1] and _on_one_line(hits[i - 1], hits[i], hits[i + 1])
         after = i + 2 < count and is_hit[i + 2] and _on_one_line(hits[i], hits[i + 1], hits[i + 2])
         joined[i] = gap <= SAME_SURFACE_GAP or before or after
-    return joined
+        lines[i, 0], lines[i, 1] = -along_y / gap, along_x / gap
+        lines[i, 2] = (along_y * hits[i, 0] - along_x * hits[i, 1]) / gap
+    return joined, lines
 
 
 @jit
@@ -112,7 +121,9 @@ def paint_scan(
         hits[i, 0], hits[i, 1] = reach[i] * direction[i, 0], reach[i] * direction[i, 1]
         low_x, high_x = min(low_x, hits[i, 0]), max(high_x, hits[i, 0])
         low_y, high_y = min(low_y, hits[i, 1]), max(high_y, hits[i, 1])
-    joined = _join_hits(hits, is_hit)
+    joined, lines = _surfaces(hits, is_hit)
+    jump = is_hit[:-1] | is_hit[1:]
+    free_below = np.maximum(np.minimum(reach[:-1], reach[1:]) - WALL_HALF_THICKNESS * jump, 0.0)
 
     first_row, last_row = _cell_range(y + low_y - CELL, y + high_y + CELL)
     first_col, last_col = _cell_range(x + low_x - CELL, x + high_x + CELL)
@@ -131,29 +142,23 @@ def paint_scan(
             while k < count - 2 and direction[k + 1, 0] * v >= direction[k + 1, 1] * u:
                 k += 1
             if joined[k]:
-                along_x, along_y = hits[k + 1, 0] - hits[k, 0], hits[k + 1, 1] - hits[k, 1]
-                before = along_x * (v - hits[k, 1]) - along_y * (u - hits[k, 0])  # positive on the robot's side
-                before /= math.hypot(along_x, along_y)
+                before = lines[k, 0] * u + lines[k, 1] * v + lines[k, 2]
                 if before > WALL_HALF_THICKNESS:
                     _add(evidence, cells, row, col, -1)
                 elif before > -WALL_HALF_THICKNESS:
                     _add(evidence, cells, row, col, HIT)
-                continue
-            distance = math.hypot(u, v)
-            both = min(reach[k], reach[k + 1])
-            jump = is_hit[k] or is_hit[k + 1]
-            if distance < both - (WALL_HALF_THICKNESS if jump else 0.0):
+            elif u * u + v * v < free_below[k] ** 2:
                 _add(evidence, cells, row, col, -1)
-            elif jump:
+            elif jump[k]:
                 aside = abs(direction[k, 0] * v - direction[k, 1] * u)
                 aside_next = abs(direction[k + 1, 0] * v - direction[k + 1, 1] * u)
                 ray = k if aside <= aside_next else k + 1
+                past = math.sqrt(u * u + v * v) - reach[ray]
                 if min(aside, aside_next) > RAY_HALF_WIDTH:
                     continue
-                if distance < reach[ray] - WALL_HALF_THICKNESS:
-                    if evidence[row, col] <= 0:
-                        _add(evidence, cells, row, col, -1)
-                elif is_hit[ray] and distance < reach[ray] + WALL_HALF_THICKNESS:
+                if past < -WALL_HALF_THICKNESS and evidence[row, col] <= 0:
+                    _add(evidence, cells, row, col, -1)
+                elif is_hit[ray] and abs(past) < WALL_HALF_THICKNESS:
                     _add(evidence, cells, row, col, HIT)
     return READINGS_FINE
 
@@ -175,6 +180,25 @@ def paint_disc(evidence: Any, cells: Any, x: float, y: float, radius: float) -> 
 
 
 @jit
+def _bounds_in_frame(other: Any, x: float, y: float, c: float, s: float) -> tuple[float, float, float, float]:
+    """Return low x, high x, low y and high y [m] of what a grid knows, seen from pose (x, y) turned by (c, s)."""
+    low_row, high_row, low_col, high_col = GRID_SIZE, -1, GRID_SIZE, -1
+    for row in range(GRID_SIZE):
+        for col in range(GRID_SIZE):
+            if other[row, col] != 0:
+                low_row, high_row = min(low_row, row), row
+                low_col, high_col = min(low_col, col), max(high_col, col)
+    low_x, high_x, low_y, high_y = math.inf, -math.inf, math.inf, -math.inf
+    if high_row >= 0:
+        for row in (low_row, high_row + 1):
+            for col in (low_col, high_col + 1):
+                u, v = col * CELL - HALF_WIDTH, row * CELL - HALF_WIDTH
+                low_x, high_x = min(low_x, x + c * u - s * v), max(high_x, x + c * u - s * v)
+                low_y, high_y = min(low_y, y + s * u + c * v), max(high_y, y + s * u + c * v)
+    return low_x, high_x, low_y, high_y
+
+
+@jit
 def paint_grid(evidence: Any, cells: Any, other: Any, x: float, y: float, theta: float) -> None:
     """Add another grid's evidence, seen from pose (x, y, theta) of its frame in this one.
 
@@ -182,8 +206,11 @@ def paint_grid(evidence: Any, cells: Any, other: Any, x: float, y: float, theta:
     a wall one cell thick would come out of a rotation with holes.
     """
     c, s = math.cos(theta), math.sin(theta)
-    for row in range(GRID_SIZE):
-        for col in range(GRID_SIZE):
+    low_x, high_x, low_y, high_y = _bounds_in_frame(other, x, y, c, s)
+    first_row, last_row = _cell_range(low_y, high_y)
+    first_col, last_col = _cell_range(low_x, high_x)
+    for row in range(first_row, last_row):
+        for col in range(first_col, last_col):
             u = (col + 0.5) * CELL - HALF_WIDTH - x
             v = (row + 0.5) * CELL - HALF_WIDTH - y
             other_x, other_y = (c * u + s * v + HALF_WIDTH) / CELL, (-s * u + c * v + HALF_WIDTH) / CELL

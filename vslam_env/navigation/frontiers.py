@@ -11,15 +11,12 @@ from scipy.optimize import linear_sum_assignment
 from slam_backend._jit import jit
 from slam_backend.errors import BoolArray, FloatArray, check_array
 from vslam_env.navigation._arguments import pose_floats, positions_array
-from vslam_env.navigation._painting import CELL, FREE, GRID_SIZE, HALF_WIDTH, UNKNOWN
-from vslam_env.navigation._wavefront import UNREACHED
+from vslam_env.navigation._frontier_search import HEADING, LENGTH, NUM_COLUMNS, SIZE, XY, frontier_rows
+from vslam_env.navigation._painting import CELL, GRID_SIZE, HALF_WIDTH
 from vslam_env.navigation.planning import distance_map
 
 NUM_SLOTS = 16
 ROBOT_RADIUS = 0.2  # [m]
-MIN_CELLS = 3  # a robot needs 0.4 m; what is smaller is a speck or the corner of a wall
-MAX_CELLS = 20  # longer frontiers are cut, as one goal cannot stand for them
-SIGHT_CELLS = 3  # the unknown this near to a goal tells where to look from it
 
 SAME_GOAL = 1.0  # [m] between updates the goal of a living candidate moves less than this
 AT_GOAL = 0.5  # [m]
@@ -28,8 +25,6 @@ LOOK_COUNTS = 4  # times as much as a visit without a look, for a teammate's dir
 PATIENCE = 16  # visits, after which what is still unseen there never will be seen
 GIVEN_UP = 0.8  # [m] radius of what is then left out
 NO_TEAMMATE = 60.0  # [m] stands for the distance of a teammate when there is none
-
-XY, HEADING, SIZE, LENGTH, NUM_COLUMNS = slice(0, 2), 2, 3, 4, 5  # columns of the rows that describe candidates
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,117 +44,10 @@ class Frontiers:
     lengths: FloatArray
 
 
-@jit
-def _flood(mark: Any, level: int, into: int, row: int, col: int, limit: int, queue: Any) -> int:
-    """Move up to `limit` connected cells from one level of marks to another, nearest first; return how many.
-
-    Their rows and columns are left in the first rows of `queue`.
-    """
-    queue[0, 0], queue[0, 1] = row, col
-    mark[row, col] = into
-    head, tail = 0, 1
-    while head < tail:
-        r, c = queue[head]
-        head += 1
-        for nr in range(r - 1, r + 2):
-            for nc in range(c - 1, c + 2):
-                if mark[nr, nc] == level and tail < limit:
-                    mark[nr, nc] = into
-                    queue[tail, 0], queue[tail, 1] = nr, nc
-                    tail += 1
-    return tail
-
-
-@jit
-def _goal_beside(members: Any, cost: Any) -> tuple[int, int]:
-    """Return the reached cell beside a frontier that is nearest to the middle of all such cells; (-1, -1) if none."""
-    total, sum_row, sum_col = 0, 0.0, 0.0
-    for k in range(len(members)):
-        for nr in range(members[k, 0] - 1, members[k, 0] + 2):
-            for nc in range(members[k, 1] - 1, members[k, 1] + 2):
-                if cost[nr, nc] != UNREACHED:
-                    total, sum_row, sum_col = total + 1, sum_row + nr, sum_col + nc
-    best, goal_row, goal_col = np.inf, -1, -1
-    for k in range(len(members)):
-        for nr in range(members[k, 0] - 1, members[k, 0] + 2):
-            for nc in range(members[k, 1] - 1, members[k, 1] + 2):
-                if cost[nr, nc] != UNREACHED:
-                    distance = (nr - sum_row / total) ** 2 + (nc - sum_col / total) ** 2
-                    if distance < best:
-                        best, goal_row, goal_col = distance, nr, nc
-    return goal_row, goal_col
-
-
-@jit
-def _path_length(parent: Any, row: int, col: int) -> float:
-    """Measure the way to a reached cell [m]."""
-    width = parent.shape[1]
-    before = parent.ravel()
-    cell, length = row * width + col, 0.0
-    while before[cell] >= 0:
-        step = abs(cell - before[cell])
-        length += CELL if step in (1, width) else math.sqrt(2.0) * CELL
-        cell = before[cell]
-    return length
-
-
-@jit
-def _heading_to_unknown(box: Any, row: int, col: int) -> float:
-    """Return the direction from a cell to the unknown cells around it [rad]."""
-    up = right = 0
-    for r in range(max(row - SIGHT_CELLS, 0), min(row + SIGHT_CELLS + 1, box.shape[0])):
-        for c in range(max(col - SIGHT_CELLS, 0), min(col + SIGHT_CELLS + 1, box.shape[1])):
-            if box[r, c] == UNKNOWN:
-                up, right = up + r - row, right + c - col
-    return math.atan2(up, right)
-
-
-@jit
-def _find(box: Any, cost: Any, parent: Any, ignored: Any, row: int, col: int) -> Any:
-    """Collect the frontiers of a box whose first cell is the grid's (row, col).
-
-    Returns:
-        (n, 5) float64 rows (x, y, heading, size, length), by increasing length.
-    """
-    height, width = box.shape
-    mark = np.zeros((height, width), np.int8)  # 1: unseen beside free floor; 2: its component known; 3: in a piece
-    for r in range(1, height - 1):
-        for c in range(1, width - 1):
-            at_edge = FREE in (box[r - 1, c], box[r + 1, c], box[r, c - 1], box[r, c + 1])
-            if at_edge and box[r, c] == UNKNOWN and not ignored[row + r, col + c]:
-                mark[r, c] = 1
-
-    found = np.empty((height * width // MIN_CELLS + 1, NUM_COLUMNS))
-    count = 0
-    whole = np.empty((height * width, 2), np.int64)
-    piece = np.empty((MAX_CELLS, 2), np.int64)
-    for r in range(1, height - 1):
-        for c in range(1, width - 1):
-            if mark[r, c] != 1:
-                continue
-            size = _flood(mark, 1, 2, r, c, height * width, whole)
-            num_pieces = (size + MAX_CELLS - 1) // MAX_CELLS
-            share = (size + num_pieces - 1) // num_pieces
-            for k in range(size - 1, -1, -1):  # from the far end, so that a line is cut piece by piece
-                if mark[whole[k, 0], whole[k, 1]] != 2:
-                    continue
-                num = _flood(mark, 2, 3, whole[k, 0], whole[k, 1], share, piece)
-                goal_row, goal_col = _goal_beside(piece[:num], cost)
-                if num < MIN_CELLS or goal_row < 0:
-                    continue
-                found[count, 0] = (col + goal_col + 0.5) * CELL - HALF_WIDTH
-                found[count, 1] = (row + goal_row + 0.5) * CELL - HALF_WIDTH
-                found[count, HEADING] = _heading_to_unknown(box, goal_row, goal_col)
-                found[count, SIZE] = num * CELL
-                found[count, LENGTH] = _path_length(parent, goal_row, goal_col)
-                count += 1
-    return found[:count][np.argsort(found[:count, LENGTH], kind="mergesort")]
-
-
 def _frontier_rows(cells: NDArray[np.uint8], start_xy: ArrayLike, radius: float, ignored: BoolArray) -> FloatArray:
     """Return what `find_frontiers` finds as (n, 5) rows (x, y, heading, size, length)."""
     ways = distance_map(cells, start_xy, radius)
-    rows: FloatArray = _find(ways.box, ways.cost, ways.parent, ignored, *ways.corner)
+    rows: FloatArray = frontier_rows(ways.box, ways.cost, ways.parent, ignored, *ways.corner)
     return rows
 
 
