@@ -124,10 +124,13 @@ class LandmarkSensor:
             ids, points, descriptors = ids[order], points[order], descriptors[order]
         noise = rng.standard_normal((len(ids), 3 + descriptors.shape[1]))
         sharp = _add_noise(points, descriptors, noise, self._stereo, config.descriptor_noise)
+        if not sharp.all():
+            counts = np.bincount(np.repeat(np.arange(robots), counts)[sharp], minlength=robots)
+            ids, points, descriptors = ids[sharp], points[sharp], descriptors[sharp]
         frames, begin = [], 0
         for end in np.cumsum(counts).tolist():
-            rows = np.arange(begin, end)[sharp[begin:end]]
-            frames.append(Frame(Measurements(points[rows], descriptors[rows]), ids[rows]))
+            rows = slice(begin, end)
+            frames.append(Frame(Measurements(points[rows], descriptors[rows]), ids[rows].copy()))
             begin = end
         return frames
 
@@ -186,6 +189,7 @@ def _add_noise(
     """
     focal, baseline, sigma, sigma_disparity = stereo
     size = descriptors.shape[1]
+    each = descriptor_noise / np.sqrt(size)
     sharp = np.empty(len(points), dtype=np.bool_)
     for i in range(len(points)):
         scale = focal / points[i, 2]
@@ -197,10 +201,11 @@ def _add_noise(
             points[i, 2] = focal * baseline / disparity
         square = 0.0
         for j in range(size):
-            descriptors[i, j] += descriptor_noise / np.sqrt(size) * noise[i, 3 + j]
+            descriptors[i, j] += each * noise[i, 3 + j]
             square += descriptors[i, j] ** 2
+        length = np.sqrt(square)
         for j in range(size):
-            descriptors[i, j] /= np.sqrt(square)
+            descriptors[i, j] /= length
     return sharp
 
 
