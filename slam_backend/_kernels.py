@@ -61,7 +61,7 @@ def _innovation(
     pixel = (camera[2] * depth / camera[0]) ** 2
     disparity = (camera[3] * depth / (camera[0] * camera[1])) ** 2
     return (
-        k * mx - ex, k * my - ey, k * points[n, 2] - ez,
+        k * (mx - ex), k * (my - ey), k * (points[n, 2] - ez),
         pixel * s * s + disparity * ex * ex,
         -pixel * c * s + disparity * ex * ey,
         disparity * ex * ez,
