@@ -17,46 +17,57 @@ BLOCK = 256  # columns whose products are held at once: with 64 numbers each the
 
 
 @jit
-def _squared_lengths(vectors: Float32Array) -> Float32Array:
-    """Return the squared length (n,) of each row of `vectors` (n, d)."""
-    result = np.zeros(len(vectors), np.float32)
-    for i in range(len(vectors)):
-        for k in range(vectors.shape[1]):
-            result[i] += vectors[i, k] * vectors[i, k]
+def _squared_lengths(columns: Float32Array) -> Float32Array:
+    """Return the squared length (m,) of each column of `columns` (d, m)."""
+    result = np.zeros(columns.shape[1], np.float32)
+    for k in range(columns.shape[0]):
+        for j in range(columns.shape[1]):
+            result[j] += columns[k, j] * columns[k, j]
     return result
 
 
 @jit
-def _products(a: Float32Array, i: int, b_columns: Float32Array, start: int, stop: int, out: Float32Array) -> None:
-    """Write the scalar products of row `i` of `a` (n, d) and columns `start` to `stop` of `b_columns` (d, m)."""
+def _squared_distances(
+    row: Float32Array, b_columns: Float32Array, lengths_b: Float32Array, start: int, stop: int, out: Float32Array
+) -> None:
+    """Write |row|^2 + |b|^2 - 2 row . b for the columns b from `start` to `stop` of `b_columns` (d, m) to `out`."""
     out[:] = np.float32(0.0)
-    for k in range(a.shape[1]):
-        factor = a[i, k]
-        column_values = b_columns[k, start:stop]
-        for j in range(len(column_values)):
-            out[j] += factor * column_values[j]
+    length, size = np.float32(0.0), len(row)
+    for k in range(size):
+        length += row[k] * row[k]
+    for k in range(0, size - size % 4, 4):  # four at a time: fewer trips to memory
+        a0, a1, a2, a3 = row[k], row[k + 1], row[k + 2], row[k + 3]
+        b0, b1 = b_columns[k, start:stop], b_columns[k + 1, start:stop]
+        b2, b3 = b_columns[k + 2, start:stop], b_columns[k + 3, start:stop]
+        for j in range(len(b0)):
+            out[j] += (a0 * b0[j] + a1 * b1[j]) + (a2 * b2[j] + a3 * b3[j])
+    for k in range(size - size % 4, size):
+        a0, b0 = row[k], b_columns[k, start:stop]
+        for j in range(len(b0)):
+            out[j] += a0 * b0[j]
+    for j in range(stop - start):
+        out[j] = length + lengths_b[start + j] - np.float32(2.0) * out[j]
 
 
 @jit
-def _nearest(
-    a: Float32Array, b_columns: Float32Array
-) -> tuple[IntArray, Float32Array, IntArray]:
+def _nearest(a: Float32Array, b_columns: Float32Array) -> tuple[IntArray, Float32Array, IntArray]:
     """Return each a's nearest b (n,), its squared distance (n,), and each b's nearest a (m,); the first if equal."""
     n, m = len(a), b_columns.shape[1]
     nearest_b, nearest_a = np.zeros(n, np.int64), np.zeros(m, np.int64)
     least_a, least_b = np.full(n, np.float32(np.inf)), np.full(m, np.float32(np.inf))
-    lengths_a, lengths_b = _squared_lengths(a), _squared_lengths(b_columns.T)
-    products = np.empty(BLOCK, np.float32)
+    lengths_b = _squared_lengths(b_columns)
+    squares = np.empty(BLOCK, np.float32)
     for start in range(0, m, BLOCK):
         stop = min(start + BLOCK, m)
+        least, nearest = least_b[start:stop], nearest_a[start:stop]
         for i in range(n):
-            _products(a, i, b_columns, start, stop, products)
-            for j in range(start, stop):
-                square = lengths_a[i] + lengths_b[j] - np.float32(2.0) * products[j - start]
+            _squared_distances(a[i], b_columns, lengths_b, start, stop, squares)
+            for j in range(stop - start):
+                square = squares[j]
                 if square < least_a[i]:
-                    least_a[i], nearest_b[i] = square, j
-                if square < least_b[j]:
-                    least_b[j], nearest_a[j] = square, i
+                    least_a[i], nearest_b[i] = square, start + j
+                if square < least[j]:
+                    least[j], nearest[j] = square, i
     return nearest_b, least_a, nearest_a
 
 
@@ -71,22 +82,22 @@ def _unlike(
 ) -> BoolArray:
     """Compute `unlike_other_places`."""
     passed = np.ones(len(a), np.bool_)
-    lengths_a, lengths_b = _squared_lengths(a), _squared_lengths(b_columns.T)
-    products = np.empty(BLOCK, np.float32)
+    lengths_b = _squared_lengths(b_columns)
+    squares = np.empty(BLOCK, np.float32)
     for i in range(len(a)):
         partner = partners[i]
         own = np.float32(0.0)
         for k in range(a.shape[1]):
             own += (a[i, k] - b_columns[k, partner]) ** 2
+        limit = np.float32(own / (ratio * ratio))
         for start in range(0, b_columns.shape[1], BLOCK):
             stop = min(start + BLOCK, b_columns.shape[1])
-            _products(a, i, b_columns, start, stop, products)
-            for j in range(start, stop):
-                square = lengths_a[i] + lengths_b[j] - np.float32(2.0) * products[j - start]
-                if own >= ratio * ratio * square:
+            _squared_distances(a[i], b_columns, lengths_b, start, stop, squares)
+            for j in range(stop - start):
+                if squares[j] <= limit:
                     apart = 0.0
                     for axis in range(3):
-                        apart += (positions[j, axis] - positions[partner, axis]) ** 2
+                        apart += (positions[start + j, axis] - positions[partner, axis]) ** 2
                     if apart > same_place * same_place:
                         passed[i] = False
     return passed

@@ -63,8 +63,8 @@ class AlignmentOptions:
     min_inliers: int = 8
     max_ratio: float = 0.5
     min_spread: float = 2.0
-    max_sigma_position: float = 0.25
-    max_sigma_heading: float = 0.035
+    max_sigma_position: float = 0.15
+    max_sigma_heading: float = 0.025
     success_probability: float = 0.999
     max_samples: int = 20_000
 
