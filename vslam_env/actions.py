@@ -76,7 +76,7 @@ def command_of(action_type: str, action: Any) -> FloatArray:
     Continuous actions are scaled to the limits of either direction, so that zeros stand still.
     """
     if action_type == "discrete":
-        return DISCRETE_COMMANDS[action]
+        return np.array(DISCRETE_COMMANDS[action])
     speed, turn = action
     return np.array([speed * (MAX_SPEED if speed > 0.0 else MAX_REVERSE), turn * MAX_TURN])
 

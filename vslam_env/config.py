@@ -5,7 +5,7 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Literal, Self, TypeVar
 
 import numpy as np
 import tomli_w
@@ -14,9 +14,11 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 from slam_backend.errors import bad_argument, check_choice, check_float, check_int
 from slam_backend.filter_options import FilterOptions
 from slam_backend.motion import OdometryModel
-from vslam_env.belief import BeliefConfig
+from vslam_env.robot_belief import BeliefConfig
 from vslam_env.sensors import LandmarkSensorConfig, ScanConfig
 from vslam_env.world import LandmarkConfig, OdometryNoise
+
+T = TypeVar("T")
 
 ACTION_TYPES = ("continuous", "discrete", "goal")
 OBSERVATION_TYPES = ("dict", "flat")
@@ -98,7 +100,7 @@ class EnvConfig:
         check_float("robot_radius", self.robot_radius, "Give metres.", above=0.0)
         check_float("min_start_distance", self.min_start_distance, "Give metres.", at_least=0.0)
         check_float("map_error_cutoff", self.map_error_cutoff, "Give metres.", above=0.0)
-        check_float("scan.half_fov", self.scan.half_fov, "Grids are painted from less than a half circle.", at_most=1.57)
+        check_float("scan.half_fov", self.scan.half_fov, "A scan spans less than a half circle.", at_most=1.57)
 
     @property
     def ticks_per_step(self) -> int:
@@ -183,7 +185,7 @@ def preset_config(name: str) -> EnvConfig:
     )
 
 
-def _validated(cls: type[Any], values: Mapping[str, Any]) -> Any:
+def _validated(cls: type[T], values: Mapping[str, Any]) -> T:
     """Build `cls` from nested dicts, or raise the project's one error for the first thing that is wrong."""
     try:
         return TypeAdapter(cls).validate_python(dict(values))

@@ -28,7 +28,7 @@ RENDER_MODES = ("human", "rgb_array")
 STATE_PER_ROBOT = 12
 
 
-class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):
+class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # PettingZoo has no type information
     """Robots that do not know where they start explore a building, build maps, and merge these when they fit.
 
     `vslam_v0.parallel_env` describes the arguments; what is observed is described in `vslam_env.observation`.
@@ -39,7 +39,7 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):
         recorder: A function to be called with the readings of every tick, those of the reset included; None: nothing.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {  # type: ignore[misc]   # PettingZoo declares it for instances
+    metadata: ClassVar[dict[str, Any]] = {
         "name": "vslam_env/Exploration-v0",
         "render_modes": list(RENDER_MODES),
         "render_fps": 10,
@@ -281,10 +281,10 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):
             for robot, (driver, action) in enumerate(zip(self._drivers, chosen, strict=True))
         ]
         for _ in range(config.ticks_per_step):
-            bumps = [readings.bump for readings in episode.readings]
+            poses, readings = beliefs.poses, episode.readings
             episode.advance(
                 [
-                    driver.command(beliefs.pose(robot), beliefs.cells(robot), bumps[robot])
+                    driver.command(poses[robot], beliefs.cells(robot), readings[robot].bump)
                     for robot, driver in enumerate(self._drivers)
                 ]
             )

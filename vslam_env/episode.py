@@ -201,7 +201,7 @@ class Episode:
         if config.oracle_merge:
             self._merge_by_oracle()
         self.true_path.append(poses)
-        self.estimated_path.append(np.array([self.belief.pose(robot) for robot in range(len(poses))]))
+        self.estimated_path.append(self.belief.poses)
 
     def _merge_by_oracle(self) -> None:
         """Merge groups that share true landmarks until none do."""
@@ -219,5 +219,5 @@ class Episode:
                     break
 
     def _claims(self, group: tuple[int, ...]) -> IntArray:
-        """Return which true landmark each row of a group's map claims."""
-        return self.ledger.claims(group, self.belief.group_map(group[0]).ids)
+        """Return which true landmark each row of a group's filter map claims."""
+        return self.ledger.claims(group, self.belief.filter_map(group[0]).ids)

@@ -4,7 +4,7 @@
 |---|---|---|---|
 | `pose` | (3,) | x, y [m], theta [rad], start frame | +-30, pi |
 | `pose_std` | (3,) | one sigma of each [m, m, rad] | 30, pi |
-| `map_stats` | (6,) | landmarks held; mean and largest one sigma of them [m]; mean count; ESS / M; group size | see below |
+| `map_stats` | (6,) | landmarks; mean and largest one sigma [m]; mean count; ESS / M; group size | `MAP_STATS_LIMIT` |
 | `local_grid` | (3, 48, 48) uint8 | see `local_grid` | 0, 255 |
 | `scan` | (R,) | ranges from right to left [m] | range of the scan |
 | `candidates` | (16, 5) | see `CandidateSlots.features` [m] | +-90 |
@@ -48,7 +48,7 @@ def observe(belief: Belief, scan: FloatArray, goal_actions: bool) -> Observation
     Returns:
         Fresh arrays by name, as the table of this module says.
     """
-    observation = {
+    observation: Observation = {
         "pose": _clipped(belief.pose, -POSE_LIMIT, POSE_LIMIT),
         "pose_std": _clipped(np.sqrt(np.diagonal(belief.covariance)), 0.0, POSE_LIMIT),
         "map_stats": _clipped(_map_stats(belief), 0.0, MAP_STATS_LIMIT),

@@ -36,15 +36,15 @@ class Standing:
 
 @runtime_checkable
 class RewardTerm(Protocol):
-    """One part of the reward. A term of your own is any object with these three.
+    """One part of the reward. A term of your own is any object with these three."""
 
-    Attributes:
-        name: Shown in infos as `reward/<name>`.
-        weight: What the term is multiplied with.
-    """
+    @property
+    def name(self) -> str:
+        """Shown in infos as `reward/<name>`."""
 
-    name: str
-    weight: float
+    @property
+    def weight(self) -> float:
+        """What the term is multiplied with."""
 
     def __call__(self, before: Standing, after: Standing) -> FloatArray:
         """Return what each robot gains (K,) by a step, unweighted."""
@@ -77,7 +77,7 @@ TERMS: dict[str, Callable[[Standing, Standing], FloatArray]] = {
     "collisions": _collisions,  # -1 for each tick of pushing against something
 }
 
-RewardSpec = Mapping[str, float] | Sequence[RewardTerm]
+RewardSpec = Mapping[str, float] | list[RewardTerm] | tuple[RewardTerm, ...]
 
 
 def make_terms(reward: RewardSpec) -> tuple[RewardTerm, ...]:
@@ -87,14 +87,13 @@ def make_terms(reward: RewardSpec) -> tuple[RewardTerm, ...]:
         ValueError: If a name is unknown or repeats, or an object is no term.
     """
     if isinstance(reward, Mapping):
-        terms: list[RewardTerm] = []
-        for name, weight in reward.items():
+        for name in reward:
             if name not in TERMS:
                 names = "one of " + ", ".join(repr(known) for known in TERMS)
                 raise bad_argument("reward", names, name, "Choose one of these names, or pass a term of your own.")
-            terms.append(_NamedTerm(name, check_float(f"reward[{name!r}]", weight, "Give the weight of the term.")))
-        return tuple(terms)
-    if isinstance(reward, (str, bytes)) or not isinstance(reward, Sequence):
+        cure = "Give the weight of the term."
+        return tuple(_NamedTerm(n, check_float(f"reward[{n!r}]", weight, cure)) for n, weight in reward.items())
+    if not isinstance(reward, (list, tuple)):
         raise bad_argument("reward", "weights by name, or a list of terms", reward, "E.g. {'map_error': 1.0}.")
     for term in reward:
         if not isinstance(term, RewardTerm):

@@ -48,7 +48,7 @@ class SoloExplorationEnv(gymnasium.Env[Any, Any]):
         observations, rewards, terminations, truncations, infos = self.parallel.step({AGENT: action})
         return observations[AGENT], rewards[AGENT], terminations[AGENT], truncations[AGENT], infos[AGENT]
 
-    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]   # frames are never returned as a list
+    def render(self) -> NDArray[np.uint8] | None:
         """Return a picture or show it; see `ExplorationEnv.render`."""
         return self.parallel.render()
 

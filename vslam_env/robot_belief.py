@@ -1,0 +1,132 @@
+"""`Belief`: what one robot believes after a tick, and `BeliefConfig`: what it assumes."""
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_backend.alignment import AlignmentOptions
+from slam_backend.attempts import AttemptOptions
+from slam_backend.errors import BoolArray, FloatArray, check_int
+from slam_backend.filter_options import FilterOptions
+from slam_backend.geometry import compose
+from slam_backend.landmark_map import LandmarkMap
+from vslam_env.navigation import SeenGrid
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BeliefConfig:
+    """What the robots assume about their sensors, and how they align their maps.
+
+    Attributes:
+        filter: Of each robot's FastSLAM; its camera and motion hold the assumed noise.
+        alignment: When two maps are believed to fit together.
+        attempts: When a pair of groups tries.
+        confirm_after: Landmarks measured fewer times than this are not yet part of a robot's map: what is seen but
+            once may be a false point.
+    """
+
+    filter: FilterOptions = field(default_factory=FilterOptions)
+    alignment: AlignmentOptions = field(default_factory=AlignmentOptions)
+    attempts: AttemptOptions = field(default_factory=AttemptOptions)
+    confirm_after: int = 2
+
+    def __post_init__(self) -> None:
+        check_int("belief.confirm_after", self.confirm_after, 1, "Use 1 to count all landmarks.")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Body:
+    """What each robot knows of its own hardware.
+
+    Attributes:
+        radius: Of its disc [m].
+        ray_angles: (R,) float64 [rad], robot frame, ascending. Directions of the range finder's rays.
+        scan_range: A ray that meets nothing reads this [m].
+    """
+
+    radius: float
+    ray_angles: FloatArray
+    scan_range: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Teammate:
+    """Another robot of the same group, in the own start frame.
+
+    Attributes:
+        robot: Its index.
+        pose: (3,) float64 [m, m, rad].
+        covariance: (3, 3) float64 [m, m, rad].
+    """
+
+    robot: int
+    pose: FloatArray
+    covariance: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Candidates:
+    """Sixteen places to explore, in stable slots; see `CandidateSlots`.
+
+    Attributes:
+        goals: (16, 2) float64 [m], start frame; NaN in empty slots.
+        headings: (16,) float64 [rad], start frame; NaN in empty slots.
+        lengths: (16,) float64 [m]. Of the path to each at the last update.
+        valid: (16,) bool.
+        features: (16, 5) float32 [m], robot frame; see `CandidateSlots.features`.
+    """
+
+    goals: FloatArray
+    headings: FloatArray
+    lengths: FloatArray
+    valid: BoolArray
+    features: NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class Belief:
+    """What one robot believes after a tick; everything is in its own start frame, and nothing of it is the truth.
+
+    Attributes:
+        robot: Its index.
+        tick: Ticks since the reset.
+        frame: Identity of the group's map frame: the index of the group's first robot.
+        group: The robots that share the map, itself included.
+        pose: (3,) float64 [m, m, rad].
+        covariance: (3, 3) float64 [m, m, rad].
+        log_weights: (M,) float64, normalised.
+        ess: Effective sample size, as a share of M.
+        grid: The seen grid, read-only. It follows the robot: `copy()` it to keep it.
+        candidates: Places to explore.
+        teammates: The other robots of the group.
+        start_from_group: (3,) float64 [m, m, rad]. Moves the group's map frame to the own start frame.
+        group_map: The confirmed landmarks in the group's frame; `map` has it in the own start frame.
+        group_particles: (M, 3) float64 [m, m, rad], the group's frame; `particles` has them in the own start frame.
+    """
+
+    robot: int
+    tick: int
+    frame: int
+    group: tuple[int, ...]
+    pose: FloatArray
+    covariance: FloatArray
+    log_weights: FloatArray
+    ess: float
+    grid: SeenGrid
+    candidates: Candidates
+    teammates: tuple[Teammate, ...]
+    start_from_group: FloatArray
+    group_map: LandmarkMap
+    group_particles: FloatArray
+
+    @cached_property
+    def map(self) -> LandmarkMap:
+        """The confirmed landmarks of the group's most probable particle."""
+        return self.group_map.moved(self.start_from_group)
+
+    @cached_property
+    def particles(self) -> FloatArray:
+        """(M, 3) float64 [m, m, rad]. The robot's pose in each particle."""
+        return compose(self.start_from_group, self.group_particles)
