@@ -113,17 +113,18 @@ def _whitened(
 def _gate(
     pose: FloatArray, local: FloatArray, q: int, points: FloatArray, noises: FloatArray, n: int, given: bool,
     camera: FloatArray, factor: FloatArray, spread: FloatArray,
-) -> tuple[float, float, float]:
-    """Return the squared Mahalanobis distance D, log|S| and the predicted depth, pose uncertainty C L^-1 C^T included.
+) -> tuple[float, float]:
+    """Return the squared Mahalanobis distance D and log|S|, pose uncertainty C L^-1 C^T included.
 
     `local[q]` is the landmark (9), `factor` is C (3, 3), `spread` is L^-1 (3, 3). D is infinite where the landmark is
-    predicted behind the camera.
+    predicted behind the camera. Unless `given`, S is that of the image coordinates (up to a constant of the camera):
+    landmarks at different depths are compared in the space in which the measurement was made.
     """
     rx, ry, rz, s0, s1, s2, s3, s4, s5, depth = _innovation(
         pose[0], pose[1], pose[3], pose[4], local[q, 0], local[q, 1], local[q, 2], points, noises, n, given, camera
     )
     if not given and depth < MIN_DEPTH:
-        return np.inf, 0.0, depth
+        return np.inf, 0.0
     a0, a1, a2, b0, b1, b2 = _whitened(local[q, 0], local[q, 1], pose[0], pose[1], factor)
     u0 = spread[0, 0] * a0 + spread[0, 1] * a1 + spread[0, 2] * a2
     u1 = spread[1, 0] * a0 + spread[1, 1] * a1 + spread[1, 2] * a2
@@ -139,7 +140,7 @@ def _gate(
         local[q, 7] + s4,
         local[q, 8] + s5,
     )  # Eq. 7, plus what the pose adds
-    return _form(inverse, rx, ry, rz), math.log(inverse[6]), depth
+    return _form(inverse, rx, ry, rz), math.log(inverse[6] if given else inverse[6] / depth**8)
 
 
 @inlined
@@ -405,7 +406,7 @@ def update_fastslam1(
                     if taken:
                         continue
                 _load(landmarks, slot, m, local, 0)
-                distance, _, _ = _gate(pose, local, 0, points, noises, b, given, camera, zero, zero)
+                distance, _ = _gate(pose, local, 0, points, noises, b, given, camera, zero, zero)
                 if distance <= position_gate or (known[b] and distance < np.inf):
                     match = slot  # l. 23-24: the nearest descriptor inside the gate
                     distances[b, m] = distance
@@ -493,7 +494,7 @@ def update_fastslam2(
             for q in range(starts[b], starts[b + 1]):
                 if not held[q]:
                     continue
-                distance, log_det, _ = _gate(start, local, q, points, noises, b, given, camera, factor, identity)
+                distance, log_det = _gate(start, local, q, points, noises, b, given, camera, factor, identity)
                 if distance <= position_gate or (known[b] and distance < np.inf):
                     cost = distance + log_det + costs[q]
                     if cost < best:
@@ -518,7 +519,7 @@ def update_fastslam2(
             for q in range(starts[b], starts[b + 1]):
                 if not held[q]:
                     continue
-                distance, log_det, depth = _gate(pose, local, q, points, noises, b, given, camera, factor, spread)
+                distance, log_det = _gate(pose, local, q, points, noises, b, given, camera, factor, spread)
                 if known[b] and distance < np.inf:
                     distance = min(distance, position_gate)
                 nearest = min(nearest, distance)
@@ -534,8 +535,6 @@ def update_fastslam2(
                 if cost < best:
                     best, runner_up, chosen = cost, best, q
                     log_best = -0.5 * (distance + log_det + 3.0 * LOG_2PI)
-                    if not given:
-                        log_best += 4.0 * math.log(depth)
                 elif cost < runner_up:
                     runner_up = cost
             matches[b] = REJECTED

@@ -378,10 +378,11 @@ class FastSlam:
     def _report(self, slots: list[IntArray], distances: list[FloatArray], ess: float, measured: bool) -> StepReport:
         best = self.best_particle
         associations, created, matched = [], [], []
+        ids = np.append(self._ids, -1)  # the last one is for REJECTED
         num_new = 0
         for found, distance in zip(slots, distances, strict=True):
             chosen = found[:, best]
-            associations.append(np.where(chosen >= 0, self._ids[chosen], -1) if len(chosen) else chosen.copy())
+            associations.append(ids[chosen])
             is_new = (found >= 0) & np.isnan(distance)
             made = np.full(len(found), -1, dtype=np.int64)
             for b in np.flatnonzero(is_new.any(axis=1)):
