@@ -94,14 +94,18 @@ def check_array(
         dtype: Of the result.
         finite: Refuse NaN and infinity.
     """
-    wanted = "(" + ", ".join("n" if s is None else str(s) for s in shape) + ("," if len(shape) == 1 else "") + ")"
     try:
         array = np.array(value, dtype=dtype, order="C")
     except (TypeError, ValueError) as error:
-        raise bad_argument(name, f"an array of shape {wanted}", value, cure) from error
+        raise bad_argument(name, f"an array of shape {_shape_text(shape)}", value, cure) from error
     if array.ndim != len(shape) or any(s is not None and s != n for s, n in zip(shape, array.shape, strict=True)):
-        raise bad_argument(name, f"an array of shape {wanted}", f"shape {array.shape}", cure)
+        raise bad_argument(name, f"an array of shape {_shape_text(shape)}", f"shape {array.shape}", cure)
     if finite and array.size and not np.isfinite(array).all():
         where = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
         raise bad_argument(name, "finite numbers", f"NaN or infinity at index {where}", cure)
     return array
+
+
+def _shape_text(shape: tuple[int | None, ...]) -> str:
+    """Write a shape with `n` for free axes."""
+    return "(" + ", ".join("n" if s is None else str(s) for s in shape) + ("," if len(shape) == 1 else "") + ")"

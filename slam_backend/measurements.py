@@ -55,6 +55,16 @@ class Measurements:
         return len(self.points)
 
     @classmethod
+    def _trusted(cls, points: FloatArray, descriptors: NDArray[np.float32]) -> "Measurements":
+        """Build a frame in a hot loop: no copies, no checks. The caller must not write to the arrays afterwards."""
+        self = object.__new__(cls)
+        for name, array in (("points", points), ("descriptors", descriptors)):
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+        object.__setattr__(self, "covariances", None)
+        return self
+
+    @classmethod
     def empty(cls, descriptor_size: int = 64) -> "Measurements":
         """Return a frame in which nothing was seen."""
         return cls(np.empty((0, 3)), np.empty((0, descriptor_size), dtype=np.float32))

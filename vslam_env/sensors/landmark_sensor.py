@@ -130,7 +130,7 @@ class LandmarkSensor:
         frames, begin = [], 0
         for end in np.cumsum(counts).tolist():
             rows = slice(begin, end)
-            frames.append(Frame(Measurements(points[rows], descriptors[rows]), ids[rows].copy()))
+            frames.append(Frame(Measurements._trusted(points[rows], descriptors[rows]), ids[rows].copy()))
             begin = end
         return frames
 
