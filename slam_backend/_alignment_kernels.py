@@ -9,10 +9,10 @@ import math
 import numpy as np
 
 from slam_backend._jit import jit
+from slam_backend.alignment_types import FEWEST_INLIERS
 from slam_backend.errors import BoolArray, FloatArray, IntArray
 
 MATCH_COLUMNS = 18
-MIN_SUPPORT = 3  # a minimal sample always supports itself: only a third candidate is evidence
 MIN_VARIANCE = 1e-8  # [m^2], (0.1 mm)^2: keeps exact landmarks (Sigma = 0) solvable
 MEDIAN_CHI2_3 = 2.3659738843753377
 SAME_DISTANCE, SAME_ANGLE = 0.25, math.radians(2.5)  # half of what makes two alignments differ
@@ -129,7 +129,7 @@ def gauss_newton_step(table: FloatArray, members: BoolArray, pose: FloatArray, f
 
 
 @jit
-def _fitted_variance(table: FloatArray, members: BoolArray, pose: FloatArray, floor: float) -> float:
+def fitted_variance(table: FloatArray, members: BoolArray, pose: FloatArray, floor: float) -> float:
     """Return the added variance, at most `floor`, under which the members' median D is that of 3 degrees of freedom.
 
     Honest covariances get almost nothing added, so that the weights stay efficient; over-confident ones get what
@@ -162,7 +162,7 @@ def refine(table: FloatArray, start: FloatArray, floor: float, gate: float) -> t
     variance = floor
     for _ in range(MAX_ROUNDS):
         _support(table, pose, floor, gate, members)
-        variance = _fitted_variance(table, members, pose, floor)
+        variance = fitted_variance(table, members, pose, floor)
         _support(table, pose, variance, gate, members)
         moved = gauss_newton_step(table, members, pose, variance)
         rests = np.abs(moved - pose).max() < 1e-10
@@ -231,7 +231,7 @@ def search(
     best is found, and every rival that would make it ambiguous.
 
     Returns:
-        (h, 5) rows (tx, ty, theta, inliers, score) of all hypotheses with at least `MIN_SUPPORT` inliers.
+        (h, 5) rows (tx, ty, theta, inliers, score) of all hypotheses with at least `FEWEST_INLIERS` inliers.
     """
     found = np.empty((len(samples), 5))
     members = np.zeros(len(table), np.bool_)
@@ -250,11 +250,11 @@ def search(
         # Two noisy points aim badly at far ones: the first set is taken at twice the distance.
         count, score = _support(table, pose, floor, 4.0 * gate, members)
         for _ in range(2):
-            if count < MIN_SUPPORT:
+            if count < FEWEST_INLIERS:
                 break
             pose = gauss_newton_step(table, members, pose, floor)
             count, score = _support(table, pose, floor, gate, members)
-        if count >= MIN_SUPPORT:
+        if count >= FEWEST_INLIERS:
             found[h, 0], found[h, 1], found[h, 2], found[h, 3], found[h, 4] = pose[0], pose[1], pose[2], count, score
             h += 1
             if count > most:

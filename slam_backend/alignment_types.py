@@ -1,0 +1,116 @@
+"""How an alignment of two maps is asked for and answered."""
+
+from dataclasses import dataclass
+from typing import Literal, Self
+
+import numpy as np
+
+from slam_backend.errors import FloatArray, IntArray, bad_argument, check_array, check_float, check_int
+
+Reason = Literal["", "too few candidates", "too few inliers", "ambiguous", "poorly spread", "too uncertain"]
+REASONS: tuple[Reason, ...] = (
+    "too few candidates",
+    "too few inliers",
+    "ambiguous",
+    "poorly spread",
+    "too uncertain",
+)
+FEWEST_INLIERS = 3  # two matches fit any motion between them: only a third is evidence
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AlignmentOptions:
+    """When two landmarks look alike, when they lie together, and when an alignment is believed.
+
+    Attributes:
+        descriptor_gate: Largest L2 distance between matched descriptors [-].
+        descriptor_ratio: A match must be closer than this times the best landmark of another place [-].
+        same_place: Landmarks of one map within this distance may be duplicates, and do not compete [m].
+        position_gate: Largest squared Mahalanobis residual of an inlier [-]; 11.34 is 99 % of 3 degrees of freedom.
+        position_floor: Standard deviation added to the residuals, because filters' maps are over-confident [m].
+        min_inliers: Fewer inliers are refused; at least 3.
+        max_ratio: Refused when a different alignment has more than this times the best one's inliers [-].
+        min_spread: Refused when the inliers extend over less than this along their main axis [m].
+        max_sigma_position: Refused when the translation is less certain than this in any direction [m].
+        max_sigma_heading: Refused when the rotation is less certain than this [rad].
+        success_probability: That a random search meets the best alignment, and each rival that would make it
+            ambiguous [-].
+        max_samples: Bound on the minimal samples of that search, whatever the probability.
+    """
+
+    descriptor_gate: float = 0.45
+    descriptor_ratio: float = 0.8
+    same_place: float = 1.0
+    position_gate: float = 11.34
+    position_floor: float = 0.1
+    min_inliers: int = 8
+    max_ratio: float = 0.5
+    min_spread: float = 2.0
+    max_sigma_position: float = 0.15
+    max_sigma_heading: float = 0.025
+    success_probability: float = 0.999
+    max_samples: int = 20_000
+
+    def __post_init__(self) -> None:
+        above = ("descriptor_gate", "position_gate", "position_floor", "max_sigma_position", "max_sigma_heading")
+        for name in above:
+            check_float(f"options.{name}", getattr(self, name), "Give a positive number.", above=0.0)
+        for name in ("descriptor_ratio", "max_ratio"):
+            check_float(f"options.{name}", getattr(self, name), "Give a share.", above=0.0, at_most=1.0)
+        for name in ("same_place", "min_spread"):
+            check_float(f"options.{name}", getattr(self, name), "Give a distance in metres.", at_least=0.0)
+        probability = self.success_probability
+        check_float("options.success_probability", probability, "Use e.g. 0.999.", above=0.0, at_most=1.0 - 1e-12)
+        check_int("options.min_inliers", self.min_inliers, FEWEST_INLIERS, "Two fit any motion: demand more.")
+        check_int("options.max_samples", self.max_samples, 1, "Allow at least one sample.")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Alignment:
+    """The motion from map b to map a, p_a = R(theta) p_b + t, or a refusal.
+
+    Attributes:
+        success: Whether the alignment is believed.
+        reason: Empty on success, else one of `REASONS`.
+        tx: Translation [m], frame a; NaN when refused.
+        ty: Likewise.
+        theta: Rotation [rad] in [-pi, pi); NaN when refused.
+        covariance: (3, 3) float64 [m, m, rad] of (tx, ty, theta); NaN when refused.
+        inliers: (k, 2) int64 rows (index in map a, index in map b), one-to-one; none when refused.
+        ratio: Inliers of the best alignment that differs (by more than 0.5 m or 5 degrees) over those of this one;
+            0 if there was none or the method looks for none.
+    """
+
+    success: bool
+    reason: str
+    tx: float
+    ty: float
+    theta: float
+    covariance: FloatArray
+    inliers: IntArray
+    ratio: float
+
+    def __post_init__(self) -> None:
+        if self.reason not in (REASONS if not self.success else ("",)):
+            expected = "'' on success, else one of " + ", ".join(REASONS)
+            raise bad_argument("reason", expected, self.reason, "Name why it was refused.")
+        cure = "A successful alignment has a finite motion and covariance."
+        pose = check_array("tx, ty, theta", (self.tx, self.ty, self.theta), (3,), cure, finite=self.success)
+        for name, value in zip(("tx", "ty", "theta"), pose, strict=True):
+            object.__setattr__(self, name, float(value))
+        covariance = check_array("covariance", self.covariance, (3, 3), cure, finite=self.success)
+        inliers = check_array("inliers", self.inliers, (None, 2), "Give rows (a, b).", dtype=np.int64)
+        for name, array in (("covariance", covariance), ("inliers", inliers)):
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+
+    @property
+    def transform(self) -> FloatArray:
+        """The motion (3,) = a_from_b [m, m, rad]; NaN when refused."""
+        return np.array([self.tx, self.ty, self.theta])
+
+    @classmethod
+    def refused(cls, reason: Reason, ratio: float = 0.0) -> Self:
+        """Return a refusal: NaN motion and covariance, no inliers."""
+        nan = float("nan")
+        return cls(False, reason, nan, nan, nan, np.full((3, 3), nan), np.empty((0, 2), np.int64), ratio)
