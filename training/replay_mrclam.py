@@ -31,7 +31,7 @@ MOTION = OdometryModel(
 )
 # Errors of range come in runs and with heavy tails, and a barcode cannot be taken for another one: a wide gate, and
 # never a second landmark with the same barcode.
-POSITION_GATE = 1000.0
+POSITION_GATE = 1e4
 DEAD_ZONE = 1e6
 
 

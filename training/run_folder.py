@@ -92,16 +92,16 @@ def read_config(path: Path, command: str) -> tuple[dict[str, Any], int]:
     file = path / CONFIG_FILE if path.is_dir() else path
     expected = f"the {CONFIG_FILE} of an earlier run"
     if not file.is_file():
-        raise bad_argument("config", expected, f"no file {str(file)!r}", "Name a run folder or the file in it.")
+        raise bad_argument("config", expected, "no such file", f"Check {str(file)!r}.")
     try:
         content = tomllib.loads(file.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise bad_argument("config", expected, f"a broken file ({error})", f"Correct {file}.") from error
+        raise bad_argument("config", expected, "a broken file", f"Correct {str(file)!r}: {error}.") from error
     if content.get("command") != command:
         raise bad_argument("config", f"a run of {command!r}", content.get("command"), "Use the command that wrote it.")
     config, seed = content.get("config"), content.get("seed")
     if not isinstance(config, dict) or not isinstance(seed, int):
-        raise bad_argument("config", "a table [config] and a whole number seed", f"a file {str(file)!r}", "Add them.")
+        raise bad_argument("config", "a table [config] and a whole number seed", "none", f"Add them to {str(file)!r}.")
     return config, seed
 
 
@@ -136,7 +136,8 @@ def write_whole(file: Path, text: str) -> Path:
         Path(temporary).chmod(0o666 & ~_umask())  # mkstemp makes files that only their owner can read
         Path(temporary).replace(file)
     except OSError as error:
-        raise bad_argument("out", "a place that can be written", f"a failure ({error})", "Choose another.") from error
+        cure = f"Choose another than {str(file)!r}: {error.strerror}."
+        raise bad_argument("out", "a place that can be written", "no access", cure) from error
     return file
 
 
@@ -167,16 +168,16 @@ def _drop_none(value: Any) -> Any:
 
 def _claim(folder: Path) -> Path:
     """Make `folder`, or take it if it is empty."""
-    cure = "Choose a new folder, or leave --out away."
+    cure = f"Choose another than {str(folder)!r}, or leave --out away."
     if folder.is_file():
-        raise bad_argument("out", "a folder", f"a file {str(folder)!r}", cure)
+        raise bad_argument("out", "a new or empty folder", "a file", cure)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         full = any(folder.iterdir())
     except OSError as error:
-        raise bad_argument("out", "a folder that can be written", f"a failure ({error})", cure) from error
+        raise bad_argument("out", "a folder that can be written", f"no access ({error.strerror})", cure) from error
     if full:
-        raise bad_argument("out", "a new or empty folder", f"a folder with files, {str(folder)!r}", cure)
+        raise bad_argument("out", "a new or empty folder", "a folder with files", cure)
     return folder
 
 
@@ -189,7 +190,7 @@ def _next_free(parent: Path, stem: str) -> Path:
         except FileExistsError:
             continue
         except OSError as error:
-            cure = "Name another folder with --out."
-            raise bad_argument("out", "a folder that can be written", f"a failure ({error})", cure) from error
+            cure = f"Name a folder with --out; {str(parent)!r} is not for us."
+            raise bad_argument("out", "a folder that can be written", f"no access ({error.strerror})", cure) from error
         return folder
     raise bad_argument("out", "a free number", f"a million folders {stem!r}", "Clean up runs.")

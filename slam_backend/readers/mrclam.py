@@ -63,7 +63,7 @@ def load_mrclam(path: str | Path, robots: Sequence[int] | None = None, duration:
     """
     folder = Path(path)
     if not folder.is_dir():
-        raise bad_argument("path", "a folder of the MR.CLAM log", repr(str(path)), "Check that the folder exists.")
+        raise bad_argument("path", "a folder of the MR.CLAM log", "no such folder", f"Check {str(path)!r}.")
     numbers = _check_robots(folder, robots)
     barcodes = _read_table(folder / "Barcodes.dat", ("subject", "barcode"))
     subject_of = {int(barcode): int(subject) for subject, barcode in barcodes}
@@ -92,8 +92,8 @@ def _check_robots(folder: Path, robots: Sequence[int] | None) -> tuple[int, ...]
     if robots is None:
         present = tuple(robot for robot in ROBOTS if (folder / f"Robot{robot}_Odometry.dat").is_file())
         if not present:
-            missing = str(folder / "Robot1_Odometry.dat")
-            raise bad_argument("path", "a folder of the MR.CLAM log", f"no file {missing!r}", "Check the folder.")
+            cure = f"Check {str(folder / 'Robot1_Odometry.dat')!r}."
+            raise bad_argument("path", "a folder of the MR.CLAM log", "no odometry of any robot", cure)
         return present
     numbers = tuple(robots)
     unknown = [robot for robot in numbers if robot not in ROBOTS]
@@ -132,7 +132,7 @@ def _read_table(file: Path, columns: tuple[str, ...], empty: bool = False) -> Fl
             finite number per column; if subjects or barcodes are not whole, ranges not positive, or times go back.
     """
     if not file.is_file():
-        raise bad_argument("path", f"a folder with {file.name}", f"no file {str(file)!r}", "Check the folder.")
+        raise bad_argument("path", f"a folder with {file.name}", "no such file", f"Check {str(file)!r}.")
     lines = file.read_text(encoding="utf-8", errors="replace").split("\n")
     rows: list[list[float]] = []
     numbers: list[int] = []

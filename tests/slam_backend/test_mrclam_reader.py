@@ -1,0 +1,260 @@
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from slam_backend.camera import StereoCamera
+from slam_backend.geometry import between, compose
+from slam_backend.metrics import ate
+from slam_backend.readers.mrclam import MrclamLog, RobotLog, load_mrclam
+from slam_backend.readers.mrclam_steps import HOLD, SightingNoise, integrate_commands, steps
+from slam_backend.trajectory import dead_reckoning
+
+FILES = {
+    "Barcodes.dat": "# Subject #    Barcode #\n  1  5\n  2  14\n  7  81\n  6  63\n  9  70\n",
+    "Landmark_Groundtruth.dat": "6  0.5  -4.0  0.1  0.2\n7  1.5  2.5  0.1  0.2\n9  -3.0  0.25  0.1  0.2\n",
+    "Robot2_Odometry.dat": "# t v w\n100.0 0.5 0.0\n101.0 0.5 0.2\n102.0 0.0 0.0\n",
+    "Robot2_Measurement.dat": "100.1 63 2.0 0.1\n100.1 5 1.0 0.0\n100.9 99 1.0 0.0\n101.5 70 3.0 -0.2\n",
+    "Robot2_Groundtruth.dat": "99.0 0 0 0.5\n103.0 1 0 0.5\n103.0 1 0 0.5\n",
+    "Robot4_Odometry.dat": "100.5 0.1 0.0\r\n101.5 0.1 0.0\r\n",
+    "Robot4_Measurement.dat": "",
+}
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A log of two robots and three landmarks."""
+    for name, text in FILES.items():
+        (tmp_path / name).write_text(text, newline="")
+    return tmp_path
+
+
+def test_log_holds_what_the_files_say(folder: Path) -> None:
+    """Landmarks are sorted by subject; sightings of robots and of unknown barcodes are left out."""
+    log = load_mrclam(folder)
+    assert [own.robot for own in log.robots] == [2, 4]
+    assert log.subjects.tolist() == [6, 7, 9]
+    assert log.positions.tolist() == [[0.5, -4.0], [1.5, 2.5], [-3.0, 0.25]]
+    assert log.robots[0].commands.shape == (3, 3)
+    assert log.robots[0].sightings.tolist() == [[100.1, 6.0, 2.0, 0.1], [101.5, 9.0, 3.0, -0.2]]
+    assert log.robots[1].sightings.shape == (0, 4)
+    assert log.robots[0].truth is not None
+    assert len(log.robots[0].truth) == 2  # the repeated stamp is dropped
+    assert log.robots[1].truth is None
+    with pytest.raises(ValueError, match="read-only"):
+        log.positions[0, 0] = 1.0
+
+
+def test_duration_counts_from_the_earliest_command(folder: Path) -> None:
+    """Readings later than the duration are dropped; a robot that has not started keeps its first command."""
+    log = load_mrclam(folder, robots=(4, 2), duration=0.4)
+    assert [own.robot for own in log.robots] == [4, 2]
+    assert [len(own.commands) for own in log.robots] == [1, 1]
+    assert log.robots[1].sightings[:, 1].tolist() == [6.0]
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("Barcodes.dat", None, r"expected a folder with Barcodes\.dat, got no such file\. Check '.*Barcodes\.dat'"),
+        ("Robot2_Measurement.dat", None, r"got no such file\. Check '.*Robot2_Measurement\.dat'"),
+        ("Barcodes.dat", "# nothing\n", r"expected rows \(subject barcode\), got no rows\. .*Barcodes\.dat is empty"),
+        ("Barcodes.dat", "1 5\n\n6 6.5\n", r"with a whole barcode, got '6 6\.5'\. Correct line 3 of .*Barcodes\.dat"),
+        ("Robot2_Odometry.dat", "1 2\n", r"3 numbers \(time velocity angular_velocity\), got '1 2'\. .*line 1"),
+        ("Robot2_Odometry.dat", "1 2 3\n1 2 x\n", r"got '1 2 x'\. Correct line 2"),
+        ("Robot2_Odometry.dat", "1 2 3\n2 nan 0\n", r"with finite numbers, got '2 nan 0'\. Correct line 2"),
+        ("Robot2_Odometry.dat", "1 2 inf\n", r"with finite numbers, got '1 2 inf'"),
+        ("Robot2_Odometry.dat", "2 0 0\n3 0 0\n1 0 0\n", r"a time not before that of the line above, got '1 0 0'"),
+        ("Robot2_Odometry.dat", "1_0 0 0\n", r"got '1_0 0 0'"),
+        ("Robot2_Measurement.dat", "1 63 0.0 0.1\n", r"with a range > 0, got '1 63 0\.0 0\.1'"),
+        ("Robot2_Measurement.dat", "\x00\x01binary", r"expected 4 numbers \(time barcode range bearing\)"),
+        ("Robot2_Groundtruth.dat", "1 0 0\n", r"expected 4 numbers \(time x y theta\)"),
+        ("Landmark_Groundtruth.dat", "6 0 0 0 0\n", r"a position of each landmark, got no position of subject 7"),
+    ],
+)
+def test_a_damaged_log_is_refused_with_file_and_line(folder: Path, name: str, text: str | None, message: str) -> None:
+    """Each damage gets one error that names the file, the line, and what was expected there."""
+    if text is None:
+        (folder / name).unlink()
+    else:
+        (folder / name).write_text(text)
+    with pytest.raises(ValueError, match=message):
+        load_mrclam(folder)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"robots": (2, 6)}, r"robots: expected different numbers from 1 to 5, got \(2, 6\)"),
+        ({"robots": (2, 2)}, r"robots: expected different numbers"),
+        ({"robots": ()}, r"robots: expected different numbers"),
+        ({"robots": (3,)}, r"got no such file\. Check '.*Robot3_Odometry\.dat'"),
+        ({"duration": 0.0}, r"duration: expected a finite number > 0, got 0\.0"),
+        ({"duration": float("nan")}, r"duration: expected a finite number > 0, got nan"),
+    ],
+)
+def test_bad_arguments_are_named(folder: Path, arguments: dict[str, object], message: str) -> None:
+    """An argument that makes no sense is refused by name."""
+    with pytest.raises(ValueError, match=message):
+        load_mrclam(folder, **arguments)  # type: ignore[arg-type]
+
+
+def test_a_missing_folder_is_named(tmp_path: Path) -> None:
+    """No folder, and a folder without any robot, are told apart."""
+    with pytest.raises(ValueError, match=re.escape(f"got no such folder. Check {str(tmp_path / 'none')!r}")):
+        load_mrclam(tmp_path / "none")
+    with pytest.raises(ValueError, match=r"got no odometry of any robot\. Check '.*Robot1_Odometry\.dat'"):
+        load_mrclam(tmp_path)
+
+
+@given(st.binary(max_size=60))
+def test_any_bytes_give_a_log_or_the_projects_error(tmp_path_factory: pytest.TempPathFactory, noise: bytes) -> None:
+    """Whatever stands in a file, the parser returns finite rows in order or refuses in the project's own form."""
+    folder = tmp_path_factory.mktemp("log")
+    for name, text in FILES.items():
+        (folder / name).write_text(text, newline="")
+    (folder / "Robot2_Odometry.dat").write_bytes(b"1.0 0.5 0.25\n" + noise)
+    try:
+        commands = load_mrclam(folder).robots[0].commands
+    except ValueError as error:
+        assert str(error).startswith("path: expected 3 numbers")  # noqa: PT017   # either outcome is lawful
+    else:
+        assert np.isfinite(commands).all()
+        assert (np.diff(commands[:, 0]) >= 0.0).all()
+
+
+rows = st.lists(
+    st.tuples(st.floats(0.01, 2.0), st.floats(-0.5, 0.5), st.floats(-1.0, 1.0)), min_size=1, max_size=7
+)  # (seconds since the command before, v, omega)
+
+
+def _commands(drawn: list[tuple[float, float, float]]) -> np.ndarray:
+    table = np.array(drawn)
+    table[:, 0] = np.cumsum(table[:, 0])
+    return table
+
+
+@given(rows, st.lists(st.floats(0.0, 20.0), min_size=2, max_size=6))
+def test_odometry_adds_up_whatever_the_steps(drawn: list[tuple[float, float, float]], times: list[float]) -> None:
+    """Motions between any times, chained, lead where the whole motion leads."""
+    commands, times = _commands(drawn), sorted(times)
+    path = integrate_commands(commands, times)
+    chained = dead_reckoning(path[0], between(path[:-1], path[1:]))
+    np.testing.assert_allclose(between(chained[-1], path[-1]), 0.0, atol=1e-9)
+
+
+@given(rows, st.floats(0.0, 15.0))
+def test_arcs_are_those_of_many_small_steps(drawn: list[tuple[float, float, float]], time: float) -> None:
+    """The closed-form arc equals Euler's method in the limit; a command holds no longer than `HOLD`."""
+    commands = _commands(drawn)
+    moments = np.linspace(0.0, time, 20_001)
+    middle = 0.5 * (moments[1:] + moments[:-1])
+    row = np.searchsorted(commands[:, 0], middle, side="right") - 1
+    active = (row >= 0) & (middle - commands[np.maximum(row, 0), 0] < HOLD)
+    v = np.where(active, commands[np.maximum(row, 0), 1], 0.0) * np.diff(moments)
+    w = np.where(active, commands[np.maximum(row, 0), 2], 0.0) * np.diff(moments)
+    heading = np.cumsum(w) - 0.5 * w
+    euler = [np.sum(v * np.cos(heading)), np.sum(v * np.sin(heading)), np.sum(w)]
+    error = between(integrate_commands(commands, [time])[0], euler)
+    np.testing.assert_allclose(error, 0.0, atol=2e-2)  # at each command one small step is cut anywhere
+
+
+def test_a_stale_command_no_longer_moves_the_robot() -> None:
+    """After `HOLD` seconds without a new command the robot stands; before the first it stands too."""
+    commands = [[10.0, 1.0, 0.0], [20.0, 2.0, 0.0]]
+    poses = integrate_commands(commands, [5.0, 10.0, 11.0, 15.0, 20.5, 99.0])
+    assert poses[:, 0].tolist() == [0.0, 0.0, 1.0, 1.5, 2.5, 4.5]
+    assert not poses[:, 1:].any()
+
+
+def _log(sightings: list[tuple[float, int, float, float]], commands: list[list[float]]) -> MrclamLog:
+    robot = RobotLog(3, np.array(commands), np.array(sightings).reshape(-1, 4), None)
+    return MrclamLog((robot,), np.array([6, 7, 9]), np.zeros((3, 2)))
+
+
+def test_sightings_become_points_of_the_camera() -> None:
+    """Zc = r cos b, Xc = -r sin b, Yc = 0, so that the camera model puts the landmark where it stands."""
+    frame = steps(_log([(0.0, 7, 2.0, 0.5), (0.0, 9, 3.0, -0.25)], [[0.0, 0.0, 0.0]])).robots[0].measurements[0]
+    assert frame is not None
+    np.testing.assert_allclose(frame.points[0], [-2.0 * np.sin(0.5), 0.0, 2.0 * np.cos(0.5)], atol=1e-12)
+    robot = StereoCamera().robot_from_camera(frame.points)
+    np.testing.assert_allclose(robot[1], [3.0 * np.cos(0.25), -3.0 * np.sin(0.25), 0.0], atol=1e-12)
+    assert frame.descriptors.tolist() == [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+
+
+def test_covariance_is_that_of_drawn_sightings() -> None:
+    """The Jacobian carries range and bearing noise to the camera frame: 200,000 draws agree within 3 %."""
+    noise = SightingNoise(range_floor=0.03, range_share=0.01, bearing=0.015, height=0.05)
+    frame = steps(_log([(0.0, 7, 4.0, 0.6)], [[0.0, 0.0, 0.0]]), noise=noise).robots[0].measurements[0]
+    assert frame is not None
+    assert frame.covariances is not None
+    rng = np.random.default_rng(5)
+    r = 4.0 + np.hypot(0.03, 0.04) * rng.standard_normal(200_000)
+    b = 0.6 + 0.015 * rng.standard_normal(200_000)
+    drawn = np.stack([-r * np.sin(b), 0.05 * rng.standard_normal(200_000), r * np.cos(b)])
+    np.testing.assert_allclose(frame.covariances[0], np.cov(drawn), atol=0.03 * np.cov(drawn).max())
+
+
+def test_a_sighting_is_moved_to_its_step_by_the_odometry() -> None:
+    """A landmark seen between two steps is where the robot of the nearest step would have seen it."""
+    commands = [[0.0, 0.5, 0.8], [1.0, 0.5, 0.8]]
+    landmark = np.array([3.0, 1.0])
+    seen = []
+    for time in (0.31, 0.62, 1.44):
+        pose = integrate_commands(commands, [time])[0]
+        relative = between(pose, [*landmark, 0.0])[:2]
+        seen.append((time, 7, float(np.hypot(*relative)), float(np.arctan2(relative[1], relative[0]))))
+    log = _log(seen, commands)
+    readings = steps(log, dt=0.5)
+    found = [k for k, frame in enumerate(readings.robots[0].measurements) if frame is not None]
+    assert found == [1, 3]  # the first two share a step, where one landmark counts once
+    path = dead_reckoning(np.zeros(3), readings.robots[0].odometry[1:])
+    for k in found:
+        frame = readings.robots[0].measurements[k]
+        assert frame is not None
+        point = compose(path[k], [frame.points[0, 2], -frame.points[0, 0], 0.0])[:2]
+        np.testing.assert_allclose(point, landmark, atol=1e-9)
+
+
+def test_of_two_sightings_of_one_landmark_in_a_step_the_first_counts() -> None:
+    """Repeated sightings in a step are not independent: the earliest is kept, other landmarks stay."""
+    log = _log([(0.0, 7, 2.0, 0.0), (0.05, 7, 2.5, 0.0), (0.05, 6, 1.0, 0.0)], [[0.0, 0.0, 0.0]])
+    frame = steps(log, dt=0.2).robots[0].measurements[0]
+    assert frame is not None
+    assert frame.points[:, 2].tolist() == [1.0, 2.0]
+
+
+@pytest.mark.parametrize(
+    ("dt", "message"),
+    [(0.0, "dt: expected a finite number > 0"), (1e-9, r"dt: expected at most 1,000,000 steps, got .*Take longer")],
+)
+def test_bad_steps_are_refused(dt: float, message: str) -> None:
+    """Steps of no length, or too many of them, are refused."""
+    with pytest.raises(ValueError, match=message):
+        steps(_log([], [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]), dt)
+
+
+@pytest.mark.parametrize("name", ["range_floor", "bearing", "height"])
+def test_every_direction_needs_noise(name: str) -> None:
+    """A direction without noise would make a covariance singular."""
+    with pytest.raises(ValueError, match=rf"sensor\.{name}: expected a finite number > 0, got 0\.0"):
+        SightingNoise(**{name: 0.0})
+
+
+@pytest.mark.slow
+def test_dead_reckoning_of_the_real_log_is_off_by_what_is_known(data_dir: Path) -> None:
+    """From the true start poses the five robots' odometry is off by 4.0, 2.0, 2.9, 3.0 and 2.9 m RMS."""
+    log = load_mrclam(data_dir / "mrclam" / "MRCLAM_Dataset7")
+    assert [len(own.sightings) for own in log.robots] == [2578, 3818, 4425, 1822, 3424]
+    readings = steps(log)
+    errors = []
+    for own, stepped in zip(log.robots, readings.robots, strict=True):
+        assert own.truth is not None
+        known = readings.times <= own.truth.times[-1]
+        true = own.truth.at(readings.times[known])
+        path = dead_reckoning(true[0], stepped.odometry[1:])[known]
+        errors.append(ate(path, true).start)
+    np.testing.assert_allclose(errors, [4.09, 2.05, 3.02, 2.90, 2.98], atol=0.16)
