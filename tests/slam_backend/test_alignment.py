@@ -371,7 +371,7 @@ def test_aligning_two_hundred_landmarks_takes_milliseconds() -> None:
 
 def test_bad_input_gives_one_clear_error() -> None:
     """Unknown methods, seeds in place of generators and descriptors of another size are refused by name."""
-    with pytest.raises(ValueError, match="rng: expected a numpy.random.Generator or None, got 7"):
+    with pytest.raises(ValueError, match=r"rng: expected a numpy.random.Generator or None, got 7"):
         align_maps(RICH, RICH, rng=7)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="method: expected one of 'ransac', 'svd', got 'magic'"):
         align_maps(RICH, RICH, "magic")
