@@ -5,7 +5,7 @@ import numpy as np
 from slam_backend.errors import FloatArray, bad_argument, check_int
 from vslam_env.rendering import palette
 from vslam_env.rendering.canvas import Image, Viewport, disc, dots, ellipse_outlines, fill, lines, path, veils
-from vslam_env.rendering.flash import draw_flashes
+from vslam_env.rendering.flash import draw_captions, draw_flashes
 from vslam_env.rendering.palette import mix, robot_colour
 from vslam_env.rendering.scene import RobotView, Scene
 from vslam_env.rendering.strips import draw_footer, draw_header
@@ -46,8 +46,9 @@ def draw_frame(scene: Scene, size: tuple[int, int] = (960, 720)) -> Image:
         _draw_map(plot, view, robot, palette.robot_colour(index), unit)
     for index, robot in enumerate(scene.robots):
         _draw_belief(plot, view, robot, robot_colour(index), unit, scene.robot_radius)
-    _draw_bodies(plot, view, scene, unit)
     draw_flashes(plot, view, scene, unit)
+    _draw_bodies(plot, view, scene, unit)
+    draw_captions(plot, scene, unit)
     draw_header(image[:top], scene)
     draw_footer(image[bottom:], scene)
     return image

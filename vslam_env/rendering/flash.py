@@ -14,12 +14,21 @@ RING_M = 2.2  # [m] how far the rings run
 
 
 def draw_flashes(plot: Image, view: Viewport, scene: Scene, unit: float) -> None:
-    """Draw the merges that are younger than `FLASH_TICKS`, the youngest caption on top."""
-    young = sorted((m for m in scene.merges if m.age_ticks < FLASH_TICKS), key=lambda merge: merge.age_ticks)
-    for merge in young:
+    """Draw rings and lines of the merges that are younger than `FLASH_TICKS`."""
+    for merge in _young(scene):
         _draw_glow(plot, view, scene, merge, unit)
-    for line, merge in enumerate(young):
+
+
+def draw_captions(plot: Image, scene: Scene, unit: float) -> None:
+    """Write who merged, the youngest merge on top."""
+    for line, merge in enumerate(_young(scene)):
         _draw_caption(plot, merge, line, unit)
+
+
+def _young(scene: Scene) -> list[MergeFlash]:
+    """Return the merges that still flash, the youngest first."""
+    young = (merge for merge in scene.merges if merge.age_ticks < FLASH_TICKS)
+    return sorted(young, key=lambda merge: merge.age_ticks)
 
 
 def caption(merge: MergeFlash) -> str:

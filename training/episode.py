@@ -1,0 +1,229 @@
+"""One episode of an environment under given policies, and the record of it that tables and figures are made of."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from agents.policy import Policy
+from slam_backend.errors import FloatArray, bad_argument
+from slam_backend.geometry import between
+from slam_backend.landmark_map import LandmarkMap
+from slam_backend.reports import MergeEvent
+from slam_backend.trajectory import dead_reckoning
+from vslam_env.config import TICK
+from vslam_env.environment import ExplorationEnv
+from vslam_env.rendering import Scene
+
+FALSE_MERGE_M, FALSE_MERGE_DEG = 0.5, 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class MergeRecord:
+    """One merge, compared with the truth.
+
+    Attributes:
+        tick: Ticks since the reset.
+        time: Since the reset [s].
+        robots_a: The group whose map frame stayed.
+        robots_b: The other group.
+        landmarks: How many landmarks of either map were believed to be the same.
+        error_m: Of the translation between the two map frames [m].
+        error_deg: Of the rotation between them, >= 0 [degrees].
+    """
+
+    tick: int
+    time: float
+    robots_a: tuple[int, ...]
+    robots_b: tuple[int, ...]
+    landmarks: int
+    error_m: float
+    error_deg: float
+
+    @property
+    def is_false(self) -> bool:
+        """Whether the maps were joined in a way that is plainly wrong."""
+        return self.error_m > FALSE_MERGE_M or self.error_deg > FALSE_MERGE_DEG
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EpisodeRecord:
+    """What happened in an episode of K robots and T steps.
+
+    Attributes:
+        times: (T + 1,) float64 [s]. Of the reset and of each step.
+        true_poses: (K, T + 1, 3) float64 [m, m, rad], world frame.
+        estimated: (K, T + 1, 3) float64 [m, m, rad]. What each robot believed at the time, own start frames.
+        reckoned: (K, T + 1, 3) float64 [m, m, rad]. Its odometry alone, own start frames.
+        map_errors: (K, T + 1) float64 [m].
+        coverage: (T + 1,) float64 [-].
+        merges: In order.
+        attempts: How often two maps were compared.
+        groups: The robots that share a map at the end.
+        infos: Per robot its last info.
+        own_maps: Per robot its map just before its first merge, own start frame; the last map if it never merged.
+        alone_until: Per robot the time of that merge [s], or None.
+        scene: The last picture: truth and maps in the world frame.
+        complete: Whether the episode ran to its end.
+    """
+
+    times: FloatArray
+    true_poses: FloatArray
+    estimated: FloatArray
+    reckoned: FloatArray
+    map_errors: FloatArray
+    coverage: FloatArray
+    merges: tuple[MergeRecord, ...]
+    attempts: int
+    groups: tuple[tuple[int, ...], ...]
+    infos: tuple[Mapping[str, Any], ...]
+    own_maps: tuple[LandmarkMap, ...]
+    alone_until: tuple[float | None, ...]
+    scene: Scene
+    complete: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Progress:
+    """How far an episode is.
+
+    Attributes:
+        step: Steps done; 0 after the reset.
+        time: Since the reset [s].
+        infos: Of all agents, as the environment gave them.
+        new_merges: Merges of this step.
+    """
+
+    step: int
+    time: float
+    infos: Mapping[str, Mapping[str, Any]]
+    new_merges: tuple[MergeRecord, ...]
+
+
+def run_episode(
+    env: ExplorationEnv,
+    policies: Mapping[str, Policy],
+    seed: int,
+    on_step: Callable[[Progress], None] = lambda progress: None,
+    should_stop: Callable[[], bool] = lambda: False,
+) -> EpisodeRecord:
+    """Run one episode to its end, or until `should_stop`.
+
+    Args:
+        env: A parallel environment, unwrapped.
+        policies: One for each agent; they see observations and beliefs, never infos.
+        seed: Of the environment's reset and of the policies' draws, which are independent streams.
+        on_step: Called after the reset and after each step; the environment may be looked at.
+        should_stop: Asked after each step.
+
+    Raises:
+        ValueError: If an agent has no policy.
+    """
+    agents = list(env.possible_agents)
+    missing = [agent for agent in agents if agent not in policies]
+    if missing:
+        raise bad_argument("policies", "a policy for each agent", f"no policy for {missing}", "Add them.")
+    streams = np.random.SeedSequence([seed, len(agents)]).spawn(len(agents))
+    rngs = {agent: np.random.default_rng(stream) for agent, stream in zip(agents, streams, strict=True)}
+    odometry: list[FloatArray] = []
+    env.recorder = lambda readings: odometry.append(
+        np.stack([np.zeros(3) if r.odometry is None else r.odometry for r in readings])
+    )
+    observations, infos = env.reset(seed=seed)
+    for policy in policies.values():
+        policy.reset()
+    log = _Log(env, infos)
+    on_step(Progress(0, 0.0, infos, ()))
+    while env.agents and not should_stop():
+        actions = {a: policies[a].act(observations[a], env.belief(a), rngs[a]) for a in env.agents}
+        log.before_step()
+        observations, _, _, _, infos = env.step(actions)
+        on_step(log.after_step(infos, len(odometry) - 1))
+    return log.finish(np.array(odometry))
+
+
+class _Log:
+    """Collects the record step by step."""
+
+    def __init__(self, env: ExplorationEnv, infos: Mapping[str, Mapping[str, Any]]) -> None:
+        self._env, self._agents = env, list(env.possible_agents)
+        self._starts = env.true_start_poses
+        self._ticks: list[int] = []
+        self._true: list[FloatArray] = []
+        self._estimated: list[FloatArray] = []
+        self._errors: list[list[float]] = []
+        self._coverage: list[float] = []
+        self._merges: list[MergeRecord] = []
+        self._events = 0
+        self._maps: dict[int, LandmarkMap] = {}
+        self._alone_until: dict[int, float] = {}
+        self._infos = infos
+        self._enter(infos, 0)
+
+    def before_step(self) -> None:
+        """Keep the maps of the robots that are still alone."""
+        for robot, agent in enumerate(self._agents):
+            if robot not in self._alone_until:
+                self._maps[robot] = self._env.belief(agent).map
+
+    def after_step(self, infos: Mapping[str, Mapping[str, Any]], tick: int) -> Progress:
+        """Take in one step that ended at `tick`."""
+        self._enter(infos, tick)
+        events = self._env.events[self._events :]
+        self._events += len(events)
+        merges = tuple(self._compared(event) for event in events if event.kind == "merge")
+        for merge in merges:
+            for robot in merge.robots_a + merge.robots_b:
+                self._alone_until.setdefault(robot, merge.time)
+        self._merges.extend(merges)
+        return Progress(len(self._ticks) - 1, tick * TICK, infos, merges)
+
+    def finish(self, odometry: FloatArray) -> EpisodeRecord:
+        """Return the record.
+
+        Args:
+            odometry: (ticks + 1, K, 3) float64 [m, m, rad]. Readings of all ticks; that of the reset is zero.
+        """
+        ticks = np.array(self._ticks)
+        reckoned = [dead_reckoning(np.zeros(3), odometry[1:, robot])[ticks] for robot in range(len(self._agents))]
+        last = {robot: self._env.belief(agent) for robot, agent in enumerate(self._agents)}
+        maps = {**self._maps, **{r: belief.map for r, belief in last.items() if r not in self._alone_until}}
+        return EpisodeRecord(
+            times=ticks * TICK,
+            true_poses=np.stack(self._true, axis=1),
+            estimated=np.stack(self._estimated, axis=1),
+            reckoned=np.stack(reckoned),
+            map_errors=np.array(self._errors).T,
+            coverage=np.array(self._coverage),
+            merges=tuple(self._merges),
+            attempts=sum(event.kind == "attempt" for event in self._env.events),
+            groups=tuple(sorted({belief.group for belief in last.values()})),
+            infos=tuple(dict(self._infos[agent]) for agent in self._agents),
+            own_maps=tuple(maps[robot] for robot in range(len(self._agents))),
+            alone_until=tuple(self._alone_until.get(robot) for robot in range(len(self._agents))),
+            scene=self._env.scene(),
+            complete=not self._env.agents,
+        )
+
+    def _enter(self, infos: Mapping[str, Mapping[str, Any]], tick: int) -> None:
+        self._infos = infos
+        self._ticks.append(tick)
+        self._true.append(self._env.true_poses)
+        self._estimated.append(np.stack([self._env.belief(agent).pose for agent in self._agents]))
+        self._errors.append([float(infos[agent]["map_error"]) for agent in self._agents])
+        self._coverage.append(float(infos[self._agents[0]]["coverage"]))
+
+    def _compared(self, event: MergeEvent) -> MergeRecord:
+        """Compare a merge with the true motion between the start poses that the two map frames stand for."""
+        truth = between(self._starts[min(event.robots_a)], self._starts[min(event.robots_b)])
+        error = between(truth, event.alignment.transform)
+        return MergeRecord(
+            tick=event.step,
+            time=event.step * TICK,
+            robots_a=event.robots_a,
+            robots_b=event.robots_b,
+            landmarks=len(event.alignment.inliers),
+            error_m=float(np.hypot(error[0], error[1])),
+            error_deg=float(abs(np.degrees(error[2]))),
+        )

@@ -1,0 +1,122 @@
+"""The command `vslam run`: robots explore a building, live progress, tables, and the run folder."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+
+if TYPE_CHECKING:  # what computes is imported when the command runs, so that --help answers at once
+    from training.episode import EpisodeRecord
+    from training.run_config import RunConfig
+    from training.run_folder import RunFolder
+
+COMMAND = "run"
+VIDEO_SIZE = (960, 720)
+
+
+def run(
+    world: Annotated[
+        str | None,
+        typer.Option(help="office, fig5, or the path of a floor plan.  [default: office]", show_default=False),
+    ] = None,
+    robots: Annotated[int | None, typer.Option(help="How many, 1 to 8.  [default: 3]", show_default=False)] = None,
+    policy: Annotated[
+        str | None, typer.Option(help="Name of a policy.  [default: frontier]", show_default=False)
+    ] = None,
+    seed: Annotated[int | None, typer.Option(help="Of all random draws.  [default: 0]", show_default=False)] = None,
+    action_type: Annotated[
+        str | None, typer.Option(help="continuous, discrete or goal.  [default: continuous]", show_default=False)
+    ] = None,
+    max_cycles: Annotated[
+        int | None, typer.Option(help="Steps of the episode.  [default: 240 s worth]", show_default=False)
+    ] = None,
+    particles: Annotated[
+        int | None, typer.Option(help="Particles per filter.  [default: 100]", show_default=False)
+    ] = None,
+    preset: Annotated[
+        str | None, typer.Option(help="easy, standard or hard noise.  [default: standard]", show_default=False)
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="New run folder.  [default: the next runs/run-*]", show_default=False)
+    ] = None,
+    json: Annotated[Path | None, typer.Option(help="Write the metrics to this file too.", show_default=False)] = None,
+    video: Annotated[bool, typer.Option(help="Whether to film the run.")] = True,
+    config: Annotated[
+        Path | None,
+        typer.Option(help="config.toml of an earlier run to repeat; other options override it.", show_default=False),
+    ] = None,
+) -> None:
+    """Robots that do not know where they start explore a building, map it, and join their maps."""
+    from training.episode_scores import score_episode
+    from training.figures import draw_errors, draw_maps
+    from training.run_config import RunConfig
+    from training.run_folder import RunFolder, read_config, to_json, write_whole
+    from training.run_tables import print_tables
+
+    values: dict[str, Any] = {}
+    if config is not None:
+        values, values["seed"] = read_config(config, COMMAND)
+    given = {
+        "world": world,
+        "robots": robots,
+        "policy": policy,
+        "seed": seed,
+        "action_type": action_type,
+        "max_cycles": max_cycles,
+        "particles": particles,
+        "preset": preset,
+    }
+    chosen = RunConfig.from_mapping(values | {name: value for name, value in given.items() if value is not None})
+    env = chosen.make_env()
+    policies = chosen.make_policies(env)
+    env.reset(seed=chosen.seed)  # what is wrong with the world shows before there is a folder
+    folder = RunFolder.create(out, COMMAND, chosen.to_mapping(), chosen.seed)
+    console = Console()
+    record = _run_live(console, env, policies, chosen, folder.path / "video.mp4" if video else None)
+    metrics = folder.write_metrics(score_episode(record))
+    _write_paths(folder, record)
+    draw_maps(record, folder.path / "map.png")
+    draw_errors(record, folder.path / "error.png")
+    if json is not None:
+        write_whole(json, to_json(metrics))
+    print_tables(console, metrics)
+    console.print(f"Run folder: {folder.path}", soft_wrap=True, highlight=False)
+
+
+def _run_live(console: Console, env: Any, policies: Any, config: "RunConfig", video: Path | None) -> "EpisodeRecord":
+    """Run the episode with live figures, filming it if there is a path for the video; Ctrl-C ends it early."""
+    from contextlib import ExitStack
+
+    from training.episode import Progress, run_episode
+    from training.interrupt import interrupt_flag
+    from training.live import LiveProgress
+    from training.video import VideoWriter, choose_pace, with_slow_flashes
+    from vslam_env.rendering import draw_frame
+
+    pace = choose_pace(config.num_steps, config.step_s)
+    with ExitStack() as stack:
+        interrupted = stack.enter_context(interrupt_flag())
+        live = stack.enter_context(LiveProgress(console, config.num_steps, env.possible_agents))
+        writer = None if video is None else stack.enter_context(VideoWriter(video, VIDEO_SIZE, pace.fps))
+
+        def on_step(progress: Progress) -> None:
+            live.show(progress)
+            if writer is not None and progress.step % pace.stride == 0:
+                writer.add(draw_frame(with_slow_flashes(env.scene(), env.events, pace.speedup), VIDEO_SIZE))
+
+        record = run_episode(env, policies, config.seed, on_step, interrupted)
+    if not record.complete:
+        console.print(f"Stopped at {record.times[-1]:.1f} s; what follows is about the run until then.")
+    return record
+
+
+def _write_paths(folder: "RunFolder", record: "EpisodeRecord") -> None:
+    """Write per robot its estimated and reckoned path, own start frame, and its true one, world frame."""
+    from slam_backend.trajectory import Trajectory
+
+    for robot in range(len(record.infos)):
+        for kind, paths in (
+            ("estimate", record.estimated), ("dead_reckoning", record.reckoned), ("truth", record.true_poses)
+        ):  # fmt: skip
+            folder.write_trajectory(f"robot{robot}_{kind}", Trajectory(record.times, paths[robot]))

@@ -1,0 +1,87 @@
+"""`RunConfig`: all that decides a run, and the environment and policies that it stands for."""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from typing import Any, Self
+
+from agents.policy import Policy
+from agents.registry import make_policy
+from slam_backend.errors import bad_argument, check_choice, check_int
+from vslam_env import vslam_v0
+from vslam_env.config import ACTION_TYPES, GOAL_DECISION_TICKS, PRESETS, TICK
+from vslam_env.environment import ExplorationEnv
+
+# Time for three robots to see the office and to meet each other's traces there [s].
+EPISODE_S = 240.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RunConfig:
+    """A run, as its command line says it.
+
+    Attributes:
+        world: A family name, or the path of a floor plan, a JSON file or a folder.
+        robots: How many.
+        policy: A name of the registry of policies, the same for all robots.
+        action_type: `"continuous"`, `"discrete"` or `"goal"`.
+        max_cycles: Steps of the episode; None: as many as `EPISODE_S` takes.
+        particles: Per filter.
+        preset: Of the environment's noise.
+        seed: Of all random draws.
+    """
+
+    world: str = "office"
+    robots: int = 3
+    policy: str = "frontier"
+    action_type: str = "continuous"
+    max_cycles: int | None = None
+    particles: int = 100
+    preset: str = "standard"
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        check_int("robots", self.robots, 1, "Use 1 to 8 robots.")
+        check_choice("action_type", self.action_type, ACTION_TYPES)
+        check_choice("preset", self.preset, PRESETS)
+        check_int("particles", self.particles, 1, "Use at least one particle; 100 is a good start.")
+        check_int("seed", self.seed, 0, "Use 0 or a positive number.")
+        if self.max_cycles is not None:
+            check_int("max_cycles", self.max_cycles, 1, "Give a number of steps.")
+
+    @classmethod
+    def from_mapping(cls, values: Mapping[str, Any]) -> Self:
+        """Build a config from plain values, as `to_mapping` gives them; unknown names are refused."""
+        known = [field.name for field in fields(cls)]
+        for name in values:
+            if name not in known:
+                raise bad_argument("config", "one of " + ", ".join(known), name, "Correct the name in the file.")
+        return cls(**values)
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return the plain values that repeat this run, the seed apart."""
+        return {name: value for name, value in asdict(self).items() if name != "seed"}
+
+    @property
+    def step_s(self) -> float:
+        """Duration of a step [s]."""
+        return TICK * (GOAL_DECISION_TICKS if self.action_type == "goal" else 1)
+
+    @property
+    def num_steps(self) -> int:
+        """Steps of the episode."""
+        return round(EPISODE_S / self.step_s) if self.max_cycles is None else self.max_cycles
+
+    def make_env(self) -> ExplorationEnv:
+        """Build the environment."""
+        return vslam_v0.parallel_env(
+            world=self.world,
+            num_robots=self.robots,
+            action_type=self.action_type,
+            num_particles=self.particles,
+            max_cycles=self.num_steps,
+            preset=self.preset,
+        )
+
+    def make_policies(self, env: ExplorationEnv) -> dict[str, Policy]:
+        """Build one policy for each agent."""
+        return {agent: make_policy(self.policy, self.action_type) for agent in env.possible_agents}

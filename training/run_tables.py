@@ -1,0 +1,65 @@
+"""The tables that a run ends with."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+ROWS = (
+    ("map error E [m]", "map_error", "{:.3f}", 1.0),
+    ("map RMSE of matched landmarks [m]", "map_rmse_m", "{:.3f}", 1.0),
+    ("recall [%]", "map_recall", "{:.1f}", 100.0),
+    ("precision [%]", "map_precision", "{:.1f}", 100.0),
+    ("ATE, aligned [m]", "ate_aligned_m", "{:.3f}", 1.0),
+    ("   odometry's [m]", "dead_reckoning_ate_aligned_m", "{:.3f}", 1.0),
+    ("ATE, start frame [m]", "ate_start_m", "{:.3f}", 1.0),
+    ("   odometry's [m]", "dead_reckoning_ate_start_m", "{:.3f}", 1.0),
+    ("path [m]", "path_m", "{:.1f}", 1.0),
+    ("odometry's last error [% of path]", "dead_reckoning_end_percent", "{:.1f}", 1.0),
+)
+
+
+def print_tables(console: Console, metrics: Mapping[str, Any]) -> None:
+    """Print robots and team, then the merges.
+
+    Args:
+        console: Where to.
+        metrics: As `score_episode` names them; None stands for what is not known.
+    """
+    columns = {f"robot {robot}": row for robot, row in enumerate(metrics["robots"])} | {"team": metrics["team"]}
+    table = Table(title="Maps and paths, each robot in its own start frame")
+    table.add_column("")
+    for heading in columns:
+        table.add_column(heading, justify="right")
+    for label, key, form, factor in ROWS:
+        table.add_row(escape(label), *(_figure(row[key], form, factor) for row in columns.values()))
+    console.print(table)
+    if metrics["merges"]:
+        console.print(_merges(metrics["merges"]))
+    else:
+        console.print("No merge.")
+    groups = "; ".join(", ".join(map(str, group)) for group in metrics["groups"])
+    console.print(
+        f"Groups at the end: {groups}.  Floor seen: {metrics['coverage']:.1%} in {metrics['duration_s']:.0f} s.  "
+        f"Alignments tried: {metrics['attempts']}.",
+        highlight=False,
+    )
+
+
+def _figure(value: float | None, form: str, factor: float) -> str:
+    """Show a number, and what is not known as a dash."""
+    return "-" if value is None else form.format(factor * value)
+
+
+def _merges(rows: list[Mapping[str, Any]]) -> Table:
+    """Return the table of merges."""
+    table = Table(title="Merges, against the true motion between the start poses")
+    for heading in ("time [s]", "robots", "with", "landmarks", "off by [m]", "off by [deg]", ""):
+        table.add_column(escape(heading), justify="right")
+    for row in rows:
+        sides = [", ".join(map(str, row[side])) for side in ("robots_a", "robots_b")]
+        errors = f"{row['error_m']:.3f}", f"{row['error_deg']:.2f}"
+        table.add_row(f"{row['time_s']:.1f}", *sides, str(row["inliers"]), *errors, "false" if row["false"] else "")
+    return table
