@@ -1,0 +1,88 @@
+"""Filters whose exact answer is known: a robot makes one move, sees each landmark once, and knows which is which."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_backend.alignment import Alignment
+from slam_backend.camera import ROBOT_FROM_CAMERA
+from slam_backend.errors import FloatArray, IntArray
+from slam_backend.filter import FastSlam
+from slam_backend.geometry import compose, inverse, transform_points
+from slam_backend.measurements import Measurements
+from slam_backend.motion import OdometryModel
+
+A_FROM_B = np.array([4.0, 3.0, 2.0])  # where b starts, seen from where a starts
+LANDMARKS = np.array(  # in a's start frame
+    [
+        [3.0, 0.5, -0.4], [4.5, 2.0, 0.3], [6.0, -1.0, 0.8], [5.5, 4.0, 0.1], [8.0, 1.5, -0.7],
+        [3.5, -3.0, 0.6], [7.0, 5.0, -0.2], [2.0, 4.5, 0.9], [9.0, -2.0, 0.0],
+    ]
+)  # fmt: skip
+NAMES_A = np.array([0, 1, 2, 3, 4, 5, 6])
+NAMES_B = np.array([7, 4, 3, 2, 8, 1, 0])  # 0 to 4 are common to both
+PAIRS = np.array([[0, 6], [1, 5], [2, 3], [3, 2], [4, 1]])  # seen from the start, an id is a place in the frame
+MOVE = np.array([1.0, 0.2, 0.15])
+WIDE_MOTION = OdometryModel(sigma_along=0.05, sigma_across=0.02, sigma_heading=0.05, sigma_turn=0.02)
+
+
+def looks(names: IntArray) -> NDArray[np.float32]:
+    """Return the descriptors (n, 13) of landmarks: orthogonal unit vectors."""
+    return np.eye(13, dtype=np.float32)[names]
+
+
+def frame_of(points: FloatArray, names: IntArray, sigma: float) -> Measurements:
+    """Return the frame in which points (n, 3), robot axes, are measured with a stated noise [m] in each direction."""
+    covariances = np.tile(sigma**2 * np.eye(3), (len(points), 1, 1))
+    return Measurements(points @ ROBOT_FROM_CAMERA, looks(names), covariances)
+
+
+def map_once(
+    names: IntArray,
+    start: FloatArray,
+    sigma: float,
+    rng: np.random.Generator,
+    num_particles: int = 7,
+    moves: int = 0,
+    claimed_sigma: float | None = None,
+) -> FastSlam:
+    """Return a filter whose particles are draws from the exact posterior, because nothing is seen twice.
+
+    Args:
+        names: (n,) which of `LANDMARKS` the robot sees, in this order.
+        start: (3,) the robot's start in a's start frame.
+        sigma: True noise of each coordinate of a measurement [m].
+        rng: Of the true noise and the filter.
+        num_particles: M.
+        moves: The robot makes `MOVE` so often, with the noise of `WIDE_MOTION`, and sees an equal share of the
+            landmarks after each; 0: it sees them all from its start.
+        claimed_sigma: Noise that the filter is told; None: the true one.
+    """
+    slam = FastSlam(1, num_particles, motion=WIDE_MOTION, proposal="fastslam1", seed=rng)
+    pose = start
+    shares = max(moves, 1)
+    for share in range(shares):
+        if moves:
+            pose = compose(pose, MOVE + rng.normal(size=3) * WIDE_MOTION.sigmas(MOVE))
+        seen = names[share::shares]
+        points = transform_points(inverse(pose), LANDMARKS[seen]) + sigma * rng.normal(size=(len(seen), 3))
+        frame = frame_of(points, seen, sigma if claimed_sigma is None else claimed_sigma)
+        slam.step([MOVE if moves else None], [frame], identities=[seen])
+    return slam
+
+
+def names_of(slam: FastSlam) -> dict[int, int]:
+    """Return the true name of each landmark that a filter holds, by its id."""
+    held = slam._ids >= 0
+    return dict(zip(slam._ids[held].tolist(), slam._identities[held].tolist(), strict=True))
+
+
+def common_landmarks(a: FastSlam, b: FastSlam) -> IntArray:
+    """Return (k, 2) rows (id in a, id in b) of the landmarks that both filters hold."""
+    ids_b = {name: landmark for landmark, name in names_of(b).items()}
+    return np.array([(landmark, ids_b[name]) for landmark, name in names_of(a).items() if name in ids_b])
+
+
+def known_alignment(sigma: float = 0.01, offset: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Alignment:
+    """Return an alignment a_from_b that is off by `offset`, with a stated deviation [m, m, rad]."""
+    motion = A_FROM_B + np.array(offset)
+    return Alignment(True, "", *motion, sigma**2 * np.eye(3), np.empty((0, 2), np.int64), 0.0)

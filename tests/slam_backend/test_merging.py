@@ -1,0 +1,234 @@
+import copy
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from mapped_once import (
+    A_FROM_B,
+    LANDMARKS,
+    NAMES_A,
+    NAMES_B,
+    PAIRS,
+    common_landmarks,
+    frame_of,
+    known_alignment,
+    looks,
+    map_once,
+    names_of,
+)
+
+from slam_backend.alignment import Alignment
+from slam_backend.filter import UNPACK, FastSlam
+from slam_backend.fusion import fuse_landmarks
+from slam_backend.geometry import inverse, rotate_covariances, transform_points, wrap_angle
+from slam_backend.measurements import Measurements
+from slam_backend.merging import inverse_alignment, merge_filters
+
+NO_PAIRS = np.empty((0, 2), np.int64)
+
+
+def both(sigma: float = 0.01, seed: int = 0, particles: tuple[int, int] = (7, 7)) -> tuple[FastSlam, FastSlam]:
+    """Two filters that stand at their starts and share five landmarks."""
+    rng = np.random.default_rng(seed)
+    a = map_once(NAMES_A, np.zeros(3), sigma, rng, particles[0])
+    return a, map_once(NAMES_B, A_FROM_B, sigma, rng, particles[1])
+
+
+def new_frame() -> Measurements:
+    """A frame with one landmark of a new look."""
+    return frame_of(np.array([[2.5, 0.5, 0.1]]), np.array([11]), 0.05)
+
+
+def arrays_of(slam: FastSlam) -> dict[str, Any]:
+    """All arrays that a filter holds, by name."""
+    return {name: value for name, value in vars(slam).items() if isinstance(value, np.ndarray)}
+
+
+# ---------------------------------------------------------------------- the alignment seen from the other map
+
+
+@given(st.floats(-20, 20), st.floats(-20, 20), st.floats(-3.1, 3.1), st.integers(0, 99))
+def test_inverse_alignment_carries_the_covariance_through_the_numerical_jacobian(
+    x: float, y: float, theta: float, seed: int
+) -> None:
+    """The covariance of the inverse motion is J Sigma J^T with J by finite differences, and the pairs are swapped."""
+    root = np.random.default_rng(seed).normal(size=(3, 3))
+    alignment = Alignment(True, "", x, y, theta, root @ root.T, np.array([[2, 5], [4, 1]]), 0.25)
+    turned = inverse_alignment(alignment)
+    step = 1e-6
+    columns = []
+    for axis in np.eye(3):
+        change = inverse(alignment.transform + step * axis) - inverse(alignment.transform - step * axis)
+        columns.append([*change[:2], wrap_angle(change[2])])
+    jacobian = np.array(columns).T / (2 * step)
+    expected = jacobian @ alignment.covariance @ jacobian.T
+    np.testing.assert_allclose(turned.covariance, expected, rtol=1e-6, atol=1e-6 * np.abs(expected).max())
+    np.testing.assert_array_equal(turned.inliers, [[5, 2], [1, 4]])
+    np.testing.assert_allclose(turned.transform, inverse(alignment.transform))
+    assert turned.ratio == alignment.ratio
+
+
+@given(st.floats(-20, 20), st.floats(-20, 20), st.floats(-3.1, 3.1))
+def test_turning_an_alignment_around_twice_changes_nothing(x: float, y: float, theta: float) -> None:
+    """The inverse of the inverse is the alignment itself."""
+    alignment = Alignment(True, "", x, y, theta, np.diag([0.1, 0.2, 0.03]), np.array([[2, 5]]), 0.0)
+    again = inverse_alignment(inverse_alignment(alignment))
+    np.testing.assert_allclose(again.transform, alignment.transform, atol=1e-12)
+    np.testing.assert_allclose(again.covariance, alignment.covariance, atol=1e-9)
+
+
+# ---------------------------------------------------------------------- what a merge gives
+
+
+def test_the_fixture_s_pairs_are_the_landmarks_in_common() -> None:
+    """The pairs written by hand name the five landmarks that both filters hold."""
+    np.testing.assert_array_equal(common_landmarks(*both()), PAIRS)
+
+
+@pytest.mark.parametrize("sigma", [1e-2, 1e-4, 1e-6])
+def test_the_error_of_a_merge_vanishes_with_the_noise(sigma: float) -> None:
+    """With noise sigma, b's pose and all landmarks land within 10 sigma of the truth, from an alignment far off."""
+    a, b = both(sigma)
+    joint, _ = merge_filters(a, b, known_alignment(offset=(0.1, -0.1, 0.05)), PAIRS, np.random.default_rng(1))
+    names = names_of(joint)
+    merged = joint.map()
+    truth = LANDMARKS[[names[landmark] for landmark in merged.ids.tolist()]]
+    assert np.abs(merged.means - truth).max() < 10 * sigma
+    assert np.abs(joint.pose(1).mean - A_FROM_B).max() < 10 * sigma
+    assert np.abs(joint.start_pose(1) - A_FROM_B).max() < 10 * sigma
+    np.testing.assert_array_equal(joint.pose(0).mean, 0.0)
+
+
+def test_ids_of_a_stay_and_those_of_b_are_renamed_one_to_one() -> None:
+    """Each landmark of b gets one id of the joint map, its own or that of its partner in a; a's keep theirs."""
+    a, b = both()
+    joint, renamed = merge_filters(a, b, known_alignment(), PAIRS, np.random.default_rng(1))
+    names_a, names_b, names = names_of(a), names_of(b), names_of(joint)
+    assert {landmark: names[landmark] for landmark in names_a} == names_a
+    assert sorted(renamed[:, 0]) == sorted(names_b)
+    assert len(np.unique(renamed[:, 1])) == len(renamed)
+    assert [names[new] for new in renamed[:, 1].tolist()] == [names_b[old] for old in renamed[:, 0].tolist()]
+
+
+def test_every_landmark_of_either_map_is_in_the_joint_map_exactly_once() -> None:
+    """The joint map holds the union of the landmarks, with counts added where both saw one."""
+    a, b = both()
+    joint, _ = merge_filters(a, b, known_alignment(), PAIRS, np.random.default_rng(1))
+    names = names_of(joint)
+    merged = joint.map()
+    assert sorted(names[landmark] for landmark in merged.ids.tolist()) == list(range(9))
+    common = np.isin([names[landmark] for landmark in merged.ids.tolist()], NAMES_A[:5])
+    np.testing.assert_array_equal(merged.counts, np.where(common, 2, 1))
+
+
+def test_ids_given_after_a_merge_were_never_used_before() -> None:
+    """A landmark that is created after the merge gets an id that neither map used."""
+    a, b = both()
+    joint, renamed = merge_filters(a, b, known_alignment(), PAIRS, np.random.default_rng(1))
+    used = set(names_of(joint)) | set(renamed.ravel().tolist())
+    report = joint.step([None, None], [new_frame(), None], identities=[np.array([11]), None])
+    assert report.created[0][0] == max(used) + 1
+
+
+@pytest.mark.parametrize("particles", [(7, 11), (11, 7)])
+def test_a_joint_filter_has_uniform_weights_and_as_many_particles_as_the_larger(particles: tuple[int, int]) -> None:
+    """Weights after a merge are uniform, and M is the larger of the two."""
+    a, b = both(particles=particles)
+    joint, _ = merge_filters(a, b, known_alignment(), PAIRS, np.random.default_rng(1))
+    assert joint.num_particles == 11
+    assert joint.options.num_particles == 11
+    np.testing.assert_allclose(joint.weights, 1 / 11)
+    for name, value in arrays_of(joint).items():
+        if name in ("_landmarks", "_present", "_counts", "_poses", "_start_poses"):
+            assert 11 in value.shape, name
+
+
+def test_a_joint_filter_shares_no_memory_with_the_old_ones() -> None:
+    """Neither the merge nor steps of the joint filter change the two filters it was made of."""
+    a, b = both()
+    before = [copy.deepcopy(arrays_of(slam)) for slam in (a, b)]
+    joint, _ = merge_filters(a, b, known_alignment(), PAIRS, np.random.default_rng(1))
+    for name, value in arrays_of(joint).items():
+        for old in (a, b):
+            assert not np.shares_memory(value, getattr(old, name)), name
+    joint.step([np.array([0.1, 0.0, 0.1])] * 2, [new_frame(), new_frame()])
+    for slam, kept in zip((a, b), before, strict=True):
+        for name, value in kept.items():
+            np.testing.assert_array_equal(getattr(slam, name), value, err_msg=name)
+
+
+def test_common_landmarks_are_fused_at_each_particle_s_own_motion() -> None:
+    """A particle's common landmark is Eqs. 13-15 of a's and b's, the latter moved by that particle's draw (Eq. 16)."""
+    a, b = both(sigma=0.3)  # wide, so that the draws of T differ visibly
+    joint, _ = merge_filters(a, b, known_alignment(), PAIRS, np.random.default_rng(1))
+    motions = joint.particles(1)[0]  # b stands at its start, so its poses are the motions a_from_b
+    assert np.ptp(motions, axis=0).min() > 0.05
+    map_a, map_b = a.map(), b.map()  # nobody moved: the same in all particles
+    scale = joint._landmarks[5, 8] / map_a.covariances[5, 2, 2]  # of a landmark that only a has
+    for m, motion in enumerate(motions):
+        means_b = transform_points(motion, map_b.means[PAIRS[:, 1]])
+        covariances_b = rotate_covariances(motion[2], map_b.covariances[PAIRS[:, 1]])
+        means, covariances = fuse_landmarks(
+            map_a.means[PAIRS[:, 0]], scale[m] * map_a.covariances[PAIRS[:, 0]], means_b, scale[m] * covariances_b
+        )
+        np.testing.assert_allclose(joint._landmarks[:5, :3, m], means, rtol=1e-10)
+        np.testing.assert_allclose(joint._landmarks[:5, 3:, m][:, UNPACK], covariances, atol=1e-12)
+
+
+def test_descriptors_are_averaged_by_counts_and_keep_their_length() -> None:
+    """A landmark seen thrice by a, once by b, looks three quarters like a's, at unit length (Sec. 3.2, corrected)."""
+    a, b = both()
+    for _ in range(2):
+        a.step([None], [frame_of(LANDMARKS[NAMES_A], NAMES_A, 0.01)], identities=[NAMES_A])
+    b._descriptors[1] = looks(np.array([12]))[0]  # b's view of landmark 4
+    joint, _ = merge_filters(a, b, known_alignment(), PAIRS, np.random.default_rng(1))
+    fused = joint.map().descriptors[4]
+    expected = 3 * looks(np.array([4]))[0] + looks(np.array([12]))[0]
+    np.testing.assert_allclose(fused, expected / np.sqrt(10), atol=1e-6)
+
+
+@pytest.mark.parametrize("shared", [0, 2])
+def test_without_enough_common_landmarks_the_alignment_s_own_covariance_is_used(shared: int) -> None:
+    """The spread of the motions is that of the alignment.
+
+    900 whitened draws: each mean is 0 +- 5 / 30, each variance 1 +- 5 sqrt(2 / 900); false alarm below 1e-5.
+    """
+    a, b = both(particles=(900, 5))
+    root = np.array([[0.2, 0.0, 0.0], [-0.1, 0.3, 0.0], [0.02, -0.03, 0.05]])
+    near_pi = np.array([1.0, -2.0, np.pi - 0.01])  # the draws of the heading cross the cut
+    alignment = Alignment(True, "", *near_pi, root @ root.T, NO_PAIRS, 0.0)
+    joint, renamed = merge_filters(a, b, alignment, PAIRS[:shared], np.random.default_rng(1))
+    offsets = joint.particles(1)[0] - near_pi
+    offsets[:, 2] = wrap_angle(offsets[:, 2])
+    white = np.linalg.solve(root, offsets.T)
+    assert np.abs(white.mean(axis=1)).max() < 5 / 30
+    np.testing.assert_allclose(np.cov(white), np.eye(3), atol=5 * np.sqrt(2 / 900))
+    assert len(joint.map()) == 14 - shared
+    assert len(renamed) == 7
+
+
+@pytest.mark.parametrize("empty_first", [True, False])
+def test_a_filter_without_landmarks_joins_by_the_alignment_alone(empty_first: bool) -> None:
+    """A robot that has seen nothing yet brings its pose, and nothing is lost."""
+    full, _ = both()
+    blank = FastSlam(1, 7, seed=1)
+    a, b = (blank, full) if empty_first else (full, blank)
+    joint, _ = merge_filters(a, b, known_alignment(sigma=1e-6), NO_PAIRS, np.random.default_rng(1))
+    assert len(joint.map()) == 7
+    assert np.abs(joint.pose(1).mean - A_FROM_B).max() < 1e-4
+    report = joint.step([None, None], [new_frame(), None])
+    assert report.num_new == 1
+
+
+def test_the_same_stream_gives_the_same_merge() -> None:
+    """A merge is a function of its arguments and of the generator's state."""
+    results = []
+    for _ in range(2):
+        a, b = both()
+        results.append(merge_filters(a, b, known_alignment(), PAIRS, np.random.default_rng(5))[0])
+    one, other = results
+    for name, value in arrays_of(one).items():
+        np.testing.assert_array_equal(value, getattr(other, name), err_msg=name)
+    assert one._rng.bit_generator.state == other._rng.bit_generator.state
