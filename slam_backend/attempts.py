@@ -90,10 +90,11 @@ class AttemptSchedule:
         record.next_step = step + record.wait
         record.wait = min(2 * record.wait, self._options.longest_wait)
 
-    def get_state(self) -> dict[PairKey, Any]:
-        """Return a copy of the memory."""
-        return copy.deepcopy(self._records)
+    def get_state(self) -> dict[str, Any]:
+        """Return the options and a copy of the memory."""
+        return {"options": self._options, "alignment": self._alignment, "records": copy.deepcopy(self._records)}
 
-    def set_state(self, state: Mapping[PairKey, Any]) -> None:
-        """Take over a memory that `get_state` returned."""
-        self._records = copy.deepcopy(dict(state))
+    def set_state(self, state: Mapping[str, Any]) -> None:
+        """Take over options and a memory that `get_state` returned."""
+        self._options, self._alignment = state["options"], state["alignment"]
+        self._records = copy.deepcopy(state["records"])

@@ -127,7 +127,7 @@ def fuse_maps(map_a: LandmarkMap, map_b: LandmarkMap, alignment: Alignment) -> L
         expected = f"descriptors of size {map_a.descriptors.shape[1]}, as in map_a"
         cure = "Describe the landmarks of both maps with the same front end."
         raise bad_argument("map_b", expected, map_b.descriptors.shape[1], cure)
-    _check_inliers(alignment.inliers, len(map_a), len(map_b))
+    check_inliers(alignment.inliers, len(map_a), len(map_b))
     rows_a, rows_b = alignment.inliers.T
     means_b = transform_points(alignment.transform, map_b.means)
     covariances_b = move_covariances(alignment, map_b.means, map_b.covariances)
@@ -152,7 +152,7 @@ def fuse_maps(map_a: LandmarkMap, map_b: LandmarkMap, alignment: Alignment) -> L
     )
 
 
-def _check_inliers(inliers: IntArray, size_a: int, size_b: int) -> None:
+def check_inliers(inliers: IntArray, size_a: int, size_b: int) -> None:
     """Raise unless the inliers (k, 2) pair existing landmarks one-to-one."""
     outside = (inliers < 0) | (inliers >= np.array([size_a, size_b]))
     repeated = any(len(np.unique(column)) < len(column) for column in inliers.T)

@@ -17,10 +17,11 @@ from numpy.typing import ArrayLike
 from slam_backend._step_input import check_step
 from slam_backend.alignment import Alignment, AlignmentOptions, align_maps
 from slam_backend.attempts import AttemptOptions, AttemptSchedule, PairKey
-from slam_backend.errors import BoolArray, FloatArray, IntArray, bad_argument, check_int
+from slam_backend.errors import BoolArray, FloatArray, IntArray, bad_argument, check_array, check_int
 from slam_backend.exchange import ExchangeLedger
 from slam_backend.filter import FastSlam
 from slam_backend.filter_options import FilterOptions
+from slam_backend.fusion import check_inliers
 from slam_backend.geometry import inverse
 from slam_backend.landmark_map import LandmarkMap
 from slam_backend.measurements import Measurements
@@ -212,16 +213,19 @@ class TeamSlam:
             How landmark ids changed; `robots_a` is the group whose frame stays, the one with the lowest robot.
 
         Raises:
-            ValueError: If the robots share a group already, or the alignment is a refusal.
+            ValueError: If the robots share a group already, or the alignment is a refusal or names rows that do not
+                exist or the same one twice; the team is then as before.
         """
         a, b = self._find(robot_a)[0], self._find(robot_b)[0]
         if a is b:
             raise bad_argument("robot_b", f"a robot outside the group {a.robots}", robot_b, "They share a map already.")
-        if not alignment.success:
-            raise bad_argument("alignment", "a successful one", f"a refusal ({alignment.reason})", "Align first.")
+        if not isinstance(alignment, Alignment) or not alignment.success:
+            got = f"a refusal ({alignment.reason})" if isinstance(alignment, Alignment) else alignment
+            raise bad_argument("alignment", "a successful Alignment", got, "Align the two maps first.")
         if b.robots < a.robots:
             a, b, alignment = b, a, inverse_alignment(alignment)
         ids_a, ids_b = a.filter.map().ids, b.filter.map().ids
+        check_inliers(alignment.inliers, len(ids_a), len(ids_b))
         pairs = np.column_stack([ids_a[alignment.inliers[:, 0]], ids_b[alignment.inliers[:, 1]]])
         joint, renamed = merge_filters(a.filter, b.filter, alignment, pairs, self._rng)
         robots = a.robots + b.robots
@@ -260,12 +264,11 @@ class TeamSlam:
         count = self.num_robots
         if contacts is None:
             return np.ones((count, count), dtype=np.bool_)
-        touch = np.asarray(contacts)
-        if touch.shape != (count, count) or touch.dtype != np.bool_ or not np.array_equal(touch, touch.T):
-            raise bad_argument(
-                "contacts", f"a symmetric ({count}, {count}) array of bools", f"an array {touch.dtype} {touch.shape}",
-                "Say for each pair of robots whether it can exchange data.",
-            )
+        cure = "Say for each pair of robots whether it can exchange data."
+        touch = check_array("contacts", contacts, (count, count), cure, dtype=None, finite=False)
+        if touch.dtype != np.bool_ or not np.array_equal(touch, touch.T):
+            got = f"an array of {touch.dtype}" if touch.dtype != np.bool_ else "a matrix that is not symmetric"
+            raise bad_argument("contacts", "a symmetric array of bools", got, cure)
         return touch
 
     def _descriptor_size(self) -> int:
@@ -274,9 +277,10 @@ class TeamSlam:
 
     def _find(self, robot: int) -> tuple[_Group, int]:
         """Return the robot's group and its place in it."""
-        for group in self._groups:
-            if robot in group.robots and not isinstance(robot, bool):
-                return group, group.robots.index(robot)
+        if isinstance(robot, (int, np.integer)) and not isinstance(robot, bool):
+            for group in self._groups:
+                if robot in group.robots:
+                    return group, group.robots.index(robot)
         raise bad_argument("robot", f"an index from 0 to {self.num_robots - 1}", robot, "Count robots from 0.")
 
     # ------------------------------------------------------------------ snapshots
@@ -288,6 +292,7 @@ class TeamSlam:
             "rng": copy.deepcopy(self._rng.bit_generator.state),
             "events": tuple(self._events),
             "groups": [(group.robots, group.filter.get_state(), group.report) for group in self._groups],
+            "alignment": self._alignment,
             "schedule": self._schedule.get_state(),
             "exchange": self._exchange.get_state(),
         }
@@ -298,8 +303,8 @@ class TeamSlam:
         Raises:
             ValueError: If `state` is not one of `get_state`, or of a team of another size.
         """
-        keys = ("step", "rng", "events", "groups", "schedule", "exchange")
-        missing = [key for key in keys if key not in state]
+        keys = ("step", "rng", "events", "groups", "alignment", "schedule", "exchange")
+        missing = [key for key in keys if not isinstance(state, Mapping) or key not in state]
         if missing:
             raise bad_argument("state", "a dict from TeamSlam.get_state", f"no {missing[0]!r}", "Pass it unchanged.")
         count = sum(len(robots) for robots, _, _ in state["groups"])
@@ -313,5 +318,6 @@ class TeamSlam:
             slam = FastSlam.from_options(len(robots), filter_state["options"])
             slam.set_state(filter_state)
             self._groups.append(_Group(robots, slam, report))
+        self._alignment = state["alignment"]
         self._schedule.set_state(state["schedule"])
         self._exchange.set_state(state["exchange"])
