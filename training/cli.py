@@ -7,6 +7,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from training.replay_command import replay_mrclam
+from training.run import run
 
 app = typer.Typer(
     name="vslam",
@@ -15,6 +16,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
+app.command("run")(run)
 replay = typer.Typer(help="Run the backend on the log of real robots.", no_args_is_help=True)
 replay.command("mrclam")(replay_mrclam)
 app.add_typer(replay, name="replay")
@@ -23,7 +25,7 @@ app.add_typer(replay, name="replay")
 def main() -> None:
     """Run the command line; bad input becomes one line on stderr and exit status 2."""
     try:
-        app()
+        app(prog_name="vslam")
     except ValueError as error:
         # Only errors in the project's own form explain themselves; others are faults and keep their traceback.
         if ": expected " not in str(error):

@@ -32,7 +32,7 @@ def draw_maps(record: EpisodeRecord, path: Path) -> None:
     ratio = (high[1] - low[1]) / (high[0] - low[0])
     small, large = 9.0 / columns * ratio + 0.45, 9.0 * ratio + 0.45
     figure = Figure(figsize=(9.3, rows * small + large + 0.25), layout="constrained", facecolor=_rgb(PAPER))
-    upper, lower = figure.subfigures(2, 1, height_ratios=[rows * small, large])
+    upper, lower = np.ravel(figure.subfigures(2, 1, height_ratios=[rows * small, large]))
     for part in (upper, lower):
         part.set_facecolor(_rgb(PAPER))
     panels = upper.subplots(rows, columns, squeeze=False).ravel()
@@ -114,7 +114,7 @@ def _extent(scene: Scene) -> tuple[FloatArray, FloatArray]:
 def _draw_truth(axes: Axes, scene: Scene, width: float) -> None:
     """Draw walls and true landmarks, and frame the world."""
     axes.add_collection(LineCollection(list(scene.walls.reshape(-1, 2, 2)), colors=[_rgb(WALL)], linewidths=width))
-    axes.scatter(*scene.landmarks[:, :2].T, s=2.2 * width, color=_rgb(TRUE_LANDMARK), linewidths=0)
+    axes.scatter(scene.landmarks[:, 0], scene.landmarks[:, 1], s=2.2 * width, color=_rgb(TRUE_LANDMARK), linewidths=0)
     low, high = _extent(scene)
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xticks=[], yticks=[])
     axes.set_facecolor("white")
