@@ -20,10 +20,10 @@ HIT = 3
 MOST_FREE, MOST_OCCUPIED = -8, 12
 
 WALL_HALF_THICKNESS = 0.12  # [m] half a cell and a little, so that a wall marks at least one cell wherever it lies
-SAME_SURFACE_GAP = 0.4  # [m] no robot fits between two hits this close: they are joined unseen
+SAME_SURFACE_GAP = 0.4  # [m] no robot fits between two hits this near: they are joined unseen
 STRAIGHT_GAP = 0.8  # [m] joined if a third hit lies on their line; doors are 1.1 m and wider
 STRAIGHT_TOLERANCE = 0.1  # [m]
-RAY_HALF_WIDTH = 0.1  # [m] what one ray beside a jump in range tells about the cells along it
+NOTHING, JUMP, SPARSE, SOLID = 0, 1, 2, 3  # what two neighbouring rays see
 
 READINGS_FINE, BAD_RANGES, BAD_ANGLES = 0, 1, 2
 
@@ -56,28 +56,41 @@ def _on_one_line(a: Any, b: Any, c: Any) -> bool:
 
 @jit
 def _surfaces(hits: Any, is_hit: Any) -> tuple[Any, Any]:
-    """Find which neighbouring rays see one surface without a gap to drive through.
+    """Find out what neighbouring rays see.
 
     Returns:
-        For each pair of rays, whether it does, (n - 1,) bool; and of the line through its two hits the unit normal
-        towards the robot and the robot's distance, (n - 1, 3) float64.
+        For each pair of rays, (n - 1,) int8: `SOLID`, one surface without a gap to drive through; `SPARSE`, hits that
+        line up with a third one but leave room for a gap; `JUMP`, a jump in range; `NOTHING`, no hit. And of the line
+        through the two hits the unit normal towards the robot and the robot's distance, (n - 1, 3) float64.
     """
     count = len(is_hit)
-    joined = np.zeros(count - 1, np.bool_)
+    kinds = np.full(count - 1, NOTHING, np.int8)
     lines = np.zeros((count - 1, 3))
     for i in range(count - 1):
         if not (is_hit[i] and is_hit[i + 1]):
+            kinds[i] = JUMP if is_hit[i] or is_hit[i + 1] else NOTHING
             continue
         along_x, along_y = hits[i + 1, 0] - hits[i, 0], hits[i + 1, 1] - hits[i, 1]
-        gap = math.hypot(along_x, along_y)
-        if gap < 1e-6 or gap > STRAIGHT_GAP:
-            continue
+        gap = max(math.hypot(along_x, along_y), 1e-9)
         before = i > 0 and is_hit[i - 1] and _on_one_line(hits[i - 1], hits[i], hits[i + 1])
         after = i + 2 < count and is_hit[i + 2] and _on_one_line(hits[i], hits[i + 1], hits[i + 2])
-        joined[i] = gap <= SAME_SURFACE_GAP or before or after
+        if gap <= SAME_SURFACE_GAP or (gap <= STRAIGHT_GAP and (before or after)):
+            kinds[i] = SOLID
+        else:
+            kinds[i] = SPARSE if before or after else JUMP
         lines[i, 0], lines[i, 1] = -along_y / gap, along_x / gap
         lines[i, 2] = (along_y * hits[i, 0] - along_x * hits[i, 1]) / gap
-    return joined, lines
+    return kinds, lines
+
+
+@jit
+def _on_a_line_beside(kinds: Any, lines: Any, k: int, u: float, v: float) -> bool:
+    """Tell whether a cell between the rays k and k + 1 lies where the surface seen by the next pair would go on."""
+    for other in (max(k - 1, 0), min(k + 1, len(kinds) - 1)):
+        before = lines[other, 0] * u + lines[other, 1] * v + lines[other, 2]
+        if kinds[other] in (SOLID, SPARSE) and abs(before) < WALL_HALF_THICKNESS:
+            return True
+    return False
 
 
 @jit
@@ -94,8 +107,9 @@ def paint_scan(
     """Write one scan, visiting each cell between its rays once.
 
     Two neighbouring rays that see one surface span a triangle: a cell of it is free before the surface, occupied on
-    it, untold behind. Where the range jumps, the cells nearer than both readings are free, and beyond that each ray
-    speaks only for the cells it crosses, and may not free one that is held to be occupied.
+    it, untold behind. Where hits are sparse, as on a wall seen at a grazing angle, what lies between them stays
+    untold. Where the range jumps, the cells nearer than both readings are free, if they are not on a surface that may
+    go on there, and each hit marks its own cell.
 
     Returns:
         `READINGS_FINE`, or what is wrong with the readings, in which case nothing was written.
@@ -111,19 +125,16 @@ def paint_scan(
 
     direction = np.empty((count, 2))
     hits = np.empty((count, 2))
-    reach = np.empty(count)
-    is_hit = np.empty(count, np.bool_)
+    is_hit = ranges < max_range
+    reach = np.minimum(ranges, max_range)
     low_x = high_x = low_y = high_y = 0.0
     for i in range(count):
         direction[i, 0], direction[i, 1] = math.cos(theta + angles[i]), math.sin(theta + angles[i])
-        is_hit[i] = ranges[i] < max_range
-        reach[i] = min(ranges[i], max_range)
         hits[i, 0], hits[i, 1] = reach[i] * direction[i, 0], reach[i] * direction[i, 1]
         low_x, high_x = min(low_x, hits[i, 0]), max(high_x, hits[i, 0])
         low_y, high_y = min(low_y, hits[i, 1]), max(high_y, hits[i, 1])
-    joined, lines = _surfaces(hits, is_hit)
-    jump = is_hit[:-1] | is_hit[1:]
-    free_below = np.maximum(np.minimum(reach[:-1], reach[1:]) - WALL_HALF_THICKNESS * jump, 0.0)
+    kinds, lines = _surfaces(hits, is_hit)
+    free_below = np.maximum(np.minimum(reach[:-1], reach[1:]) - WALL_HALF_THICKNESS * (kinds == JUMP), 0.0)
 
     first_row, last_row = _cell_range(y + low_y - CELL, y + high_y + CELL)
     first_col, last_col = _cell_range(x + low_x - CELL, x + high_x + CELL)
@@ -141,25 +152,21 @@ def paint_scan(
                 k -= 1
             while k < count - 2 and direction[k + 1, 0] * v >= direction[k + 1, 1] * u:
                 k += 1
-            if joined[k]:
+            if kinds[k] in (SOLID, SPARSE):
                 before = lines[k, 0] * u + lines[k, 1] * v + lines[k, 2]
                 if before > WALL_HALF_THICKNESS:
                     _add(evidence, cells, row, col, -1)
-                elif before > -WALL_HALF_THICKNESS:
+                elif before > -WALL_HALF_THICKNESS and kinds[k] == SOLID:
                     _add(evidence, cells, row, col, HIT)
             elif u * u + v * v < free_below[k] ** 2:
-                _add(evidence, cells, row, col, -1)
-            elif jump[k]:
-                aside = abs(direction[k, 0] * v - direction[k, 1] * u)
-                aside_next = abs(direction[k + 1, 0] * v - direction[k + 1, 1] * u)
-                ray = k if aside <= aside_next else k + 1
-                past = math.sqrt(u * u + v * v) - reach[ray]
-                if min(aside, aside_next) > RAY_HALF_WIDTH:
-                    continue
-                if past < -WALL_HALF_THICKNESS and evidence[row, col] <= 0:
+                if kinds[k] == NOTHING or not _on_a_line_beside(kinds, lines, k, u, v):
                     _add(evidence, cells, row, col, -1)
-                elif is_hit[ray] and abs(past) < WALL_HALF_THICKNESS:
-                    _add(evidence, cells, row, col, HIT)
+            else:
+                for ray in range(k, k + 2):
+                    off_x, off_y = abs(u - hits[ray, 0]), abs(v - hits[ray, 1])
+                    if is_hit[ray] and max(off_x, off_y) <= 0.5 * CELL:
+                        _add(evidence, cells, row, col, HIT)
+                        break
     return READINGS_FINE
 
 

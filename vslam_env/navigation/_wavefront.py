@@ -138,9 +138,10 @@ def nearest_open(box: Any, weights: Any, row: int, col: int, reach: int) -> tupl
 def wavefront(weights: Any, row: int, col: int) -> tuple[Any, Any]:
     """Find the cheapest ways from one cell to all others (Dijkstra's algorithm with Dial's buckets).
 
-    A step costs its length times the sum of the weights of its two cells; a diagonal step needs both cells that it
-    passes between to be open, so no corner is cut. Costs are small integers, so that the queue is a ring of buckets,
-    each a linked list. A cell whose cost falls is listed again; its older entries are passed over.
+    A step to one of the eight neighbours costs its length times the sum of the weights of its two cells. Diagonal
+    steps need no look at the cells beside them, since walls have been widened by more than a cell. Costs are small
+    integers, so that the queue is a ring of buckets, each a linked list. A cell whose cost falls is listed again; its
+    older entries are passed over.
 
     Args:
         weights: (h, w) uint8, 0 = closed. The outermost cells must be closed.
@@ -162,10 +163,7 @@ def wavefront(weights: Any, row: int, col: int) -> tuple[Any, Any]:
     following = np.empty(8 * weight.size + 1, np.int32)
     heads = np.full(NUM_BUCKETS, -1, np.int32)
 
-    # the eight neighbours: four straight, then four diagonal ones, and the cells that these pass between
-    offsets = np.array([1, width, -1, -width, 1 + width, width - 1, -1 - width, 1 - width])
-    one_side = np.array([0, 0, 0, 0, 1, width, -1, -width])
-    other_side = np.array([0, 0, 0, 0, width, -1, -width, 1])
+    offsets = np.array([1, width, -1, -width, 1 + width, width - 1, -1 - width, 1 - width])  # four straight ones first
 
     used, waiting, current = 0, 0, 0
     if row >= 0:
@@ -185,8 +183,6 @@ def wavefront(weights: Any, row: int, col: int) -> tuple[Any, Any]:
                 step = STRAIGHT if k < 4 else DIAGONAL
                 through = current + step * (np.int64(weight[cell]) + weight[neighbour])
                 if through >= cost[neighbour]:
-                    continue
-                if k >= 4 and (weight[cell + one_side[k]] == 0 or weight[cell + other_side[k]] == 0):
                     continue
                 cost[neighbour], parent[neighbour] = through, cell
                 target = through & (NUM_BUCKETS - 1)

@@ -35,6 +35,8 @@ from vslam_env.navigation.seen_grid import centre_of
 ESCAPE_CELLS = 5  # a robot that drift or a bump put into a wall's margin looks this far for open floor
 GOAL_CELLS = 2  # a goal in a wall's margin is served by open floor this near
 
+MIN_RADIUS = 0.11  # [m] for a smaller one walls would not be widened enough to keep diagonal steps from crossing them
+
 LOOKAHEAD = 0.4  # [m]
 TURN_GAIN = 3.0  # [1/s]; times the tick of 0.1 s it is well below 1, so the heading settles without swinging
 TURN_ONLY = 0.7  # [rad] with a larger heading error the robot turns in place
@@ -80,7 +82,7 @@ def distance_map(cells: NDArray[np.uint8], start_xy: ArrayLike, radius: float = 
         cells: (300, 300) uint8. `SeenGrid.cells`.
         start_xy: (2,) float64 [m], start frame. If a robot may not be there, the nearest open cell within 1 m that no
             wall separates stands in.
-        radius: Of the robot [m].
+        radius: Of the robot [m], at least 0.11.
 
     Returns:
         The map; all of it is unreached if there is no open cell near the start.
@@ -90,7 +92,7 @@ def distance_map(cells: NDArray[np.uint8], start_xy: ArrayLike, radius: float = 
     """
     check_cells(cells)
     start = point_floats(start_xy, "start_xy")
-    radius = check_float("radius", radius, "Give the robot's radius in metres.", above=0.0, at_most=1.0)
+    radius = check_float("radius", radius, "Give the robot's radius in metres.", at_least=MIN_RADIUS, at_most=1.0)
 
     column, row, width, height = cv2.boundingRect(cells)
     box = known_box(cells, row, column, height, width)
