@@ -196,7 +196,7 @@ def _refine(
     given: bool, camera: FloatArray, robust: float, xi: FloatArray, pose: FloatArray, spread: FloatArray,
     information: FloatArray, gradient: FloatArray,
 ) -> float:
-    """Gauss-Newton, twice, on |xi|^2 + sum r^T S^-1 r; leave xi, pose and spread = L^-1 at the mode.
+    """Gauss-Newton, twice from the given xi, on |xi|^2 + sum r^T S^-1 r; leave xi, pose, spread = L^-1 at the mode.
 
     `information` (6) and `gradient` (3) are working space.
 

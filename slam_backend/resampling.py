@@ -47,12 +47,12 @@ def residual(weights: FloatArray, rng: np.random.Generator, count: int | None = 
     """Keep floor(count w) copies of each, and draw the rest from what remains."""
     count = len(weights) if count is None else count
     scaled = count * weights / weights.sum()
-    copies = np.floor(scaled).astype(np.int64)
+    copies = np.floor(scaled + 1e-9).astype(np.int64)  # a weight of 1/M earns its copy in spite of rounding
     kept = np.repeat(np.arange(len(weights)), copies)
     missing = count - len(kept)
     if missing == 0:
         return kept.astype(np.int64)
-    return np.concatenate([kept, multinomial(scaled - copies, rng, missing)]).astype(np.int64)
+    return np.concatenate([kept, multinomial(np.maximum(scaled - copies, 0.0), rng, missing)]).astype(np.int64)
 
 
 RESAMPLING: dict[str, Callable[..., IntArray]] = {
