@@ -11,6 +11,7 @@ from vslam_env.navigation._wavefront import UNREACHED
 
 MIN_CELLS = 3  # a robot needs 0.4 m; what is smaller is a speck or the corner of a wall
 MAX_CELLS = 20  # longer frontiers are cut, as one goal cannot stand for them
+GOAL_STEPS = 5  # a goal is at most this far from its frontier [cells]
 SIGHT_CELLS = 3  # the unknown this near to a goal tells where to look from it
 
 XY, HEADING, SIZE, LENGTH, NUM_COLUMNS = slice(0, 2), 2, 3, 4, 5  # columns of the rows that describe frontiers
@@ -38,23 +39,39 @@ def _flood(mark: Any, level: int, into: int, row: int, col: int, limit: int, que
 
 
 @jit
-def _goal_beside(members: Any, cost: Any) -> tuple[int, int]:
-    """Return the reached cell beside a frontier that is nearest to the middle of all such cells; (-1, -1) if none."""
-    total, sum_row, sum_col = 0, 0.0, 0.0
-    for k in range(len(members)):
-        for nr in range(members[k, 0] - 1, members[k, 0] + 2):
-            for nc in range(members[k, 1] - 1, members[k, 1] + 2):
-                if cost[nr, nc] != UNREACHED:
-                    total, sum_row, sum_col = total + 1, sum_row + nr, sum_col + nc
-    best, goal_row, goal_col = np.inf, -1, -1
-    for k in range(len(members)):
-        for nr in range(members[k, 0] - 1, members[k, 0] + 2):
-            for nc in range(members[k, 1] - 1, members[k, 1] + 2):
-                if cost[nr, nc] != UNREACHED:
-                    distance = (nr - sum_row / total) ** 2 + (nc - sum_col / total) ** 2
-                    if distance < best:
-                        best, goal_row, goal_col = distance, nr, nc
-    return goal_row, goal_col
+def _goal_near(members: Any, box: Any, cost: Any, visited: Any, stamp: int) -> tuple[int, int]:
+    """Return a reached cell as few steps as possible from a frontier and near its middle; (-1, -1) if none is near.
+
+    Steps go sideways and not through walls. Most often one is enough; where a wall that is drawn too thick closes a
+    door, the robot has to come near and look again.
+    """
+    ring = members.copy()
+    for k in range(len(ring)):
+        visited[ring[k, 0], ring[k, 1]] = stamp
+    for _ in range(GOAL_STEPS):
+        following = np.empty((4 * len(ring), 2), np.int64)
+        num, total, sum_row, sum_col = 0, 0, 0.0, 0.0
+        for k in range(len(ring)):
+            for i, j in ((0, 1), (1, 0), (0, -1), (-1, 0)):
+                r, c = ring[k, 0] + i, ring[k, 1] + j
+                if not (0 <= r < box.shape[0] and 0 <= c < box.shape[1]) or visited[r, c] == stamp:
+                    continue
+                visited[r, c] = stamp
+                if box[r, c] in (FREE, UNKNOWN):
+                    following[num, 0], following[num, 1] = r, c
+                    num += 1
+                    if cost[r, c] != UNREACHED:
+                        total, sum_row, sum_col = total + 1, sum_row + r, sum_col + c
+        ring = following[:num]
+        if total > 0:
+            best, goal_row, goal_col = np.inf, -1, -1
+            for k in range(num):
+                r, c = ring[k]
+                distance = (r - sum_row / total) ** 2 + (c - sum_col / total) ** 2
+                if cost[r, c] != UNREACHED and distance < best:
+                    best, goal_row, goal_col = distance, r, c
+            return goal_row, goal_col
+    return -1, -1
 
 
 @jit
@@ -100,6 +117,8 @@ def frontier_rows(box: Any, cost: Any, parent: Any, ignored: Any, row: int, col:
     count = 0
     whole = np.empty((height * width, 2), np.int64)
     piece = np.empty((MAX_CELLS, 2), np.int64)
+    visited = np.zeros((height, width), np.int32)
+    num_tried = 0
     for r in range(1, height - 1):
         for c in range(1, width - 1):
             if mark[r, c] != 1:
@@ -111,8 +130,11 @@ def frontier_rows(box: Any, cost: Any, parent: Any, ignored: Any, row: int, col:
                 if mark[whole[k, 0], whole[k, 1]] != 2:
                     continue
                 num = _flood(mark, 2, 3, whole[k, 0], whole[k, 1], share, piece)
-                goal_row, goal_col = _goal_beside(piece[:num], cost)
-                if num < MIN_CELLS or goal_row < 0:
+                if num < MIN_CELLS:
+                    continue
+                num_tried += 1
+                goal_row, goal_col = _goal_near(piece[:num], box, cost, visited, num_tried)
+                if goal_row < 0:
                     continue
                 found[count, 0] = (col + goal_col + 0.5) * CELL - HALF_WIDTH
                 found[count, 1] = (row + goal_row + 0.5) * CELL - HALF_WIDTH

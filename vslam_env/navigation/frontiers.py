@@ -32,7 +32,7 @@ class Frontiers:
     """Places to explore, by increasing path length.
 
     Attributes:
-        goals: (n, 2) float64 [m], start frame. Open floor beside the middle of each frontier.
+        goals: (n, 2) float64 [m], start frame. Open floor next to the middle of each frontier.
         headings: (n,) float64 [rad], start frame. Where the unknown lies, seen from the goal.
         sizes: (n,) float64 [m]. Length of each frontier.
         lengths: (n,) float64 [m]. Of the path from the robot to the goal.
@@ -56,8 +56,8 @@ def find_frontiers(
 ) -> Frontiers:
     """Find where floor that a robot can reach borders on what has not been seen.
 
-    A frontier is a connected set of unknown cells beside free ones, of at least 0.6 m, and with an open cell beside
-    it to which a way is known. Those above 4 m are cut into pieces of equal size.
+    A frontier is a connected set of unknown cells beside free ones, of at least 0.6 m, and with an open cell within
+    1 m of it to which a way is known. Those above 4 m are cut into pieces of equal size.
 
     Args:
         cells: (300, 300) uint8. `SeenGrid.cells`.

@@ -1,0 +1,251 @@
+import numpy as np
+import pytest
+from navigation_rooms import ANGLES, building, clearance, drive, in_start_frame, scan
+
+from slam_backend.errors import FloatArray
+from slam_backend.geometry import inverse, transform_points
+from vslam_env.navigation import (
+    CELL,
+    FREE,
+    GRID_SIZE,
+    OCCUPIED,
+    UNKNOWN,
+    CandidateSlots,
+    SeenGrid,
+    cell_of,
+    find_frontiers,
+    follow_path,
+    plan_path,
+)
+
+
+def room(doors: tuple[float, ...] = (), width: float = 1.2) -> np.ndarray:
+    """Return cells of a room, x from -6 to 6, y from -2 to 3, walled but for doors at the given x of its upper wall."""
+    cells = np.full((GRID_SIZE, GRID_SIZE), UNKNOWN, np.uint8)
+    (r1, c1), (r2, c2) = cell_of((-5.9, -1.9)), cell_of((5.9, 2.9))
+    cells[r1 - 1 : r2 + 2, c1 - 1 : c2 + 2] = OCCUPIED
+    cells[r1 : r2 + 1, c1 : c2 + 1] = FREE
+    for x in doors:
+        first = cell_of((x - width / 2 + 0.1, 3.1))[1]
+        cells[r2 + 1, first : first + round(width / CELL)] = FREE
+    return cells
+
+
+def test_a_door_is_the_frontier_of_a_closed_room() -> None:
+    """The goal lies in the door or just before it, and looks outwards; its length is that of the way."""
+    found = find_frontiers(room((2.0,)), (-3.1, -0.9))
+    assert len(found.goals) == 1
+    assert np.abs(found.goals[0] - [2.0, 3.0]).max() < 0.3
+    assert found.headings[0] == pytest.approx(np.pi / 2, abs=0.3)
+    assert found.sizes[0] == pytest.approx(1.2, abs=0.45)
+    assert found.lengths[0] == pytest.approx(np.hypot(5.1, 3.9), rel=0.1)
+
+
+def test_a_closed_room_and_an_empty_grid_have_no_frontier() -> None:
+    """Where nothing unknown can be reached, there is nothing to explore."""
+    assert len(find_frontiers(room(), (0.0, 0.0)).goals) == 0
+    assert len(find_frontiers(np.zeros((GRID_SIZE, GRID_SIZE), np.uint8), (0.0, 0.0)).goals) == 0
+    assert len(find_frontiers(np.full((GRID_SIZE, GRID_SIZE), FREE, np.uint8), (3.0, 0.0)).goals) == 0
+
+
+def test_frontiers_come_nearest_first() -> None:
+    """Of several doors, the one with the shortest way comes first."""
+    found = find_frontiers(room((-4.0, 0.2, 4.4)), (3.1, -0.9))
+    assert np.abs(found.goals[:, 0] - [4.4, 0.2, -4.0]).max() < 0.3
+    assert (np.diff(found.lengths) > 0.5).all()
+
+
+def test_long_frontiers_are_cut() -> None:
+    """An opening of 11 m gives three frontiers of nearly equal size, with goals far apart."""
+    found = find_frontiers(room((0.0,), width=11.0), (0.1, 0.1))
+    assert len(found.goals) == 3
+    assert found.sizes.max() <= 4.0
+    assert found.sizes.sum() == pytest.approx(11.0, abs=0.5)
+    assert np.diff(np.sort(found.goals[:, 0])).min() > 3.0
+
+
+def test_specks_and_what_is_out_of_reach_are_no_frontiers() -> None:
+    """Two unseen cells in the floor are ignored, three are not; and so is floor behind a wall."""
+    cells = room()
+    row, col = cell_of((1.1, 0.1))
+    cells[row, col : col + 2] = UNKNOWN
+    far_row, far_col = cell_of((10.0, 10.0))
+    cells[far_row : far_row + 9, far_col : far_col + 9] = FREE
+    assert len(find_frontiers(cells, (-3.0, 0.0)).goals) == 0
+    cells[row, col + 2] = UNKNOWN
+    assert len(find_frontiers(cells, (-3.0, 0.0)).goals) == 1
+    ignored = np.zeros(cells.shape, bool)
+    ignored[row, col] = True
+    assert len(find_frontiers(cells, (-3.0, 0.0), ignored=ignored).goals) == 0
+
+
+def test_a_gap_too_narrow_for_the_robot_is_no_frontier() -> None:
+    """A hole of 0.4 m in a wall cannot be driven through, so its other side is not to be explored."""
+    assert len(find_frontiers(room((1.0,), width=0.4), (0.0, 0.0)).goals) == 0
+
+
+def test_a_candidate_keeps_its_slot_while_it_lives() -> None:
+    """When one of three candidates dies, the others stay in their slots, and the next new one takes the free one."""
+    slots = CandidateSlots()
+    slots.update(room((-4.0, 0.2, 4.4)), (3.1, -0.9, 0.0))
+    assert slots.valid.tolist() == [True] * 3 + [False] * 13
+    assert slots.goals[:3, 0] == pytest.approx([4.4, 0.2, -4.0], abs=0.3)
+    slots.update(room((-4.0, 4.4)), (-3.0, 0.2, 0.0))
+    assert slots.valid.tolist() == [True, False, True] + [False] * 13
+    assert slots.goals[[0, 2], 0] == pytest.approx([4.4, -4.0], abs=0.3)
+    assert np.isnan(slots.goals[1]).all()
+    slots.update(room((-4.3, -1.9, 1.1, 4.4)), (-3.0, 0.2, 0.0))
+    assert slots.goals[:4, 0] == pytest.approx([4.4, -1.9, -4.3, 1.1], abs=0.3)
+    slots.update(room(), (-3.0, 0.2, 0.0))
+    assert not slots.valid.any()
+
+
+def test_sixteen_slots_take_the_nearest_of_more_candidates() -> None:
+    """With more frontiers than slots, the sixteen nearest ones are offered."""
+    cells = room()
+    for x in np.arange(-5.0, 5.1, 0.9):
+        for y in (-1.1, 0.3, 1.7):
+            row, col = cell_of((x, y))
+            cells[row : row + 2, col : col + 2] = UNKNOWN
+    found = find_frontiers(cells, (-3.0, 1.0))
+    assert len(found.goals) > 20
+    slots = CandidateSlots()
+    slots.update(cells, (-3.0, 1.0, 0.0))
+    assert slots.valid.all()
+    assert (slots.goals == found.goals[:16]).all()
+
+
+def test_features_are_seen_from_the_robot() -> None:
+    """Goals are given in the robot frame, with path length, size and the nearest teammate's distance; else zeros."""
+    slots = CandidateSlots()
+    pose = np.array([3.1, -0.9, 0.7])
+    slots.update(room((-4.0, 4.4)), pose)
+    teammates = np.array([[4.4, 0.5], [-4.0, -1.0], [0.0, 9.0]])
+    features = slots.features(pose, teammates)
+    assert features.dtype == np.float32
+    assert features.shape == (16, 5)
+    back = transform_points(pose, features[:2, :2].astype(float))
+    assert back == pytest.approx(slots.goals[:2], abs=1e-5)
+    assert features[:2, 2] == pytest.approx(slots.lengths[:2])
+    assert features[:2, 3] == pytest.approx(slots.sizes[:2])
+    distances = np.linalg.norm(slots.goals[:2, None] - teammates, axis=-1).min(axis=1)
+    assert features[:2, 4] == pytest.approx(distances)
+    assert (features[2:] == 0).all()
+    assert (slots.features(pose)[:2, 4] == 60.0).all()
+
+
+def test_what_cannot_be_seen_is_given_up_after_looking_at_it() -> None:
+    """A frontier that stays when the robot looks at it from its goal dies after four updates, and does not return."""
+    cells = room((-4.0, 4.4))
+    slots = CandidateSlots()
+    slots.update(cells, (0.0, 0.0, 0.0))
+    pose = np.array([*slots.goals[0], slots.headings[0]])
+    for _ in range(3):
+        slots.update(cells, pose)
+        assert slots.valid[:2].all()
+    for _ in range(9):
+        slots.update(cells, pose)
+        assert slots.valid.tolist() == [False, True] + [False] * 14
+    assert slots.goals[1, 0] == pytest.approx(4.4, abs=0.3)
+
+
+def test_visits_without_a_look_take_longer() -> None:
+    """With its back to a frontier, or with a teammate there, a robot waits sixteen updates before it gives up."""
+    cells = room((-4.0, 4.4))
+    slots = CandidateSlots()
+    slots.update(cells, (0.0, 0.0, 0.0))
+    pose = np.array([*slots.goals[0], slots.headings[0] + np.pi])
+    teammates = slots.goals[1:2]
+    for _ in range(15):
+        slots.update(cells, pose, teammates)
+        assert slots.valid.sum() == 2
+    slots.update(cells, pose, teammates)
+    assert not slots.valid.any()
+
+
+def test_a_robot_that_passes_by_gives_nothing_up() -> None:
+    """Updates away from the goals do not count as visits."""
+    cells = room((-4.0, 4.4))
+    slots = CandidateSlots()
+    for k in range(40):
+        slots.update(cells, (3.0 * np.sin(k), -0.5, float(k)))
+    assert slots.valid.sum() == 2
+
+
+def test_restored_slots_go_on_bit_by_bit() -> None:
+    """After set_state, the same updates lead to the same candidates, visits included."""
+    cells = room((-4.0, 4.4))
+    slots, again = CandidateSlots(), CandidateSlots()
+    slots.update(cells, (0.0, 0.0, 0.0))
+    pose = np.array([*slots.goals[0], slots.headings[0]])
+    for _ in range(3):
+        slots.update(cells, pose)
+    again.set_state(slots.get_state())
+    for each in (slots, again):
+        each.update(cells, pose)
+    assert slots.valid.sum() == 1
+    for name, value in slots.get_state().items():
+        assert np.array_equal(value, again.get_state()[name], equal_nan=True)
+
+
+CELLS = room((1.0,))
+BAD_CALLS = [
+    (lambda: CandidateSlots().update(CELLS, (0, 0)), r"pose: expected an array of shape \(3,\)"),
+    (lambda: CandidateSlots().update(CELLS, (0, 0, np.nan)), "pose: expected finite numbers"),
+    (lambda: CandidateSlots().update(CELLS[1:], (0, 0, 0)), "cells: expected an array"),
+    (lambda: CandidateSlots().update(CELLS, (0, 0, 0), [1.0, 2.0]), r"teammates: expected finite .* shape \(k, 2\)"),
+    (lambda: CandidateSlots().features((0, 0, 0), [[np.nan, 2.0]]), "teammates: expected finite numbers"),
+    (lambda: find_frontiers(CELLS, (0, np.inf)), "start_xy: expected finite numbers"),
+    (lambda: find_frontiers(CELLS, (0, 0), ignored=np.zeros(3, bool)), "ignored: expected an array of shape"),
+]
+
+
+@pytest.mark.parametrize(("call", "message"), BAD_CALLS)
+def test_bad_input_is_refused(call, message) -> None:
+    """Each wrong argument raises one error that names it."""
+    with pytest.raises(ValueError, match=message):
+        call()
+
+
+def explore(seed: int, start: FloatArray, max_ticks: int = 2000) -> tuple[SeenGrid, CandidateSlots, FloatArray]:
+    """Drive an ideal robot to the nearest candidate until none is left; return grid, slots and true path (n, 3)."""
+    rng = np.random.default_rng(seed)
+    walls = building()
+    grid, slots = SeenGrid(), CandidateSlots()
+    pose, path, heading = start, None, 0.0
+    track = [pose]
+    for tick in range(max_ticks):
+        est_pose = in_start_frame(start, pose)
+        grid.paint_scan(est_pose, scan(walls, pose, rng), ANGLES)
+        grid.clear_disc(est_pose)
+        if tick % 10 == 0:
+            slots.update(grid.cells, est_pose)
+            if not slots.valid.any():
+                break
+            nearest = int(np.nanargmin(slots.lengths))
+            path, heading = plan_path(grid.cells, est_pose[:2], slots.goals[nearest]), float(slots.headings[nearest])
+            assert path is not None
+        v, omega = follow_path(est_pose, path, final_heading=heading)
+        pose = drive(pose, v, omega)
+        track.append(pose)
+    return grid, slots, np.array(track)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("seed", "start"), [(0, (2.0, 2.0, 0.3)), (1, (8.0, 5.5, -2.0)), (2, (16.2, 0.7, 1.0)), (3, (7.3, 9.9, 2.5))]
+)
+def test_the_nearest_frontier_explores_a_building_and_ends(seed: int, start: tuple[float, float, float]) -> None:
+    """With 1 % noise, at least 98 % of the reachable floor is seen free in 150 s, then no candidate is left.
+
+    On the way the robot keeps its radius from all walls. The seeds are fixed.
+    """
+    walls, start_pose = building(), np.array(start)
+    grid, slots, track = explore(seed, start_pose)
+    assert not slots.valid.any()
+    assert len(track) <= 1500
+    assert clearance(walls, track[:, :2]).min() > 0.2
+    points = np.stack(np.meshgrid(np.arange(0.05, 17, 0.1), np.arange(0.05, 11, 0.1)), axis=-1).reshape(-1, 2)
+    reachable = points[clearance(walls, points) > 0.2]
+    rows, cols = cell_of(transform_points(inverse(start_pose), reachable)).T
+    assert (grid.cells[rows, cols] == FREE).mean() > 0.98
