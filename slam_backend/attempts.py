@@ -68,6 +68,8 @@ class AttemptSchedule:
         most = 0
         self._proposed = {}
         for pair, (map_a, map_b) in maps.items():
+            if not len(map_a) or not len(map_b):
+                continue  # before its first landmark a map does not know how long descriptors are
             rows = candidate_matches(map_a, map_b, self._alignment)
             if len(rows) < self._alignment.min_inliers:
                 continue
