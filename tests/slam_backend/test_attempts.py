@@ -1,0 +1,171 @@
+import numpy as np
+import pytest
+from mapped_once import looks
+from simulated_team import SimulatedTeam
+
+from slam_backend.alignment import AlignmentOptions
+from slam_backend.attempts import AttemptOptions, AttemptSchedule, PairKey
+from slam_backend.landmark_map import LandmarkMap
+from slam_backend.team import TeamSlam
+
+FIRST: PairKey = ((0,), (1, 3))
+SECOND: PairKey = ((0,), (2,))
+
+
+def map_of(names: list[int]) -> LandmarkMap:
+    """A map of landmarks with unlike looks; the name is the id."""
+    rows = np.array(names)
+    means = np.column_stack([2.0 * rows, np.zeros(len(rows)), np.zeros(len(rows))])
+    return LandmarkMap(means, np.tile(0.01 * np.eye(3), (len(rows), 1, 1)), looks(rows), ids=rows)
+
+
+def schedule(every: int = 25, new_candidates: int = 3, longest_wait: int = 200) -> AttemptSchedule:
+    """A schedule whose alignments need four candidates."""
+    options = AttemptOptions(every=every, new_candidates=new_candidates, longest_wait=longest_wait)
+    return AttemptSchedule(options, AlignmentOptions(min_inliers=4))
+
+
+def pair_of(names: list[int]) -> tuple[LandmarkMap, LandmarkMap]:
+    """Two maps that have just these landmarks in common."""
+    return map_of([*names, 12]), map_of([11, *names])
+
+
+def test_one_step_in_so_many_is_due() -> None:
+    """With every = 25, the last step of each 25 is due, and no other."""
+    assert [step for step in range(100) if schedule().is_due(step)] == [24, 49, 74, 99]
+
+
+def test_a_refused_pair_waits_twice_as_long_each_time() -> None:
+    """Waits after refusals are 25, 50, 100, 200 and then 200 steps; other pairs do not wait."""
+    plan, step, waits = schedule(), 24, []
+    for _ in range(6):
+        plan.record(FIRST, step, success=False)
+        wait = next(ahead for ahead in range(1, 999) if plan.may_try(FIRST, step + ahead))
+        waits.append(wait)
+        assert plan.may_try(SECOND, step + 1)
+        step += wait
+    assert waits == [25, 50, 100, 200, 200, 200]
+
+
+def test_a_refused_pair_needs_new_candidates() -> None:
+    """The same candidates are not tried again, nor with two new ones; with three new ones they are."""
+    plan = schedule()
+    names = [0, 1, 2, 3, 4]
+    assert plan.choose({FIRST: pair_of(names)}) == FIRST
+    plan.record(FIRST, 24, success=False)
+    assert plan.choose({FIRST: pair_of(names)}) is None
+    assert plan.choose({FIRST: pair_of([*names, 5, 6])}) is None
+    assert plan.choose({FIRST: pair_of([*names, 5, 6, 7])}) == FIRST
+
+
+def test_too_few_candidates_are_no_attempt() -> None:
+    """A pair with fewer candidates than an alignment needs does not try."""
+    assert schedule().choose({FIRST: pair_of([0, 1, 2])}) is None
+    assert schedule().choose({FIRST: pair_of([0, 1, 2, 3])}) == FIRST
+    assert schedule().choose({}) is None
+
+
+def test_the_pair_with_the_most_new_candidates_tries() -> None:
+    """Most new candidate matches win; of equals, the first."""
+    few, many = pair_of([0, 1, 2, 3]), pair_of([0, 1, 2, 3, 4])
+    assert schedule().choose({FIRST: few, SECOND: many}) == SECOND
+    assert schedule().choose({FIRST: many, SECOND: few}) == FIRST
+    assert schedule().choose({FIRST: few, SECOND: few}) == FIRST
+    plan = schedule()
+    plan.choose({SECOND: many})
+    plan.record(SECOND, 24, success=False)
+    assert plan.choose({FIRST: few, SECOND: many}) == FIRST
+
+
+def test_a_merge_forgets_the_attempts_of_the_groups_that_are_gone() -> None:
+    """After a success, no record names a robot of the merged groups; others keep waiting."""
+    plan = schedule()
+    other: PairKey = ((4,), (5,))
+    for pair in (FIRST, SECOND, other):
+        plan.record(pair, 24, success=False)
+    plan.record(FIRST, 49, success=True)
+    assert plan.may_try(FIRST, 25)
+    assert plan.may_try(SECOND, 25)
+    assert not plan.may_try(other, 25)
+
+
+def test_a_schedule_goes_on_from_its_state() -> None:
+    """A restored schedule has the same waits, memory and options, and shares nothing with the first."""
+    plan, twin = schedule(every=10), schedule()
+    plan.choose({FIRST: pair_of([0, 1, 2, 3])})
+    plan.record(FIRST, 9, success=False)
+    twin.set_state(plan.get_state())
+    plan.record(FIRST, 19, success=False)
+    assert twin.may_try(FIRST, 19)
+    assert not twin.may_try(FIRST, 18)
+    assert twin.is_due(9)
+    assert twin.choose({FIRST: pair_of([0, 1, 2, 3])}) is None
+
+
+# ---------------------------------------------------------------------- in a team
+
+
+@pytest.mark.parametrize("every", [25, 10])
+def test_a_team_tries_at_most_one_pair_in_so_many_steps(every: int) -> None:
+    """At most one attempt falls into each stretch of `every` steps, and its merge follows in the same step."""
+    simulation = SimulatedTeam(seed=1)
+    team = simulation.build(attempts=AttemptOptions(every=every))
+    simulation.run(team, 130)
+    attempts = [event.step for event in team.events if event.kind == "attempt"]
+    assert attempts
+    assert len({step // every for step in attempts}) == len(attempts)
+    for attempt, following in zip(team.events, [*team.events[1:], None], strict=True):
+        if attempt.kind == "attempt" and attempt.alignment.success:
+            assert following is not None
+            assert (following.kind, following.step) == ("merge", attempt.step)
+
+
+def test_refused_attempts_of_a_team_wait_and_need_new_candidates() -> None:
+    """Between attempts of one pair that cannot succeed lie at least 5, 10, 20, 40 ... steps."""
+    simulation = SimulatedTeam(num_robots=2, seed=6, separate=True, aliased=True)
+    team = simulation.build(attempts=AttemptOptions(every=5))
+    simulation.run(team, 150)
+    steps = [event.step for event in team.events]
+    assert len(steps) >= 3
+    for gap, wait in zip(np.diff(steps), [5, 10, 20, 40, 80], strict=False):
+        assert gap >= wait
+
+
+def test_without_contact_nobody_tries() -> None:
+    """Groups none of whose robots are in contact do not try, however much their maps share."""
+    simulation = SimulatedTeam(seed=1)
+    team = simulation.build()
+    simulation.run(team, 110, np.eye(3, dtype=bool))
+    assert team.events == ()
+    assert team.groups == ((0,), (1,), (2,))
+
+
+def test_one_contact_between_two_groups_is_enough() -> None:
+    """Only the pairs in contact try; a member in contact brings its whole group along."""
+    simulation = SimulatedTeam(seed=1)
+    team = simulation.build()
+    contacts = np.eye(3, dtype=bool)
+    contacts[1, 2] = contacts[2, 1] = True
+    simulation.run(team, 110, contacts)
+    assert team.groups == ((0,), (1, 2))
+    assert {(event.robots_a, event.robots_b) for event in team.events} == {((1,), (2,))}
+    contacts = np.eye(3, dtype=bool)
+    contacts[0, 2] = contacts[2, 0] = True
+    simulation.run(team, 40, contacts)
+    assert team.groups == ((0, 1, 2),)
+
+
+@pytest.mark.parametrize("name", ["every", "new_candidates", "longest_wait"])
+@pytest.mark.parametrize("value", [0, -1, 2.5, True, None])
+def test_attempt_options_are_whole_numbers_of_at_least_one(name: str, value: object) -> None:
+    """Each option names itself when it is refused."""
+    with pytest.raises(ValueError, match=rf"attempts\.{name}: expected an int >= 1, got .*Give a number of at least 1"):
+        AttemptOptions(**{name: value})  # type: ignore[arg-type]
+
+
+def test_a_lone_robot_never_tries() -> None:
+    """A team of one has no events."""
+    simulation = SimulatedTeam(num_robots=1, seed=1)
+    team: TeamSlam = simulation.build()
+    simulation.run(team, 55)
+    assert team.events == ()

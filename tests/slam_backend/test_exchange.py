@@ -1,0 +1,86 @@
+import numpy as np
+import pytest
+from mapped_once import looks
+from simulated_team import SIZE, SimulatedTeam
+
+from slam_backend.exchange import LANDMARK_BYTES, POSE_BYTES, ExchangeLedger
+from slam_backend.landmark_map import LandmarkMap
+from slam_backend.reports import StepReport
+
+LOOK = 4 * 13  # bytes of a descriptor of `looks`
+
+
+def map_of(counts: dict[int, int]) -> LandmarkMap:
+    """A map of landmarks with given ids and counts."""
+    ids = np.array(list(counts))
+    n = len(ids)
+    return LandmarkMap(np.zeros((n, 3)), np.tile(np.eye(3), (n, 1, 1)), looks(ids), list(counts.values()), ids)
+
+
+def report_of(associations: list[list[int]], created: list[list[int]]) -> StepReport:
+    """A report of a joint step."""
+    rows = [tuple(np.array(row, dtype=np.int64) for row in rows) for rows in (associations, created)]
+    return StepReport(rows[0], rows[1], num_new=0, ess=1.0, nis=3.0, resampled=False)
+
+
+def test_new_landmarks_are_sent_with_descriptors_and_changed_ones_without() -> None:
+    """A first exchange costs whole landmarks; a second only what is new, and what changed without its descriptor."""
+    ledger = ExchangeLedger(3)
+    ledger.record_maps(0, 2, map_of({1: 4, 5: 2}), map_of({7: 1}))
+    assert ledger.bytes_sent.tolist() == [2 * (LANDMARK_BYTES + LOOK), 0, LANDMARK_BYTES + LOOK]
+    ledger.record_maps(0, 2, map_of({1: 4, 5: 3, 6: 1}), map_of({7: 1}))
+    second = [LANDMARK_BYTES + (LANDMARK_BYTES + LOOK), 0, 0]
+    assert ledger.bytes_sent.tolist() == [
+        2 * (LANDMARK_BYTES + LOOK) + second[0], 0, LANDMARK_BYTES + LOOK,
+    ]  # fmt: skip
+
+
+def test_what_one_robot_was_told_another_was_not() -> None:
+    """Each pair of robots has its own record of what was sent."""
+    ledger = ExchangeLedger(3)
+    ledger.record_maps(0, 1, map_of({1: 4}), map_of({2: 1}))
+    ledger.record_maps(0, 2, map_of({1: 4}), map_of({2: 1}))
+    assert ledger.bytes_sent.tolist() == [2 * (LANDMARK_BYTES + LOOK), LANDMARK_BYTES + LOOK, LANDMARK_BYTES + LOOK]
+
+
+def test_members_of_a_group_send_poses_and_the_landmarks_they_touched() -> None:
+    """Per step a robot sends its pose, each landmark it matched or made, and descriptors of those it made."""
+    ledger = ExchangeLedger(4)
+    ledger.record_step((1, 3), report_of([[4, -1, 9], [2]], [[-1, -1, 9], [-1]]), 13)
+    assert ledger.bytes_sent.tolist() == [0, POSE_BYTES + 2 * LANDMARK_BYTES + LOOK, 0, POSE_BYTES + LANDMARK_BYTES]
+
+
+def test_a_lone_robot_sends_nothing() -> None:
+    """A group of one has nobody to talk to."""
+    ledger = ExchangeLedger(2)
+    ledger.record_step((1,), report_of([[4, 5]], [[4, -1]]), 13)
+    assert ledger.bytes_sent.tolist() == [0, 0]
+
+
+def test_a_ledger_goes_on_from_its_state() -> None:
+    """A restored ledger counts on as the first one did, and shares nothing with it."""
+    ledger, twin = ExchangeLedger(2), ExchangeLedger(2)
+    ledger.record_maps(0, 1, map_of({1: 4}), map_of({2: 1}))
+    twin.set_state(ledger.get_state())
+    for one in (ledger, twin):
+        one.record_maps(0, 1, map_of({1: 5}), map_of({2: 1}))
+    assert twin.bytes_sent.tolist() == ledger.bytes_sent.tolist() == [2 * LANDMARK_BYTES + LOOK, LANDMARK_BYTES + LOOK]
+
+
+@pytest.mark.parametrize("connected", [False, True])
+def test_a_team_counts_only_what_is_exchanged(connected: bool) -> None:
+    """Robots that never meet send nothing; those that merge send maps, then a few hundred bytes a step."""
+    simulation = SimulatedTeam(num_robots=2, seed=1)
+    team = simulation.build()
+    reports = simulation.run(team, 110, None if connected else np.eye(2, dtype=bool))
+    sent = team.bytes_sent
+    if not connected:
+        assert sent.tolist() == [0, 0]
+        return
+    assert team.groups == ((0, 1),)
+    simulation.run(team, 1)
+    largest = POSE_BYTES + 5 * (LANDMARK_BYTES + 4 * SIZE)
+    assert ((team.bytes_sent - sent >= POSE_BYTES) & (team.bytes_sent - sent <= largest)).all()
+    team.bytes_sent[:] = 0  # a copy
+    assert (team.bytes_sent > 0).all()
+    assert any(report.events for report in reports)

@@ -1,0 +1,192 @@
+from itertools import permutations
+from typing import Any
+
+import numpy as np
+import pytest
+from mapped_once import LANDMARKS, frame_of
+from simulated_team import ASSUMED_CAMERA, MOTION, SimulatedTeam
+from standing_team import SIGMA, STARTS, hand_made, standing_team
+
+from slam_backend.alignment import align_maps
+from slam_backend.filter import FastSlam
+from slam_backend.filter_options import FilterOptions
+from slam_backend.geometry import between, compose, inverse, transform_points, wrap_angle
+from slam_backend.team import TeamSlam
+
+ALONE = np.eye(3, dtype=bool)
+
+
+def test_a_fresh_team_is_a_set_of_filters_at_their_own_starts() -> None:
+    """Before the first step each robot is alone, at the origin of its own start frame, with an empty map."""
+    team = TeamSlam(3, num_particles=7)
+    assert team.groups == ((0,), (1,), (2,))
+    assert team.num_robots == 3
+    assert team.events == ()
+    for robot in range(3):
+        np.testing.assert_array_equal(team.start_from_group(robot), 0.0)
+        np.testing.assert_array_equal(team.pose(robot).mean, 0.0)
+        assert len(team.map(robot)) == 0
+        assert team.particles(robot)[0].shape == (7, 3)
+    assert [row["ess"] for row in team.diagnostics] == [7.0] * 3
+    assert FilterOptions(num_particles=7) == team._find(0)[0].filter.options
+
+
+ORDERS = [
+    ((0, 1), (0, 2), (0, 3)),
+    ((3, 2), (2, 1), (1, 0)),
+    ((1, 2), (3, 0), (2, 3)),
+    ((3, 1), (0, 2), (1, 2)),
+    ((2, 1), (3, 2), (2, 0)),
+]
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_the_frame_of_a_group_is_the_start_of_its_lowest_robot_whatever_the_order(order: Any) -> None:
+    """After each of the merges, poses, starts and maps are true in the start frame of the group's lowest robot."""
+    team = standing_team(4)
+    for robot_a, robot_b in order:
+        joined = {group for group in team.groups if robot_a in group or robot_b in group}
+        renaming = team.merge(robot_a, robot_b, hand_made(team, robot_a, robot_b))
+        assert {renaming.robots_a, renaming.robots_b} == joined
+        assert renaming.robots_a[0] < renaming.robots_b[0]
+        for group in team.groups:
+            for robot in group:
+                true = between(STARTS[group[0]], STARTS[robot])
+                assert np.abs(team.pose(robot).mean - true).max() < 10 * SIGMA
+                assert np.abs(inverse(team.start_from_group(robot)) - true).max() < 10 * SIGMA
+            held = team.map(group[0])
+            truth = transform_points(inverse(STARTS[group[0]]), LANDMARKS[held.descriptors.argmax(axis=1)])
+            assert np.abs(held.means - truth).max() < 20 * SIGMA
+            assert len(held) == 5 + len(group)
+    assert team.groups == ((0, 1, 2, 3),)
+    np.testing.assert_array_equal(team.start_from_group(0), 0.0)
+
+
+@pytest.mark.parametrize(("robot_a", "robot_b"), list(permutations(range(3), 2)))
+def test_a_merge_gives_the_same_whichever_robot_is_named_first(robot_a: int, robot_b: int) -> None:
+    """merge(a, b, T) and merge(b, a, T^-1) make the same groups, events and renamings, and maps that agree."""
+    team, other = standing_team(), standing_team()
+    renaming = team.merge(robot_a, robot_b, hand_made(team, robot_a, robot_b))
+    turned = other.merge(robot_b, robot_a, hand_made(other, robot_b, robot_a))
+    assert team.groups == other.groups
+    np.testing.assert_array_equal(renaming.ids_b, turned.ids_b)
+    event, mirrored = team.events[-1], other.events[-1]
+    assert (event.kind, event.robots_a, event.robots_b) == ("merge", mirrored.robots_a, mirrored.robots_b)
+    np.testing.assert_allclose(event.alignment.transform, mirrored.alignment.transform, atol=1e-9)
+    np.testing.assert_allclose(team.map(robot_a).means, other.map(robot_a).means, atol=10 * SIGMA)
+
+
+def test_a_renaming_names_every_landmark_of_b_s_map() -> None:
+    """A landmark of b's map before the merge, renamed, looks the same in the joint map; a's keep id and look."""
+    team = standing_team()
+    before = [team.map(robot) for robot in range(3)]
+    renaming = team.merge(2, 1, hand_made(team, 2, 1))
+    joint = team.map(1)
+    looks = dict(zip(joint.ids.tolist(), joint.descriptors.argmax(axis=1).tolist(), strict=True))
+    new_id = dict(renaming.ids_b.tolist())
+    assert (renaming.robots_a, renaming.robots_b) == ((1,), (2,))
+    for landmark, look in zip(before[2].ids.tolist(), before[2].descriptors.argmax(axis=1).tolist(), strict=True):
+        assert looks[new_id[landmark]] == look
+    for landmark, look in zip(before[1].ids.tolist(), before[1].descriptors.argmax(axis=1).tolist(), strict=True):
+        assert looks[landmark] == look
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_own_start_frames_do_not_jump_at_a_merge(seed: int) -> None:
+    """Seen in its own start frame, a robot's pose and map move by no more than their uncertainty.
+
+    Poses: five standard deviations of the pose before and of the start's spread after. Maps: the median landmark
+    by one deviation, every landmark by six.
+    """
+    simulation = SimulatedTeam(seed=seed)
+    team = simulation.build()
+    simulation.run(team, 100, ALONE)
+    poses = [team.pose(robot) for robot in range(2)]
+    own = [compose(team.start_from_group(robot), poses[robot].mean) for robot in range(2)]
+    maps = [team.map(robot).moved(team.start_from_group(robot)) for robot in range(2)]
+    mixtures = [team.map(robot, "mixture") for robot in range(2)]
+    alignment = align_maps(*mixtures)
+    assert alignment.success
+    new_ids = [{}, dict(team.merge(0, 1, alignment).ids_b.tolist())]
+    spread = np.cov(team._find(1)[0].filter._start_poses[1].T)
+    for robot in range(2):
+        jump = compose(team.start_from_group(robot), team.pose(robot).mean) - own[robot]
+        jump[2] = wrap_angle(jump[2])
+        assert (np.abs(jump) < 5.0 * np.sqrt(np.diag(poses[robot].covariance + spread))).all()
+        joint = team.map(robot).moved(team.start_from_group(robot))
+        row_of = {landmark: row for row, landmark in enumerate(joint.ids.tolist())}
+        moved = []
+        for row, landmark in enumerate(maps[robot].ids.tolist()):
+            after = row_of.get(new_ids[robot].get(landmark, landmark))
+            if after is not None:
+                distance = np.linalg.norm(joint.means[after] - maps[robot].means[row])
+                moved.append(distance / np.sqrt(np.trace(mixtures[robot].covariances[row])))
+        assert len(moved) > 0.8 * len(maps[robot])
+        assert np.median(moved) < 1.0
+        assert max(moved) < 6.0
+
+
+# ---------------------------------------------------------------------- robots without contact, robots together
+
+
+def test_robots_without_contact_do_not_influence_each_other() -> None:
+    """Robot 0 of a team that never meets does what it does in a team of one, bit for bit."""
+    simulation = SimulatedTeam(seed=4)
+    team = simulation.build()
+    alone = TeamSlam(1, seed=4, num_particles=30, camera=ASSUMED_CAMERA, motion=MOTION)
+    for _ in range(40):
+        odometry, frames = simulation.read()
+        team.step(odometry, frames, ALONE)
+        alone.step(odometry[:1], frames[:1])
+    np.testing.assert_array_equal(team.particles(0)[0], alone.particles(0)[0])
+    np.testing.assert_array_equal(team.map(0).means, alone.map(0).means)
+
+
+def test_a_robot_matches_what_another_has_just_mapped() -> None:
+    """In one step, a later robot of a joint filter finds the landmark that an earlier one has just created (l. 9)."""
+    names = np.array([3])
+    starts = np.array([[0.0, 0.0, 0.0], [0.5, -0.4, 0.2]])
+    slam = FastSlam(2, 7, initial_poses=starts)
+    frames = [frame_of(transform_points(inverse(start), LANDMARKS[names]), names, 0.02) for start in starts]
+    report = slam.step([None, None], frames)
+    assert report.num_new == 1
+    np.testing.assert_array_equal(report.associations[0], report.associations[1])
+    np.testing.assert_array_equal(report.created[1], [-1])
+    assert slam.map().counts.tolist() == [2]
+
+
+def test_weights_multiply_by_the_chain_rule() -> None:
+    """Two robots' likelihoods multiply, the second taken in the map that the first has just updated (l. 9).
+
+    With exact poses this is the joint density of both measurements of one landmark, whose errors are correlated
+    through the landmark's own uncertainty.
+    """
+    names, sigma_map, sigma = np.array([3]), 0.3, 0.1
+    rng = np.random.default_rng(5)
+    starts = np.array([[0.0, 0.0, 0.0], [0.5, -0.4, 0.2]])
+    local = [transform_points(inverse(start), LANDMARKS[names]) for start in starts]
+    slam = FastSlam(2, 1, initial_poses=starts, proposal="fastslam1")
+    still = np.zeros((2, 3))
+    slam.step([None, None], [frame_of(local[0], names, sigma_map), None], identities=[names, None], poses=still)
+    before = slam._path_log_weights[0]
+    errors = sigma * rng.normal(size=(2, 1, 3))
+    frames = [frame_of(points + error, names, sigma) for points, error in zip(local, errors, strict=True)]
+    slam.step([None, None], frames, identities=[names, names], poses=still)
+    turned = [transform_points([0.0, 0.0, start[2]], error) for start, error in zip(starts, errors, strict=True)]
+    stacked = np.ravel(turned)
+    joint = np.kron(np.full((2, 2), sigma_map**2), np.eye(3)) + sigma**2 * np.eye(6)
+    expected = -0.5 * (stacked @ np.linalg.solve(joint, stacked) + np.linalg.slogdet(2 * np.pi * joint)[1])
+    assert slam._path_log_weights[0] - before == pytest.approx(expected, rel=1e-9)
+
+
+def test_a_joint_filter_takes_robots_in_the_order_of_the_team() -> None:
+    """Whatever the order of merges, odometry of robot k moves robot k."""
+    for order in permutations(range(3)):
+        team = standing_team()
+        team.merge(order[0], order[1], hand_made(team, order[0], order[1]))
+        team.merge(order[1], order[2], hand_made(team, order[1], order[2]))
+        before = [team.pose(robot).mean for robot in range(3)]
+        moves = [np.array([0.1 * (robot + 1), 0.0, 0.0]) for robot in range(3)]
+        team.step(moves, [None] * 3)
+        for robot in range(3):
+            assert between(before[robot], team.pose(robot).mean)[0] == pytest.approx(0.1 * (robot + 1), abs=0.02)
