@@ -14,15 +14,13 @@ import numpy as np
 from slam_backend._kernels import MIN_DEPTH
 from slam_backend.camera import ROBOT_FROM_CAMERA, StereoCamera
 from slam_backend.errors import FloatArray
-from slam_backend.geometry import rotation
 from slam_backend.measurements import Measurements
 
 
 def turn_about_vertical(theta: float) -> FloatArray:
     """Return the 3 x 3 rotation by theta about the vertical axis."""
-    turn = np.eye(3)
-    turn[:2, :2] = rotation(theta)
-    return turn
+    c, s = np.cos(theta), np.sin(theta)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 @dataclass
@@ -119,8 +117,8 @@ class Frame:
     def predict(self, pose: FloatArray, mean: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray] | None:
         """Return z^ (Eq. 5) and its Jacobians by landmark (G, Eq. 6) and by pose (H); None if it cannot be seen."""
         turn = turn_about_vertical(pose[2])
-        by_heading = np.zeros((3, 3))
-        by_heading[:2, :2] = rotation(pose[2] + 0.5 * np.pi)
+        c, s = np.cos(pose[2]), np.sin(pose[2])
+        by_heading = np.array([[-s, -c, 0.0], [c, -s, 0.0], [0.0, 0.0, 0.0]])  # of turn
         offset = mean - [pose[0], pose[1], 0.0]
         point = self.camera.camera_from_robot(turn.T @ offset)
         g = ROBOT_FROM_CAMERA.T @ turn.T
