@@ -1,6 +1,7 @@
 """The two figures of a run: the maps beside the truth, and the map errors over time."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -32,7 +33,8 @@ def draw_maps(record: EpisodeRecord, path: Path) -> None:
     ratio = (high[1] - low[1]) / (high[0] - low[0])
     small, large = 9.0 / columns * ratio + 0.45, 9.0 * ratio + 0.45
     figure = Figure(figsize=(9.3, rows * small + large + 0.25), layout="constrained", facecolor=_rgb(PAPER))
-    upper, lower = np.ravel(figure.subfigures(2, 1, height_ratios=[rows * small, large]))
+    parts: Any = figure.subfigures(2, 1, height_ratios=[rows * small, large])
+    upper, lower = parts
     for part in (upper, lower):
         part.set_facecolor(_rgb(PAPER))
     panels = upper.subplots(rows, columns, squeeze=False).ravel()

@@ -17,29 +17,18 @@ VIDEO_SIZE = (960, 720)
 
 def run(
     world: Annotated[
-        str | None,
-        typer.Option(help="office, fig5, or the path of a floor plan.  [default: office]", show_default=False),
+        str | None, typer.Option(help="office, fig5, or the path of a floor plan.", show_default="office")
     ] = None,
-    robots: Annotated[int | None, typer.Option(help="How many, 1 to 8.  [default: 3]", show_default=False)] = None,
-    policy: Annotated[
-        str | None, typer.Option(help="Name of a policy.  [default: frontier]", show_default=False)
-    ] = None,
-    seed: Annotated[int | None, typer.Option(help="Of all random draws.  [default: 0]", show_default=False)] = None,
+    robots: Annotated[int | None, typer.Option(help="How many, 1 to 8.", show_default="3")] = None,
+    policy: Annotated[str | None, typer.Option(help="Name of a policy.", show_default="frontier")] = None,
+    seed: Annotated[int | None, typer.Option(help="Of all random draws.", show_default="0")] = None,
     action_type: Annotated[
-        str | None, typer.Option(help="continuous, discrete or goal.  [default: continuous]", show_default=False)
+        str | None, typer.Option(help="continuous, discrete or goal.", show_default="continuous")
     ] = None,
-    max_cycles: Annotated[
-        int | None, typer.Option(help="Steps of the episode.  [default: 240 s worth]", show_default=False)
-    ] = None,
-    particles: Annotated[
-        int | None, typer.Option(help="Particles per filter.  [default: 100]", show_default=False)
-    ] = None,
-    preset: Annotated[
-        str | None, typer.Option(help="easy, standard or hard noise.  [default: standard]", show_default=False)
-    ] = None,
-    out: Annotated[
-        Path | None, typer.Option(help="New run folder.  [default: the next runs/run-*]", show_default=False)
-    ] = None,
+    max_cycles: Annotated[int | None, typer.Option(help="Steps of the episode.", show_default="240 s worth")] = None,
+    particles: Annotated[int | None, typer.Option(help="Particles per filter.", show_default="100")] = None,
+    preset: Annotated[str | None, typer.Option(help="easy, standard or hard noise.", show_default="standard")] = None,
+    out: Annotated[Path | None, typer.Option(help="New run folder.", show_default="the next runs/run-*")] = None,
     json: Annotated[Path | None, typer.Option(help="Write the metrics to this file too.", show_default=False)] = None,
     video: Annotated[bool, typer.Option(help="Whether to film the run.")] = True,
     config: Annotated[
