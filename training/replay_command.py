@@ -140,20 +140,23 @@ def _write_paths(folder: "RunFolder", log: "MrclamLog", result: "Replay") -> Non
 
 
 def _print_tables(console: Console, metrics: dict[str, Any]) -> None:
-    """Print scores of robots and merges."""
-    table = Table(title="Path and map errors [m]")
-    table.add_column("robot", justify="right")
-    for name in ("path\naligned", "dead reckoning\naligned", "path\nfrom start", "dead reckoning\nfrom start"):
-        table.add_column(name, justify="right")
-    for name in ("map RMSE\naligned", "recall", "precision", "map error\nfrom start"):
-        table.add_column(name, justify="right")
-    keys = (
-        "ate_aligned_m", "dead_reckoning_ate_aligned_m", "ate_start_m", "dead_reckoning_ate_start_m",
-        "map_rmse_m", "map_recall", "map_precision", "map_error",
-    )  # fmt: skip
-    for row in metrics["robots"]:
-        table.add_row(str(row["robot"]), *(_number(row[key]) for key in keys))
-    console.print(table)
+    """Print scores of paths, maps and merges."""
+    aligned, start = "after the best rigid fit", "from the true start, no fit"
+    paths = {
+        f"path [m],\n{aligned}": "ate_aligned_m", "odometry,\nfitted too": "dead_reckoning_ate_aligned_m",
+        f"path [m],\n{start}": "ate_start_m", "odometry,\nno fit": "dead_reckoning_ate_start_m",
+    }  # fmt: skip
+    maps = {
+        f"RMSE [m],\n{aligned}": "map_rmse_m", "recall": "map_recall", "precision": "map_precision",
+        f"map error [m],\n{start}": "map_error",
+    }  # fmt: skip
+    for title, columns in (("Paths", paths), ("Maps", maps)):
+        table = Table(title=title)
+        for name in ("robot", *columns):
+            table.add_column(name, justify="right")
+        for row in metrics["robots"]:
+            table.add_row(str(row["robot"]), *(_number(row[key]) for key in columns.values()))
+        console.print(table)
     merges = Table(title="Merges")
     for name in ("time [s]", "group", "with", "shared landmarks", "off by [m]", "off by [deg]"):
         merges.add_column(name, justify="right")

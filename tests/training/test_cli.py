@@ -1,0 +1,76 @@
+import subprocess
+import sys
+
+import pytest
+
+from training import cli
+from training.replay_command import parse_numbers
+
+
+def _run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
+    monkeypatch.setattr(sys, "argv", ["vslam", *arguments])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    return int(end.value.code or 0)
+
+
+@pytest.mark.parametrize("command", [(), ("replay",), ("replay", "mrclam")])
+def test_every_command_explains_itself(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], command: tuple[str, ...]
+) -> None:
+    """`--help` works at every level and leaves with status 0."""
+    assert _run(monkeypatch, *command, "--help") == 0
+    assert "Usage: vslam" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--path", "/nowhere"), "path: expected a folder of the MR.CLAM log, got no such folder. Check '/nowhere'."),
+        ((), "path: expected a folder of the MR.CLAM log, got no --path. Name it, or set VSLAM_DATA."),
+        (("--path", ".", "--robots", "1;2"), "robots: expected numbers with commas between, got '1;2'."),
+        (("--path", ".", "--robots", "7"), "robots: expected different numbers from 1 to 5, got (7,)."),
+        (("--path", ".", "--particles", "0"), "particles: expected an int >= 1, got 0."),
+        (("--path", ".", "--duration", "-1"), "duration: expected a finite number > 0, got -1.0."),
+        (("--path", ".", "--estimator", "ekf"), "estimator: expected one of 'fastslam2', 'fastslam1', got 'ekf'."),
+        (("--path", ".", "--seed", "-2"), "seed: expected an int >= 0, got -2."),
+        (("--config", "/nowhere/config.toml"), "config: expected the config.toml of an earlier run, got no such file."),
+    ],
+)
+def test_bad_input_is_one_line_and_status_2(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    arguments: tuple[str, ...],
+    message: str,
+) -> None:
+    """Argument, what was expected, what came and the cure on one line of stderr, without a traceback."""
+    monkeypatch.delenv("VSLAM_DATA", raising=False)
+    assert _run(monkeypatch, "replay", "mrclam", *arguments) == 2
+    shown = capsys.readouterr()
+    assert shown.err.startswith(f"error {message}")
+    assert shown.err.count("\n") == 1
+    assert not shown.out
+
+
+def test_a_fault_of_the_program_keeps_its_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A ValueError that is not in the project's form is no bad input."""
+
+    def broken(prog_name: str) -> None:
+        raise ValueError("operands could not be broadcast together")
+
+    monkeypatch.setattr(cli, "app", broken)
+    with pytest.raises(ValueError, match="broadcast"):
+        cli.main()
+
+
+def test_numbers_with_commas() -> None:
+    """Blanks around the numbers do not matter."""
+    assert parse_numbers("1, 4,2") == (1, 4, 2)
+
+
+def test_help_needs_no_heavy_import() -> None:
+    """The command line is built without numba, OpenCV, matplotlib or torch, so that --help answers at once."""
+    heavy = "{'numba', 'cv2', 'matplotlib', 'torch', 'scipy'}"
+    code = f"import sys, training.cli; print(sorted({heavy} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

@@ -1,0 +1,192 @@
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from slam_backend.geometry import compose, inverse, transform_points
+from slam_backend.landmark_map import LandmarkMap
+from slam_backend.metrics import align_se2
+from slam_backend.motion import OdometryModel
+from slam_backend.readers.mrclam import load_mrclam
+from slam_backend.readers.mrclam_steps import SightingNoise, integrate_commands
+from slam_backend.trajectory import Trajectory
+from training import cli
+from training.replay_mrclam import MOTION, ReplayConfig, replay
+from training.replay_scores import align_to_truth, score_path, summarise
+
+ANGLES, RADII = np.random.default_rng(11).uniform([[0.0], [2.8]], [[2.0 * np.pi], [4.2]], (2, 14))
+LANDMARKS = np.column_stack([RADII * np.cos(ANGLES), RADII * np.sin(ANGLES)])  # a ring around both robots
+STARTS = {2: (0.5, -1.0, 0.4), 5: (-1.5, 1.0, -2.0)}
+SECONDS = 45.0
+EXACT = ReplayConfig(
+    path="log",
+    particles=7,
+    motion=OdometryModel(sigma_along=1e-3, sigma_across=1e-3, sigma_heading=1e-3, sigma_turn=1e-3),
+    sensor=SightingNoise(range_floor=0.02, range_share=0.0, bearing=0.01, height=0.01),
+)
+
+
+def _write_log(folder: Path, noise: float, seed: int = 3) -> None:
+    """Write a log of two robots that drive in circles among 14 landmarks, with `noise` times the usual errors."""
+    rng = np.random.default_rng(seed)
+    subjects = np.arange(6, 6 + len(LANDMARKS))
+    (folder / "Barcodes.dat").write_text("".join(f"{n} {100 + n}\n" for n in [1, 2, 3, 4, 5, *subjects]))
+    lines = [f"{n} {x} {y} 0 0\n" for n, (x, y) in zip(subjects, LANDMARKS, strict=True)]
+    (folder / "Landmark_Groundtruth.dat").write_text("".join(lines))
+    for robot, start in STARTS.items():
+        times = 1000.0 + 0.1 * np.arange(round(SECONDS / 0.1))
+        driven = np.column_stack([times, np.full_like(times, 0.5), np.full_like(times, 0.6 if robot == 2 else -0.5)])
+        told = driven * [1.0, 1.0 + 0.2 * noise, 1.0 - 0.15 * noise]
+        np.savetxt(folder / f"Robot{robot}_Odometry.dat", told, fmt="%.6f")
+        poses = compose(start, integrate_commands(driven, times))
+        np.savetxt(folder / f"Robot{robot}_Groundtruth.dat", np.column_stack([times, poses]), fmt="%.9f")
+        rows = []
+        for time, pose in zip(times[::3], poses[::3], strict=True):
+            seen = transform_points(inverse(pose), LANDMARKS)
+            ranges, bearings = np.hypot(*seen.T), np.arctan2(seen[:, 1], seen[:, 0])
+            for n in np.flatnonzero((np.abs(bearings) < 0.5) & (ranges < 9.0)):
+                r, b = [ranges[n], bearings[n]] + noise * rng.normal(0.0, [0.05, 0.01])
+                rows.append(f"{time:.3f} {100 + subjects[n]} {r:.9f} {b:.9f}\n")
+        (folder / f"Robot{robot}_Measurement.dat").write_text("".join(rows))
+
+
+def test_without_noise_the_team_is_right(tmp_path: Path) -> None:
+    """Exact readings that are believed give one group, and paths, maps and the merge exact to centimetres."""
+    _write_log(tmp_path, noise=0.0)
+    log = load_mrclam(tmp_path)
+    result = replay(log, EXACT)
+    paths = [score_path(result, robot, own.truth) for robot, own in enumerate(log.robots)]
+    metrics = summarise(result, log, paths)
+    assert metrics["groups"] == [[2, 5]]
+    assert len(metrics["merges"]) == 1
+    assert metrics["merges"][0]["error_m"] < 0.05
+    assert metrics["merges"][0]["error_deg"] < 1.0
+    for row in metrics["robots"]:
+        assert row["ate_aligned_m"] < 0.05
+        assert row["dead_reckoning_ate_start_m"] < 1e-3
+        assert row["map_rmse_m"] < 0.05
+        assert row["map_precision"] == 1.0
+
+
+def test_noise_is_removed_that_dead_reckoning_keeps(tmp_path: Path) -> None:
+    """With biased odometry each path is at most a third as wrong as dead reckoning, in both kinds of score."""
+    _write_log(tmp_path, noise=1.0)
+    log = load_mrclam(tmp_path)
+    result = replay(log, ReplayConfig(path=str(tmp_path), particles=25, seed=4))
+    for robot, own in enumerate(log.robots):
+        path = score_path(result, robot, own.truth)
+        assert path is not None
+        assert path.ate_aligned < 0.5 * path.reckoned_aligned
+    assert len(result.groups) == 1
+
+
+def test_a_run_is_written_and_repeats_itself(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The command leaves a complete folder, and run again from its config the same metrics to the last digit."""
+    log, first, second = (tmp_path / name for name in ("log", "first", "second"))
+    log.mkdir()
+    _write_log(log, noise=1.0)
+    monkeypatch.setenv("VSLAM_DATA", str(tmp_path))
+    options = ("--path", str(log), "--duration", "20", "--particles", "7", "--seed", "5")
+    for arguments in (
+        (*options, "--out", str(first), "--json", str(tmp_path / "copy.json")),
+        ("--config", str(first), "--out", str(second)),
+    ):
+        monkeypatch.setattr(sys, "argv", ["vslam", "replay", "mrclam", *arguments])
+        with pytest.raises(SystemExit) as end:
+            cli.main()
+        assert not end.value.code
+    assert "odometry" in capsys.readouterr().out
+    names = {f"robot{n}_{kind}.tum" for n in (2, 5) for kind in ("estimate", "dead_reckoning", "truth")}
+    assert {file.name for file in first.iterdir()} == {"config.toml", "metrics.json", "replay.png", *names}
+    assert (first / "replay.png").read_bytes()[:4] == b"\x89PNG"
+    metrics = json.loads((first / "metrics.json").read_text())
+    assert metrics == json.loads((tmp_path / "copy.json").read_text())
+    assert metrics == json.loads((second / "metrics.json").read_text())
+    assert metrics["seed"] == 5
+    assert metrics["coverage"] is None
+    assert metrics["config"]["particles"] == 7
+    assert set(metrics) >= {"robots", "merges", "groups", "coverage", "config", "seed", "versions"}
+    estimate = Trajectory.load_tum(first / "robot5_estimate.tum")
+    assert np.array_equal(estimate.poses, Trajectory.load_tum(second / "robot5_estimate.tum").poses)
+
+
+def test_a_log_without_truth_has_no_path_scores(tmp_path: Path) -> None:
+    """Where the true path is not known its errors are NaN, while the map is scored."""
+    _write_log(tmp_path, noise=1.0)
+    (tmp_path / "Robot5_Groundtruth.dat").unlink()
+    log = load_mrclam(tmp_path, robots=(5,), duration=10.0)
+    result = replay(log, ReplayConfig(path=str(tmp_path), particles=5))
+    row = summarise(result, log, [score_path(result, 0, log.robots[0].truth)])["robots"][0]
+    assert np.isnan([row["ate_aligned_m"], row["dead_reckoning_ate_start_m"], row["map_error"]]).all()
+    assert row["map_rmse_m"] < 0.6
+
+
+def test_map_is_aligned_by_its_most_seen_landmarks(tmp_path: Path) -> None:
+    """A duplicate seen once does not turn the map; it lowers the precision."""
+    _write_log(tmp_path, noise=0.0)
+    log = load_mrclam(tmp_path)
+    world_from_map = np.array([1.0, -2.0, 0.7])
+    means = transform_points(inverse(world_from_map), LANDMARKS[[0, 3, 5, 3]])
+    means[3] += 2.0
+    descriptors = np.eye(len(LANDMARKS), dtype=np.float32)[[0, 3, 5, 3]]
+    covariances, counts = np.tile(np.eye(3), (4, 1, 1)), np.array([9, 9, 9, 1])
+    found = align_to_truth(LandmarkMap(np.column_stack([means, np.zeros(4)]), covariances, descriptors, counts), log)
+    assert found is not None
+    np.testing.assert_allclose(found.world_from_map, world_from_map, atol=1e-9)
+    assert found.score.precision == 0.75
+    assert found.score.recall == 3 / 14
+    assert align_to_truth(LandmarkMap.empty(14), log) is None
+
+
+def test_config_survives_a_round_trip() -> None:
+    """Plain values rebuild the same config."""
+    config = ReplayConfig(path="log", robots=(1, 4), duration=12.5, particles=30, motion=MOTION)
+    assert ReplayConfig.from_mapping(config.to_mapping()) == config
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"path": "log", "particels": 3}, "config: expected names among path, .*, got 'particels'"),
+        ({"path": "log", "motion": {"sigma": 1.0}}, "motion: expected names among sigma_along, .*, got 'sigma'"),
+        ({"path": "log", "sensor": 3}, "sensor: expected a table of range_floor, .*, got 3"),
+        ({"path": "log", "sensor": {"bearing": 0.0}}, r"sensor\.bearing: expected a finite number > 0, got 0\.0"),
+        ({"path": "log", "dt": 0.0}, r"dt: expected a finite number > 0, got 0\.0"),
+    ],
+)
+def test_a_config_with_unknown_names_is_refused(values: dict[str, object], message: str) -> None:
+    """A misspelt or impossible entry of a config file is named."""
+    with pytest.raises(ValueError, match=message):
+        ReplayConfig.from_mapping(values)
+
+
+@pytest.mark.slow
+def test_five_real_robots_become_one_team(data_dir: Path) -> None:
+    """On the real log all five end in one group, each path at most a quarter as wrong as dead reckoning."""
+    log = load_mrclam(data_dir / "mrclam" / "MRCLAM_Dataset7")
+    result = replay(log, ReplayConfig(path="MRCLAM_Dataset7"))
+    metrics = summarise(result, log, [score_path(result, robot, own.truth) for robot, own in enumerate(log.robots)])
+    assert metrics["groups"] == [[1, 2, 3, 4, 5]]
+    for row in metrics["robots"]:
+        assert row["ate_aligned_m"] <= 0.25 * row["dead_reckoning_ate_start_m"]
+        assert row["map_rmse_m"] < 0.25
+        assert row["map_recall"] == 1.0
+
+
+def test_paths_in_start_frames_and_group_frames_agree(tmp_path: Path) -> None:
+    """Late poses, moved into the group's frame, fit the true poses by the same motion as the group's map."""
+    _write_log(tmp_path, noise=0.0)
+    log = load_mrclam(tmp_path)
+    result = replay(log, EXACT)
+    late = compose(inverse(result.start_from_group), result.paths[:, -4])
+    group_map = result.maps[0].moved(inverse(result.start_from_group[0]))
+    rows = group_map.descriptors.argmax(axis=1)
+    world_from_group = align_se2(LANDMARKS[rows], group_map.means[:, :2])
+    for pose, own in zip(late, log.robots, strict=True):
+        assert own.truth is not None
+        error = compose(inverse(own.truth.at(result.times[-4])), compose(world_from_group, pose))
+        assert np.abs(error).max() < 0.05
