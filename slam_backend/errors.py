@@ -93,7 +93,11 @@ def check_array(
         cure: What to do about it.
         dtype: Of the result.
         finite: Refuse NaN and infinity.
+
+    Integer dtypes accept floats only if these are whole numbers.
     """
+    if np.issubdtype(dtype, np.integer):
+        _check_whole(name, value, cure)
     try:
         array = np.array(value, dtype=dtype, order="C")
     except (TypeError, ValueError) as error:
@@ -109,3 +113,13 @@ def check_array(
 def _shape_text(shape: tuple[int | None, ...]) -> str:
     """Write a shape with `n` for free axes."""
     return "(" + ", ".join("n" if s is None else str(s) for s in shape) + ("," if len(shape) == 1 else "") + ")"
+
+
+def _check_whole(name: str, value: Any, cure: str) -> None:
+    """Raise if `value` holds floats that are not whole; what is no array at all is left to the caller."""
+    try:
+        floats = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        return
+    if not np.array_equal(floats, np.rint(floats)):
+        raise bad_argument(name, "whole numbers", value, cure)

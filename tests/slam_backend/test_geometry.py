@@ -1,0 +1,85 @@
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from slam_backend.geometry import (
+    between,
+    compose,
+    inverse,
+    rotate_covariances,
+    rotation,
+    transform_points,
+    wrap_angle,
+)
+
+coordinates = st.floats(-50.0, 50.0)
+angles = st.floats(-np.pi, np.pi, exclude_max=True)
+poses = st.tuples(coordinates, coordinates, angles).map(np.array)
+
+
+def assert_same_pose(a: np.ndarray, b: np.ndarray) -> None:
+    """Compare positions, and headings on the circle."""
+    np.testing.assert_allclose(a[..., :2], b[..., :2], atol=1e-10)
+    np.testing.assert_allclose(wrap_angle(a[..., 2] - b[..., 2]), 0.0, atol=1e-10)
+
+
+@given(a=poses, b=poses, c=poses)
+def test_motions_are_a_group(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> None:
+    """Composition is associative, has the origin as its unit, and `inverse` undoes on both sides."""
+    assert_same_pose(compose(compose(a, b), c), compose(a, compose(b, c)))
+    unit = np.zeros(3)
+    assert_same_pose(compose(a, unit), a)
+    assert_same_pose(compose(unit, a), a)
+    assert_same_pose(compose(a, inverse(a)), unit)
+    assert_same_pose(compose(inverse(a), a), unit)
+
+
+@given(a=poses, b=poses)
+def test_between_is_the_motion_from_one_pose_to_the_other(a: np.ndarray, b: np.ndarray) -> None:
+    """Pose a followed by `between(a, b)` is pose b."""
+    assert_same_pose(compose(a, between(a, b)), b)
+
+
+@given(a=poses, b=poses, point=st.tuples(coordinates, coordinates, coordinates).map(np.array))
+def test_points_follow_the_same_group(a: np.ndarray, b: np.ndarray, point: np.ndarray) -> None:
+    """Moving a point by b and then by a is moving it by their composition; its height stays."""
+    moved = transform_points(a, transform_points(b, point))
+    np.testing.assert_allclose(moved, transform_points(compose(a, b), point), atol=1e-9)
+    assert moved[2] == point[2]
+    np.testing.assert_allclose(transform_points(a, point[:2]), rotation(a[2]) @ point[:2] + a[:2], atol=1e-9)
+
+
+@given(angle=st.floats(-1e3, 1e3))
+def test_wrapped_angles_lie_in_their_interval_and_point_the_same_way(angle: float) -> None:
+    """The result lies in [-pi, pi) and differs by whole turns."""
+    wrapped = float(wrap_angle(angle))
+    assert -np.pi <= wrapped < np.pi
+    np.testing.assert_allclose(np.exp(1j * wrapped), np.exp(1j * angle), atol=1e-9)
+
+
+def test_many_motions_at_once_are_the_motions_one_by_one() -> None:
+    """Shapes broadcast: (5, 1, 3) with (7, 3) gives (5, 7, 3)."""
+    rng = np.random.default_rng(0)
+    a, b = rng.normal(size=(5, 1, 3)), rng.normal(size=(7, 3))
+    together = compose(a, b)
+    assert together.shape == (5, 7, 3)
+    for i in range(5):
+        for j in range(7):
+            np.testing.assert_array_equal(together[i, j], compose(a[i, 0], b[j]))
+
+
+def test_points_are_copied() -> None:
+    """`transform_points` leaves its argument alone."""
+    points = np.ones((4, 3))
+    transform_points([1.0, 2.0, 0.5], points)
+    np.testing.assert_array_equal(points, 1.0)
+
+
+def test_a_rotated_covariance_is_that_of_rotated_points() -> None:
+    """Cov(R p) = R Cov(p) R^T (Eq. 16 with R on the left; the printed R^T Sigma R is another matrix)."""
+    rng = np.random.default_rng(1)
+    points = rng.normal(size=(400, 3)) @ np.diag([3.0, 1.0, 0.5]) + [1.0, 2.0, 3.0]
+    theta = 0.7
+    before, after = np.cov(points.T), np.cov(transform_points([4.0, 5.0, theta], points).T)
+    np.testing.assert_allclose(rotate_covariances(theta, before), after, atol=1e-12)
+    assert not np.allclose(rotate_covariances(-theta, before), after, atol=0.1)

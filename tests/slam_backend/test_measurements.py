@@ -1,0 +1,53 @@
+from typing import Any
+
+import numpy as np
+import pytest
+
+from slam_backend.measurements import Measurements
+
+POINTS = [[0.0, 0.1, 2.0], [1.0, 0.0, 3.0]]
+LOOKS = np.eye(2, 5, dtype=np.float32)
+
+
+def test_frames_share_no_memory_and_cannot_be_written() -> None:
+    """The arrays are copies and read-only, so a caller cannot change what a filter has accepted."""
+    points = np.array(POINTS)
+    frame = Measurements(points, LOOKS, np.tile(np.eye(3), (2, 1, 1)))
+    points[:] = 9.0
+    np.testing.assert_array_equal(frame.points, POINTS)
+    for array in (frame.points, frame.descriptors, frame.covariances):
+        assert array is not None
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 0.0
+    assert (len(frame), frame.points.dtype, frame.descriptors.dtype) == (2, np.float64, np.float32)
+
+
+def test_nothing_seen_is_a_frame_too() -> None:
+    """An empty frame has no rows and its descriptor size."""
+    frame = Measurements.empty(11)
+    assert (len(frame), frame.points.shape, frame.descriptors.shape) == (0, (0, 3), (0, 11))
+
+
+INDEFINITE = np.array([[[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 1.0]]] * 2)
+ASYMMETRIC = np.array([[[1.0, 0.1, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]] * 2)
+
+
+@pytest.mark.parametrize(
+    ("points", "descriptors", "covariances", "message"),
+    [
+        ([[0.0, 1.0]], LOOKS[:1], None, r"points: expected an array of shape \(n, 3\), got shape \(1, 2\)"),
+        ([0.0, 1.0, 2.0], LOOKS[:1], None, r"points: expected an array of shape \(n, 3\), got shape \(3,\)"),
+        ([[0.0, np.nan, 1.0]], LOOKS[:1], None, r"points: expected finite numbers, got NaN .* at index \(0, 1\)"),
+        ("far", LOOKS, None, r"points: expected an array of shape \(n, 3\), got"),
+        (POINTS, LOOKS[:1], None, r"descriptors: expected an array of shape \(2, n\), got shape \(1, 5\)"),
+        (POINTS, LOOKS + np.inf, None, r"descriptors: expected finite numbers, got NaN or infinity"),
+        (POINTS, LOOKS, np.eye(3), r"covariances: expected an array of shape \(2, 3, 3\), got shape \(3, 3\)"),
+        (POINTS, LOOKS, INDEFINITE, r"covariances: expected positive definite matrices, got a smallest eigenvalue"),
+        (POINTS, LOOKS, ASYMMETRIC, r"covariances: expected symmetric matrices, got a different transpose"),
+        (POINTS, LOOKS, np.zeros((2, 3, 3)), r"covariances: expected positive definite matrices"),
+    ],
+)
+def test_frames_that_make_no_sense_are_refused(points: Any, descriptors: Any, covariances: Any, message: str) -> None:
+    """The error names the argument, what it should be and what it was."""
+    with pytest.raises(ValueError, match=message):
+        Measurements(points, descriptors, covariances)

@@ -1,0 +1,70 @@
+import numpy as np
+import pytest
+from scipy import stats
+
+from slam_backend.geometry import compose, wrap_angle
+from slam_backend.motion import OdometryModel
+
+MODEL = OdometryModel(
+    sigma_along=0.1, sigma_across=0.03, sigma_heading=0.05, sigma_turn=0.2, floor_position=0.01, floor_heading=0.02
+)
+MOVE = np.array([0.6, 0.8, -0.5])
+
+
+def test_standard_deviations_add_in_squares() -> None:
+    """Each part grows with distance or turn and is added to its floor in squares."""
+    expected = [np.hypot(0.1, 0.01), np.hypot(0.03, 0.01), np.sqrt(0.05**2 + (0.2 * 0.5) ** 2 + 0.02**2)]
+    np.testing.assert_allclose(MODEL.sigmas(MOVE), expected)
+    np.testing.assert_allclose(MODEL.sigmas(np.zeros(3)), [0.01, 0.01, 0.02])
+
+
+def test_samples_have_the_stated_moments() -> None:
+    """In the robot's frame the samples are N(u, diag(sigmas^2)); chi-square and t, false alarm 1e-4 each."""
+    start = np.array([1.0, -2.0, 2.4])
+    n = 20_000
+    samples = MODEL.sample(np.tile(start, (n, 1)), MOVE, np.random.default_rng(5))
+    c, s = np.cos(start[2]), np.sin(start[2])
+    offsets = samples - start
+    motion = np.column_stack(
+        [
+            c * offsets[:, 0] + s * offsets[:, 1],
+            -s * offsets[:, 0] + c * offsets[:, 1],
+            wrap_angle(offsets[:, 2]),
+        ]
+    )
+    scaled = (motion - MOVE) / MODEL.sigmas(MOVE)
+    assert np.all(np.abs(scaled.mean(axis=0)) * np.sqrt(n) < stats.norm.isf(0.5e-4))
+    low, high = stats.chi2.interval(1.0 - 1e-4, n)
+    assert np.all((low < (scaled**2).sum(axis=0)) & ((scaled**2).sum(axis=0) < high))
+    correlations = np.corrcoef(scaled.T)[np.triu_indices(3, 1)]
+    assert np.all(np.abs(correlations) * np.sqrt(n) < stats.norm.isf(0.5e-4))
+
+
+def test_each_particle_moves_from_its_own_past() -> None:
+    """Eq. 4 conditions on the particle's own pose: without noise, particle m ends at x^[m] composed with u."""
+    still = OdometryModel(
+        sigma_along=0.0, sigma_across=0.0, sigma_heading=0.0, sigma_turn=0.0, floor_position=0.0, floor_heading=0.0
+    )
+    poses = np.random.default_rng(0).normal(size=(7, 3))
+    np.testing.assert_array_equal(still.sample(poses, MOVE, np.random.default_rng(1)), compose(poses, MOVE))
+
+
+def test_the_pose_is_linear_in_the_noise_of_the_odometry() -> None:
+    """Noise e of the odometry moves the pose by diag(R(theta), 1) e, exactly: the Jacobian leaves no remainder."""
+    start, noise = np.array([0.3, 0.4, 1.1]), np.array([0.2, -0.3, 0.4])
+    c, s = np.cos(start[2]), np.sin(start[2])
+    jacobian = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    np.testing.assert_allclose(compose(start, MOVE + noise), compose(start, MOVE) + jacobian @ noise, atol=1e-14)
+
+
+def test_the_same_stream_gives_the_same_draws() -> None:
+    """Randomness comes from the generator alone."""
+    draws = [MODEL.sample(np.zeros((5, 3)), MOVE, np.random.default_rng(9)) for _ in range(2)]
+    np.testing.assert_array_equal(*draws)
+
+
+@pytest.mark.parametrize("name", ["sigma_along", "sigma_across", "sigma_heading", "sigma_turn", "floor_heading"])
+def test_negative_noise_is_refused(name: str) -> None:
+    """A standard deviation is not negative."""
+    with pytest.raises(ValueError, match=rf"motion.{name}: expected a finite number >= 0, got -0.1. Give"):
+        OdometryModel(**{name: -0.1})
