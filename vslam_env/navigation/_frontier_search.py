@@ -103,7 +103,7 @@ def frontier_rows(box: Any, cost: Any, parent: Any, ignored: Any, row: int, col:
     """Collect the frontiers of a box whose first cell is the grid's (row, col).
 
     Returns:
-        (n, 5) float64 rows (x, y, heading, size, length), by increasing length.
+        (n, 5) float64 rows (x, y, heading, size, length).
     """
     height, width = box.shape
     mark = np.zeros((height, width), np.int8)  # 1: unseen beside free floor; 2: its component known; 3: in a piece
@@ -142,4 +142,4 @@ def frontier_rows(box: Any, cost: Any, parent: Any, ignored: Any, row: int, col:
                 found[count, SIZE] = num * CELL
                 found[count, LENGTH] = _path_length(parent, goal_row, goal_col)
                 count += 1
-    return found[:count][np.argsort(found[:count, LENGTH], kind="mergesort")]
+    return found[:count]

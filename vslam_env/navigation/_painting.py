@@ -125,16 +125,20 @@ def paint_scan(
 
     direction = np.empty((count, 2))
     hits = np.empty((count, 2))
-    is_hit = ranges < max_range
-    reach = np.minimum(ranges, max_range)
+    reach = np.empty(count)
+    is_hit = np.empty(count, np.bool_)
     low_x = high_x = low_y = high_y = 0.0
     for i in range(count):
         direction[i, 0], direction[i, 1] = math.cos(theta + angles[i]), math.sin(theta + angles[i])
+        reach[i], is_hit[i] = min(ranges[i], max_range), ranges[i] < max_range
         hits[i, 0], hits[i, 1] = reach[i] * direction[i, 0], reach[i] * direction[i, 1]
         low_x, high_x = min(low_x, hits[i, 0]), max(high_x, hits[i, 0])
         low_y, high_y = min(low_y, hits[i, 1]), max(high_y, hits[i, 1])
     kinds, lines = _surfaces(hits, is_hit)
-    free_below = np.maximum(np.minimum(reach[:-1], reach[1:]) - WALL_HALF_THICKNESS * (kinds == JUMP), 0.0)
+    free_below = np.empty(count - 1)
+    for i in range(count - 1):
+        margin = WALL_HALF_THICKNESS if kinds[i] == JUMP else 0.0
+        free_below[i] = max(min(reach[i], reach[i + 1]) - margin, 0.0)
 
     first_row, last_row = _cell_range(y + low_y - CELL, y + high_y + CELL)
     first_col, last_col = _cell_range(x + low_x - CELL, x + high_x + CELL)

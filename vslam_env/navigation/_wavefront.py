@@ -32,12 +32,10 @@ def known_box(cells: Any, row: int, col: int, height: int, width: int) -> Any:
     Returns:
         (height + 2 PAD, width + 2 PAD) uint8, its first cell being (row - PAD, col - PAD) of the grid.
     """
-    box = np.full((height + 2 * PAD, width + 2 * PAD), UNKNOWN, np.uint8)
-    box[PAD : PAD + height, PAD : PAD + width] = cells[row : row + height, col : col + width]
-    box[: max(PAD - row, 0)] = OUTSIDE
-    box[:, : max(PAD - col, 0)] = OUTSIDE
-    box[min(GRID_SIZE - row + PAD, box.shape[0]) :] = OUTSIDE
-    box[:, min(GRID_SIZE - col + PAD, box.shape[1]) :] = OUTSIDE
+    box = np.full((height + 2 * PAD, width + 2 * PAD), OUTSIDE, np.uint8)
+    for grid_row in range(max(row - PAD, 0), min(row + height + PAD, GRID_SIZE)):
+        for grid_col in range(max(col - PAD, 0), min(col + width + PAD, GRID_SIZE)):
+            box[grid_row - row + PAD, grid_col - col + PAD] = cells[grid_row, grid_col]
     return box
 
 

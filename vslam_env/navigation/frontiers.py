@@ -48,7 +48,7 @@ def _frontier_rows(cells: NDArray[np.uint8], start_xy: ArrayLike, radius: float,
     """Return what `find_frontiers` finds as (n, 5) rows (x, y, heading, size, length)."""
     ways = distance_map(cells, start_xy, radius)
     rows: FloatArray = frontier_rows(ways.box, ways.cost, ways.parent, ignored, *ways.corner)
-    return rows
+    return rows[rows[:, LENGTH].argsort(kind="stable")]
 
 
 def find_frontiers(
@@ -96,20 +96,28 @@ def _distances(goals: Any, places: Any) -> Any:
 @jit
 def _refill(costs: Any, slots: Any, sources: Any, found: Any, visits: Any) -> tuple[Any, Any]:
     """Return the next rows and visits of the slots: old candidates stay where they were, new ones fill the gaps."""
-    rows = np.full((NUM_SLOTS, NUM_COLUMNS), np.nan)
-    next_visits = np.zeros_like(visits)
+    chosen = np.full(NUM_SLOTS, -1, np.int64)
     is_new = np.ones(len(found), np.bool_)
     for k in range(len(slots)):
         if costs[slots[k], sources[k]] < SAME_GOAL:
-            rows[slots[k]], next_visits[slots[k]] = found[sources[k]], visits[slots[k]]
-            is_new[sources[k]] = False
-    slot = 0
-    for source in np.flatnonzero(is_new):
-        while slot < NUM_SLOTS and not np.isnan(rows[slot, 0]):
-            slot += 1
-        if slot == NUM_SLOTS:
-            break
-        rows[slot] = found[source]
+            chosen[slots[k]], is_new[sources[k]] = sources[k], False
+
+    rows = np.full((NUM_SLOTS, NUM_COLUMNS), np.nan)
+    next_visits = np.zeros(NUM_SLOTS, np.int64)
+    new = 0
+    for slot in range(NUM_SLOTS):
+        source = chosen[slot]
+        if source >= 0:
+            next_visits[slot] = visits[slot]
+        else:
+            while new < len(found) and not is_new[new]:
+                new += 1
+            if new == len(found):
+                continue
+            source = new
+            new += 1
+        for column in range(NUM_COLUMNS):
+            rows[slot, column] = found[source, column]
     return rows, next_visits
 
 
