@@ -1,0 +1,78 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vslam_env import EnvConfig, preset_config, vslam_v0
+from vslam_env.config import PRESETS
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_toml_round_trip(name: str, tmp_path: Path) -> None:
+    """A configuration survives the way through a TOML file unchanged."""
+    config = preset_config(name).replace(num_robots=2, decision_ticks=3, reward={"coverage": 0.5})
+    path = tmp_path / "config.toml"
+    path.write_text(config.to_toml(), encoding="utf-8")
+    assert EnvConfig.from_toml(path) == config
+
+
+def test_standard_is_the_contract() -> None:
+    """The standard preset has the numbers that the documentation promises."""
+    config = preset_config("standard")
+    sensor, odometry, scan = config.landmark_sensor, config.odometry, config.scan
+    assert config == EnvConfig()
+    assert (sensor.max_measurements, sensor.detection_probability, sensor.false_points) == (5, 0.9, 0.02)
+    assert (sensor.descriptor_noise, sensor.camera.max_range) == (0.17, 8.0)
+    assert np.isclose(sensor.max_incidence, np.pi / 3)
+    assert (odometry.sigma_distance, odometry.bias_distance) == (0.05, 0.02)
+    assert np.allclose([odometry.sigma_heading_per_metre, odometry.bias_heading_per_metre], np.radians([2.0, 0.5]))
+    assert (scan.num_rays, scan.max_range, scan.sigma) == (32, 8.0, 0.01)
+    assert np.isclose(scan.half_fov, sensor.camera.half_fov)
+    assert (config.num_robots, config.belief.filter.num_particles, config.max_cycles) == (3, 100, 1000)
+    assert (config.min_start_distance, config.shared_start_view, config.map_error_cutoff) == (5.0, False, 1.0)
+
+
+def test_presets_are_ordered() -> None:
+    """From easy to hard all true noise grows and less is seen."""
+    easy, standard, hard = (preset_config(name) for name in ("easy", "standard", "hard"))
+    for less, more in ((easy, standard), (standard, hard)):
+        assert less.odometry.sigma_distance < more.odometry.sigma_distance
+        assert less.odometry.bias_heading_per_metre < more.odometry.bias_heading_per_metre
+        assert less.landmark_sensor.descriptor_noise < more.landmark_sensor.descriptor_noise
+        assert less.landmark_sensor.false_points < more.landmark_sensor.false_points
+        assert less.landmark_sensor.detection_probability > more.landmark_sensor.detection_probability
+        assert less.landmark_sensor.max_measurements > more.landmark_sensor.max_measurements
+        assert less.belief.filter.motion.sigma_along < more.belief.filter.motion.sigma_along
+
+
+def test_true_and_assumed_noise_are_apart() -> None:
+    """Changing what the filters assume leaves the simulator's noise, and the other way round."""
+    config = EnvConfig()
+    assumed = config.replace(belief={"filter": {"camera": {"sigma_px": 1.7}}})
+    assert assumed.landmark_sensor == config.landmark_sensor
+    assert assumed.belief.filter.camera.sigma_px == 1.7
+    true = config.replace(landmark_sensor={"camera": {"sigma_px": 1.7}})
+    assert true.belief == config.belief
+
+
+def test_nested_changes_keep_the_rest() -> None:
+    """A dict changes the fields that it names, and no others."""
+    config = EnvConfig(max_cycles=77).replace(landmark_sensor={"max_measurements": 9})
+    assert config.max_cycles == 77
+    assert config.landmark_sensor.max_measurements == 9
+    assert config.landmark_sensor.detection_probability == 0.9
+
+
+@pytest.mark.parametrize(("action_type", "ticks"), [("continuous", 1), ("discrete", 1), ("goal", 10)])
+def test_default_decision_ticks(action_type: str, ticks: int) -> None:
+    """A step is one tick, with goal actions ten, unless asked otherwise."""
+    assert EnvConfig().replace(action_type=action_type).ticks_per_step == ticks
+    assert EnvConfig().replace(action_type=action_type, decision_ticks=4).ticks_per_step == 4
+
+
+def test_keywords_override_the_file(tmp_path: Path) -> None:
+    """Arguments of `parallel_env` go before what a configuration file says; the environment tells the result."""
+    path = tmp_path / "config.toml"
+    path.write_text(EnvConfig(num_robots=2, max_cycles=55).to_toml(), encoding="utf-8")
+    env = vslam_v0.parallel_env(config=path, num_particles=7, num_robots=4)
+    assert (env.config.num_robots, env.config.max_cycles, env.config.belief.filter.num_particles) == (4, 55, 7)

@@ -1,0 +1,166 @@
+from typing import Any
+
+import numpy as np
+import pytest
+
+from small_env import MEETING, small_env, turning, wander
+from vslam_env import ExplorationEnv
+from vslam_env.belief import TeamBelief
+from vslam_env.observation import flatten, observe
+from vslam_env.readings import Readings
+
+KEYS = ["pose", "pose_std", "map_stats", "local_grid", "scan", "candidates", "teammates", "teammates_mask"]
+
+
+def _record(env: ExplorationEnv, steps: int) -> tuple[list[tuple[Readings, ...]], list[dict[str, Any]]]:
+    """Run an episode in which the robots meet; return the readings of every tick and the observations of every step."""
+    readings: list[tuple[Readings, ...]] = []
+    env.recorder = readings.append
+    observations = [env.reset(seed=5, options={"start_poses": MEETING})[0]]
+    rng = np.random.default_rng(2)
+    for k in range(steps):
+        drive = turning(env.agents) if env.config.action_type == "continuous" and k < 120 else wander(env, rng)
+        observations.append(env.step(drive)[0])
+    return readings, observations
+
+
+@pytest.mark.parametrize(("action_type", "steps"), [("continuous", 300), ("goal", 30)])
+def test_observations_are_rebuilt_from_readings_alone(action_type: str, steps: int) -> None:
+    """300 ticks of observations, a merge among them, follow byte for byte from the readings, with no world present."""
+    env = small_env(max_cycles=400, action_type=action_type)
+    readings, recorded = _record(env, steps)
+    assert any(event.kind == "merge" for event in env.events)
+    ticks = env.config.ticks_per_step
+    assert len(readings) == 1 + 300
+
+    goal = action_type == "goal"
+    episode = env.episode
+    belief = TeamBelief(
+        env.config.belief, 2, episode.belief_seed, episode.body, decision_ticks=ticks if goal else None
+    )
+    for tick, now in enumerate(readings):
+        belief.step(now)
+        if tick % ticks:
+            continue
+        for robot, agent in enumerate(env.possible_agents):
+            rebuilt = observe(belief.belief(robot), now[robot].scan, goal)
+            expected = recorded[tick // ticks][agent]
+            assert list(rebuilt) == list(expected)
+            for name, value in rebuilt.items():
+                assert value.tobytes() == expected[name].tobytes(), (tick, agent, name)
+
+
+@pytest.mark.parametrize("observation_type", ["dict", "flat"])
+@pytest.mark.parametrize("action_type", ["continuous", "discrete", "goal"])
+def test_observations_are_inside_their_spaces(action_type: str, observation_type: str) -> None:
+    """Every observation is in its space, dtype included, from the reset on."""
+    env = small_env(action_type=action_type, observation_type=observation_type, num_robots=3, max_cycles=25)
+    observations, _ = env.reset(seed=1)
+    rng = np.random.default_rng(0)
+    while env.agents:
+        for agent, observation in observations.items():
+            assert env.observation_space(agent).contains(observation)
+        observations = env.step(wander(env, rng))[0]
+
+
+def test_keys_shapes_and_types() -> None:
+    """Observations have the documented names, shapes and types, and a mask exactly where actions are goals."""
+    observation = small_env(action_type="goal").reset(seed=1)[0]["robot_1"]
+    assert list(observation) == [*KEYS, "action_mask"]
+    shapes = {name: value.shape for name, value in observation.items()}
+    assert shapes == {
+        "pose": (3,),
+        "pose_std": (3,),
+        "map_stats": (6,),
+        "local_grid": (3, 48, 48),
+        "scan": (32,),
+        "candidates": (16, 5),
+        "teammates": (7, 5),
+        "teammates_mask": (7,),
+        "action_mask": (17,),
+    }
+    types = {"local_grid": np.uint8, "teammates_mask": np.int8, "action_mask": np.int8}
+    assert all(value.dtype == types.get(name, np.float32) for name, value in observation.items())
+    assert list(small_env().reset(seed=1)[0]["robot_1"]) == KEYS
+
+
+def test_consecutive_observations_share_no_memory() -> None:
+    """What an agent does to an observation changes neither the next one nor what the robot believes."""
+    env = small_env(action_type="goal")
+    before, _ = env.reset(seed=3)
+    after = env.step(dict.fromkeys(env.agents, 0))[0]
+    for agent in before:
+        for name in before[agent]:
+            for other in after.values():
+                assert not np.shares_memory(before[agent][name], other[name])
+    pose, scan = env.belief("robot_0").pose.copy(), env.readings[0].scan.copy()
+    for value in after["robot_0"].values():
+        value[:] = 1
+    assert np.array_equal(env.belief("robot_0").pose, pose)
+    assert np.array_equal(env.readings[0].scan, scan)
+
+
+def test_every_kind_of_element_varies() -> None:
+    """Over an episode with a merge each part of the observation carries information: none is constant."""
+    _, observations = _record(small_env(max_cycles=400), 300)
+    for name in KEYS:
+        values = np.array([step["robot_0"][name] for step in observations]).reshape(len(observations), -1)
+        changing = (values != values[0]).any(axis=0)
+        if name in ("pose", "pose_std", "map_stats", "scan"):
+            assert changing.all(), name
+        assert changing.any(), name
+
+
+def test_local_grid_is_ego_centred() -> None:
+    """A wall ahead is above the middle of the local grid; turning by 90 degrees to the right moves it to the left."""
+    env = small_env(num_robots=1)
+    observations, _ = env.reset(seed=0, options={"start_poses": [[8.0, 3.0, 0.0]]})  # 3 m from the wall on the right
+    occupied = observations["robot_0"]["local_grid"][1]
+    rows = np.flatnonzero(occupied[:, 23:25].any(axis=1))
+    assert len(rows)
+    assert np.abs(rows - (23.5 - 3.0 / 0.2)).min() <= 1.5
+    assert (rows < 24).all()
+
+    for _ in range(11):  # a quarter turn in 1.1 s, at no more than 1.5 rad/s
+        observations = env.step({"robot_0": np.array([0.0, -(np.pi / 2 / 1.1) / 1.5])})[0]
+    occupied = observations["robot_0"]["local_grid"][1]
+    columns = np.flatnonzero(occupied[23:25, :24].any(axis=0))
+    assert len(columns)
+    assert np.abs(columns - (23.5 - 3.0 / 0.2)).min() <= 2.0
+
+
+def test_mask_is_what_the_belief_offers() -> None:
+    """Staying is always valid, and action k + 1 exactly where slot k of the candidates is filled."""
+    env = small_env(action_type="goal")
+    observations, _ = env.reset(seed=3)
+    for agent in env.agents:
+        valid = env.belief(agent).candidates.valid
+        assert observations[agent]["action_mask"].tolist() == [1, *valid.astype(int)]
+        assert (observations[agent]["candidates"][~valid] == 0.0).all()
+
+
+def test_flat_is_the_dict_in_order() -> None:
+    """The flat observation is the named one, concatenated in the documented order, the mask apart."""
+    named = small_env(action_type="goal").reset(seed=4)[0]["robot_0"]
+    flat = small_env(action_type="goal", observation_type="flat").reset(seed=4)[0]["robot_0"]
+    assert np.array_equal(flat["action_mask"], named["action_mask"])
+    assert np.array_equal(flat["observation"], flatten(named))
+    assert np.array_equal(flat["observation"][6:12], named["map_stats"])
+    assert flat["observation"].shape == (3 + 3 + 6 + 3 * 48 * 48 + 32 + 80 + 35 + 7,)
+
+
+def test_teammates_appear_with_the_merge() -> None:
+    """Before a merge nobody is there; after it the teammate stands where it truly is, to within the maps' errors."""
+    env = small_env(max_cycles=400)
+    _, observations = _record(env, 300)
+    merged = next(event.step for event in env.events if event.kind == "merge")
+    assert not observations[merged - 1]["robot_0"]["teammates_mask"].any()
+    last = observations[-1]
+    for robot, other in ((0, 1), (1, 0)):
+        seen = last[f"robot_{robot}"]
+        assert seen["teammates_mask"].tolist() == [1, 0, 0, 0, 0, 0, 0]
+        me, mate = env.true_poses[robot], env.true_poses[other]
+        offset = mate[:2] - me[:2]
+        c, s = np.cos(me[2]), np.sin(me[2])
+        ahead, left = c * offset[0] + s * offset[1], c * offset[1] - s * offset[0]
+        assert np.allclose(seen["teammates"][0, :2], [ahead, left], atol=0.5)
