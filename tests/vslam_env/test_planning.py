@@ -148,9 +148,10 @@ def test_a_path_keeps_away_from_walls_where_there_is_room() -> None:
     [
         ((0.1, 0.1), (3.1, 0.1)),  # behind a wall
         ((0.1, 0.1), (-6.0, 0.0)),  # on unknown floor
-        ((0.1, 0.1), (1e9, 0.0)),  # far outside the grid
+        ((0.1, 0.1), (-1e300, 0.0)),  # far outside the grid
         ((3.1, 0.1), (0.1, 0.1)),  # the robot is where nothing is known
         ((-45.0, 0.0), (0.1, 0.1)),
+        ((0.0, 1e300), (0.1, 0.1)),
     ],
 )
 def test_where_no_way_is_known_there_is_no_path(start: tuple[float, float], goal: tuple[float, float]) -> None:

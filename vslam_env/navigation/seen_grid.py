@@ -123,7 +123,8 @@ class SeenGrid:
         self._refuse_if_read_only()
         x, y, theta = pose_floats(pose)
         ahead = radius + 0.5 * CELL
-        row, col = cell_of([x + ahead * math.cos(theta), y + ahead * math.sin(theta)]).tolist()
+        row = math.floor((y + ahead * math.sin(theta) + HALF_WIDTH) / CELL)
+        col = math.floor((x + ahead * math.cos(theta) + HALF_WIDTH) / CELL)
         if 0 <= row < GRID_SIZE and 0 <= col < GRID_SIZE:
             self._evidence[row, col] = max(self._evidence[row, col], 2 * _painting.HIT)
             self._cells[row, col] = OCCUPIED
