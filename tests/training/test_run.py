@@ -1,0 +1,308 @@
+import json
+import signal
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from slam_backend.geometry import between, compose
+from slam_backend.trajectory import Trajectory
+from training import cli
+from training.episode import EpisodeRecord, MergeRecord, Progress, run_episode
+from training.episode_scores import score_episode
+from training.figures import draw_errors, draw_maps
+from training.interrupt import interrupt_flag
+from training.live import LiveProgress, describe
+from training.run_config import EPISODE_S, RunConfig
+from training.run_tables import print_tables
+from vslam_env import vslam_v0
+from vslam_env.world import World
+
+# A room of 7 x 5 m in which two robots look at the same wall from places that are not the same.
+ROOM = World(
+    "room",
+    np.array([[0.0, 0.0, 7.0, 0.0], [7.0, 0.0, 7.0, 5.0], [7.0, 5.0, 0.0, 5.0], [0.0, 5.0, 0.0, 0.0]]),
+    start_poses=np.array([[2.0, 1.5, 0.2], [1.5, 3.5, -0.4]]),
+)
+STEPS = 31
+
+
+def play(**options: object) -> EpisodeRecord:
+    """Return the record of two random walkers in the room."""
+    config = RunConfig(robots=2, policy="random_walk", seed=3)
+    env = vslam_v0.parallel_env(**{"world": ROOM, "num_robots": 2, "max_cycles": STEPS, "num_particles": 13} | options)
+    return run_episode(env, config.make_policies(env), config.seed)
+
+
+@pytest.fixture(scope="module")
+def record() -> EpisodeRecord:
+    """Return an episode in which the oracle merges both maps as soon as they share three landmarks."""
+    return play(oracle_merge=True)
+
+
+def test_a_record_has_a_row_for_the_reset_and_for_each_step(record: EpisodeRecord) -> None:
+    """Times, poses, errors and coverage have one entry more than there are steps, and begin at the reset."""
+    assert record.complete
+    np.testing.assert_allclose(record.times, 0.1 * np.arange(STEPS + 1))
+    for poses in (record.true_poses, record.estimated, record.reckoned):
+        assert poses.shape == (2, STEPS + 1, 3)
+    assert record.map_errors.shape == (2, STEPS + 1)
+    assert record.coverage.shape == (STEPS + 1,)
+    np.testing.assert_allclose(record.true_poses[:, 0], ROOM.start_poses)
+    np.testing.assert_allclose(record.estimated[:, 0], 0.0, atol=1e-9)
+    np.testing.assert_array_equal(record.reckoned[:, 0], 0.0)
+    assert record.coverage[-1] >= record.coverage[0] > 0.0
+
+
+def test_the_oracle_merges_without_error(record: EpisodeRecord) -> None:
+    """A merge with the true transform has no error, and both robots are alone until then."""
+    (merge,) = record.merges
+    assert (merge.robots_a, merge.robots_b) == ((0,), (1,))
+    assert merge.error_m < 1e-9
+    assert merge.error_deg < 1e-9
+    assert not merge.is_false
+    assert record.groups == ((0, 1),)
+    assert record.alone_until == (merge.time, merge.time)
+
+
+def test_an_episode_repeats_from_its_seed() -> None:
+    """The same seed gives the same record, bit by bit; goal actions are recorded tick by tick as well."""
+    first, second = play(), play()
+    for name in ("true_poses", "estimated", "reckoned", "map_errors", "coverage"):
+        np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
+    config = RunConfig(robots=2, action_type="goal", seed=3)
+    env = vslam_v0.parallel_env(world=ROOM, num_robots=2, action_type="goal", max_cycles=3, num_particles=13)
+    goal = run_episode(env, config.make_policies(env), config.seed)
+    np.testing.assert_allclose(goal.times, [0.0, 1.0, 2.0, 3.0])
+    # Thirty readings are chained to three rows: noisy, but no further off than odometry can be after three metres.
+    for robot in range(2):
+        truth = between(goal.true_poses[robot, 0], goal.true_poses[robot])
+        assert np.abs(goal.reckoned[robot] - truth).max() < 0.5
+
+
+def test_an_episode_can_be_stopped() -> None:
+    """`should_stop` ends the episode after the current step, and the record says so."""
+    config = RunConfig(robots=2, policy="random_walk", seed=3)
+    env = vslam_v0.parallel_env(world=ROOM, num_robots=2, max_cycles=STEPS, num_particles=13)
+    seen: list[int] = []
+    stopped = run_episode(
+        env, config.make_policies(env), 3, lambda p: seen.append(p.step), lambda: len(seen) > 5
+    )
+    assert seen == [0, 1, 2, 3, 4, 5]
+    assert not stopped.complete
+    assert len(stopped.times) == 6
+
+
+def test_every_agent_needs_a_policy() -> None:
+    """A missing policy is named before anything runs."""
+    env = vslam_v0.parallel_env(world=ROOM, num_robots=2)
+    with pytest.raises(ValueError, match=r"policies: expected a policy for each agent, got no policy for \['robot_0'"):
+        run_episode(env, {}, 0)
+
+
+def test_scores_of_a_perfect_path_are_zero_and_dead_reckoning_is_scored_beside_it(record: EpisodeRecord) -> None:
+    """The true path scores 0; one that ends 0.6 m off after 12 m is 5 % off; turning it alone is aligned away."""
+    own = between(record.true_poses[:, :1], record.true_poses)
+    off = own.copy()
+    off[:, -1, 0] += 0.6
+    infos = tuple({**info, "distance": 12.0} for info in record.infos)
+    metrics = score_episode(replace(record, estimated=own, reckoned=off, infos=infos))
+    for robot in metrics["robots"]:
+        assert robot["ate_start_m"] < 1e-12
+        assert robot["ate_aligned_m"] < 1e-12
+        assert robot["dead_reckoning_end_percent"] == pytest.approx(5.0)
+        assert robot["dead_reckoning_ate_start_m"] == pytest.approx(0.6 / np.sqrt(STEPS + 1))
+    turned = score_episode(replace(record, estimated=compose([0.0, 0.0, 0.3], own)))
+    for robot in turned["robots"]:
+        assert robot["ate_start_m"] > 10.0 * robot["ate_aligned_m"]
+    assert metrics["team"]["path_m"] == 12.0
+
+
+def test_metrics_have_the_promised_names(record: EpisodeRecord) -> None:
+    """Independent checks rely on these keys."""
+    metrics = score_episode(record)
+    assert {"robots", "merges", "groups", "coverage"} <= set(metrics)
+    promised = {
+        "ate_aligned_m", "ate_start_m", "dead_reckoning_ate_aligned_m", "map_rmse_m", "map_recall", "map_precision",
+        "map_error",
+    }  # fmt: skip
+    assert all(promised <= set(robot) for robot in metrics["robots"])
+    assert {"time_s", "error_m", "error_deg", "robots_a", "robots_b", "false"} <= set(metrics["merges"][0])
+
+
+@pytest.mark.parametrize(("error_m", "error_deg", "false"), [(0.5, 5.0, False), (0.51, 0.0, True), (0.0, 5.1, True)])
+def test_a_merge_is_false_beyond_half_a_metre_or_five_degrees(error_m: float, error_deg: float, false: bool) -> None:
+    """The limits of the definition, either of which suffices."""
+    merge = MergeRecord(12, 1.2, (0,), (1, 2), 9, error_m, error_deg)
+    assert merge.is_false is false
+    assert describe(merge).startswith("   1.2 s  maps of 0 and 1, 2 merged on 9 landmarks, off by")
+
+
+def test_figures_are_drawn_for_any_team(record: EpisodeRecord, tmp_path: Path) -> None:
+    """One robot or five, merged or not, and a run that was stopped at once: all give two pictures."""
+    def cut(robots: int, rows: int) -> EpisodeRecord:
+        chosen = [k % 2 for k in range(robots)]
+        return replace(
+            record,
+            times=record.times[:rows],
+            coverage=record.coverage[:rows],
+            map_errors=record.map_errors[chosen, :rows],
+            **{n: getattr(record, n)[chosen, :rows] for n in ("true_poses", "estimated", "reckoned")},
+            infos=tuple(record.infos[k] for k in chosen),
+            own_maps=tuple(record.own_maps[k] for k in chosen),
+            alone_until=tuple(None if k == 0 else 1.0 for k in chosen),
+            scene=replace(record.scene, robots=tuple(record.scene.robots[k] for k in chosen)),
+            merges=record.merges * (robots - 1),
+        )
+
+    for robots, rows in ((1, 1), (1, STEPS), (5, STEPS)):
+        for draw in (draw_maps, draw_errors):
+            file = tmp_path / f"{draw.__name__}-{robots}-{rows}.png"
+            draw(cut(robots, rows), file)
+            assert file.read_bytes().startswith(b"\x89PNG")
+
+
+def test_tables_show_what_is_not_known_as_a_dash(record: EpisodeRecord) -> None:
+    """A missing figure is a dash, units in brackets survive, and a false merge is called so."""
+    metrics = score_episode(record)
+    metrics["robots"][1]["map_rmse_m"] = None
+    metrics["merges"][0]["false"] = True
+    console = Console(width=100, record=True, file=open("/dev/null", "w"))  # noqa: SIM115 - closed with the console
+    print_tables(console, metrics)
+    console.file.close()
+    text = console.export_text()
+    for word in ("map error E [m]", "off by [deg]", "false", " - ", "robot 1", "team"):
+        assert word in text
+
+
+def test_live_figures_tell_of_merges(record: EpisodeRecord) -> None:
+    """Each merge is printed as it comes, beside the bar."""
+    with open("/dev/null", "w") as nowhere:
+        console = Console(width=120, record=True, file=nowhere)
+        infos = {f"robot_{k}": info for k, info in enumerate(record.infos)}
+        with LiveProgress(console, STEPS, list(infos)) as live:
+            live.show(Progress(5, 0.5, infos, record.merges))
+    assert "maps of 0 and 1 merged" in console.export_text()
+
+
+def test_the_first_interrupt_asks_and_the_second_insists() -> None:
+    """One Ctrl-C only raises the flag; the next interrupts; afterwards the usual handler is back."""
+    usual = signal.getsignal(signal.SIGINT)
+
+    def insist() -> None:
+        with interrupt_flag() as interrupted:
+            assert not interrupted()
+            signal.raise_signal(signal.SIGINT)
+            assert interrupted()
+            signal.raise_signal(signal.SIGINT)
+
+    with pytest.raises(KeyboardInterrupt, match=r"^$"):
+        insist()
+    assert signal.getsignal(signal.SIGINT) is usual
+
+
+def _vslam(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
+    """Run the command line; return its exit status."""
+    monkeypatch.setattr(sys, "argv", ["vslam", *arguments])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    return int(end.value.code or 0)
+
+
+SHORT = ("--robots", "2", "--particles", "11", "--max-cycles", "23", "--world", "fig5")
+
+
+@pytest.mark.slow
+def test_a_run_folder_repeats_itself(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """A run leaves all promised files, and its own config repeats its paths byte by byte and its metrics exactly."""
+    one, two, copy = tmp_path / "one", tmp_path / "two", tmp_path / "copy.json"
+    assert _vslam(monkeypatch, "run", *SHORT, "--seed", "5", "--out", str(one), "--json", str(copy)) == 0
+    assert _vslam(monkeypatch, "run", "--config", str(one / "config.toml"), "--no-video", "--out", str(two)) == 0
+    names = {file.name for file in one.iterdir()}
+    paths = {f"robot{k}_{kind}.tum" for k in range(2) for kind in ("estimate", "dead_reckoning", "truth")}
+    assert names == paths | {"config.toml", "metrics.json", "map.png", "error.png", "video.mp4"}
+    assert {file.name for file in two.iterdir()} == names - {"video.mp4"}
+    first, second = (json.loads((folder / "metrics.json").read_text()) for folder in (one, two))
+    assert first == second == json.loads(copy.read_text())
+    assert (first["seed"], first["config"]["world"], first["complete"]) == (5, "fig5", True)
+    for name in paths:
+        assert (one / name).read_bytes() == (two / name).read_bytes()
+        assert len(Trajectory.load_tum(one / name)) == 24
+
+
+@pytest.mark.slow
+def test_an_interrupted_run_writes_what_it_has(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Ctrl-C after seven steps leaves a whole folder about these seven steps."""
+    usual: Callable[[LiveProgress, Progress], None] = LiveProgress.show
+
+    def show(self: LiveProgress, progress: Progress) -> None:
+        usual(self, progress)
+        if progress.step == 7:
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(LiveProgress, "show", show)
+    assert _vslam(monkeypatch, "run", *SHORT, "--out", str(tmp_path / "run")) == 0
+    metrics: Mapping[str, object] = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert metrics["complete"] is False
+    assert metrics["duration_s"] == pytest.approx(0.7)
+    assert len(Trajectory.load_tum(tmp_path / "run" / "robot1_truth.tum")) == 8
+    assert (tmp_path / "run" / "video.mp4").stat().st_size > 1000
+    assert not [file for file in (tmp_path / "run").iterdir() if file.name.startswith(".")]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--world", "nowhere"), "world: expected one of 'office', 'fig5', or a path"),
+        (("--policy", "nobody"), "policy: expected one of 'frontier', 'random_goals', 'random_walk', got 'nobody'."),
+        (("--policy", "random_walk", "--action-type", "goal"), "action_type: expected 'continuous' or 'discrete'"),
+        (("--robots", "0"), "robots: expected an int >= 1, got 0. Use 1 to 8 robots."),
+        (("--robots", "9"), "num_robots: expected an int from 1 to 8, got 9."),
+        (("--particles", "0"), "particles: expected an int >= 1, got 0."),
+        (("--max-cycles", "0"), "max_cycles: expected an int >= 1, got 0."),
+        (("--seed", "-1"), "seed: expected an int >= 0, got -1."),
+        (("--action-type", "fly"), "action_type: expected one of 'continuous', 'discrete', 'goal', got 'fly'."),
+        (("--preset", "dire"), "preset: expected one of 'easy', 'standard', 'hard', got 'dire'."),
+        (("--config", "/nowhere"), "config: expected the config.toml of an earlier run"),
+        (("--world", "broken.json"), "world: expected"),
+        (("--world", "fig5", "--out", "/proc/version/run"), "out: expected a folder that can be written"),
+        (("--world", "fig5", "--out", "full"), "out: expected a new or empty folder"),
+    ],
+)
+def test_bad_input_is_one_line_and_status_2(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    arguments: tuple[str, ...],
+    message: str,
+) -> None:
+    """What is wrong is said on one line of stderr, and no run folder is left behind."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "file").touch()
+    (tmp_path / "broken.json").write_text("{walls: [1, 2")
+    assert _vslam(monkeypatch, "run", *arguments) == 2
+    shown = capsys.readouterr()
+    assert shown.err.startswith(f"error {message}")
+    assert shown.err.count("\n") == 1
+    assert not shown.out
+    assert not (tmp_path / "runs").exists()
+
+
+def test_a_config_file_with_an_unknown_name_is_refused() -> None:
+    """A misspelt key is named rather than ignored."""
+    with pytest.raises(ValueError, match=r"config: expected one of world, .*, got 'colour'"):
+        RunConfig.from_mapping({"colour": "blue"})
+
+
+@pytest.mark.parametrize(("action_type", "step_s"), [("continuous", 0.1), ("discrete", 0.1), ("goal", 1.0)])
+def test_an_episode_lasts_as_long_with_any_actions(action_type: str, step_s: float) -> None:
+    """By default the simulated time is the same, whatever a step is."""
+    config = RunConfig(action_type=action_type)
+    assert config.step_s == pytest.approx(step_s)
+    assert config.num_steps * config.step_s == pytest.approx(EPISODE_S)
+    assert RunConfig.from_mapping(config.to_mapping()) == config
