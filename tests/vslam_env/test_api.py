@@ -2,9 +2,9 @@ import gymnasium
 import pettingzoo
 import pytest
 from gymnasium.utils.env_checker import check_env as gymnasium_check_env
+from small_env import room, small_env
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
-from small_env import room, small_env
 from vslam_env import ExplorationEnv, vslam_v0
 
 # pettingzoo.test imports connect_four in a way that pettingzoo itself deprecates

@@ -3,8 +3,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-
 from small_env import small_env, wander
+
 from vslam_env import ExplorationEnv
 
 

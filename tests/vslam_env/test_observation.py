@@ -2,8 +2,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-
 from small_env import MEETING, small_env, turning, wander
+
 from vslam_env import ExplorationEnv
 from vslam_env.belief import TeamBelief
 from vslam_env.observation import flatten, observe

@@ -1,0 +1,180 @@
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from small_env import MEETING, small_env
+
+from vslam_env import World, vslam_v0
+from vslam_env.solo import SoloExplorationEnv
+
+NARROW = World("narrow", [[0, 0, 9, 0], [9, 0, 9, 0.3], [9, 0.3, 0, 0.3], [0, 0.3, 0, 0]])
+CLOSET = World("closet", [[0, 0, 2, 0], [2, 0, 2, 2], [2, 2, 0, 2], [0, 2, 0, 0]])
+
+
+def _reset(**kwargs: Any) -> Callable[[], Any]:
+    options = kwargs.pop("options", None)
+    seed = kwargs.pop("seed", 0)
+    return lambda: small_env(**kwargs).reset(seed=seed, options=options)
+
+
+def _step(actions: Any, **kwargs: Any) -> Callable[[], Any]:
+    def act() -> Any:
+        env = small_env(**kwargs)
+        env.reset(seed=0)
+        return env.step(actions)
+
+    return act
+
+
+class _Nameless:
+    weight = 1.0
+
+
+class _Twice:
+    name, weight = "twice", 1.0
+
+    def __call__(self, before: Any, after: Any) -> Any:
+        return np.array([1.0, np.nan])
+
+
+CASES: dict[str, tuple[Callable[[], Any], str]] = {
+    "unknown world": (_reset(world="castle"), r"world.*expected.*'office'.*'castle'"),
+    "missing world file": (_reset(world="nowhere.png"), r"nowhere\.png"),
+    "world of a wrong type": (_reset(world=3), "world: expected a name, a path, a World or a function, got 3"),
+    "function that makes no world": (_reset(world=lambda rng: 5), "world: expected a function that returns a World"),
+    "robots do not fit": (_reset(world=NARROW), "a disc of radius 0.2 m fits"),
+    "starts do not fit": (_reset(world=CLOSET, num_robots=8), "num_robots: expected as many as can start 5 m apart"),
+    "no robots": (lambda: small_env(num_robots=0), "num_robots: expected an int >= 1, got 0"),
+    "too many robots": (lambda: small_env(num_robots=9), "num_robots: expected an int from 1 to 8, got 9"),
+    "no particles": (lambda: small_env(num_particles=0), "num_particles: expected an int >= 1, got 0"),
+    "robots as text": (lambda: small_env(num_robots="many"), "num_robots: expected a valid integer.*got 'many'"),
+    "unknown sensor": (lambda: small_env(sensor="stereo"), "sensor: expected 'landmark', got 'stereo'"),
+    "unknown action type": (lambda: small_env(action_type="jump"), "action_type: expected 'continuous', .*'jump'"),
+    "unknown observations": (lambda: small_env(observation_type="image"), "observation_type: expected 'dict' or 'flat'"),
+    "unknown preset": (lambda: small_env(preset="brutal"), "preset: expected one of 'easy', 'standard', 'hard'"),
+    "unknown render mode": (lambda: small_env(render_mode="ansi"), "render_mode: expected one of 'human', 'rgb_array'"),
+    "no cycles": (lambda: small_env(max_cycles=0), "max_cycles: expected an int >= 1, got 0"),
+    "no ticks": (lambda: small_env(decision_ticks=0), "decision_ticks: expected an int >= 1, got 0"),
+    "recall above one": (lambda: small_env(stop_at_recall=1.5), "stop_at_recall: expected a finite number > 0 and <= 1"),
+    "preset and config": (
+        lambda: small_env(preset="easy", config=small_env().config),
+        "preset: expected None beside a config",
+    ),
+    "config of a wrong type": (lambda: small_env(config=7), "config: expected an EnvConfig, a path or None, got 7"),
+    "missing config": (lambda: small_env(config="nowhere.toml"), r"config: expected a readable TOML file.*nowhere\.toml"),
+    "unknown field": (lambda: small_env().config.replace(robots=2), "robots: expected a known field, got 2"),
+    "unknown nested field": (
+        lambda: small_env().config.replace(belief={"filter": {"particles": 5}}),
+        r"belief\.filter\.particles: expected a known field, got 5",
+    ),
+    "unknown reward": (lambda: small_env(reward={"fame": 1.0}), "reward: expected one of 'map_error', .*got 'fame'"),
+    "reward as text": (lambda: small_env(reward="map_error"), "reward: expected weights by name, or a list of terms"),
+    "reward without a name": (lambda: small_env(reward=[_Nameless()]), "reward: expected terms with name, weight and a call"),
+    "repeated reward": (lambda: small_env(reward=[_Twice(), _Twice()]), "reward: expected terms with different names"),
+    "reward that is NaN": (
+        _step({"robot_0": [0, 0], "robot_1": [0, 0]}, reward=[_Twice()]),
+        "reward term 'twice': expected 2 finite numbers",
+    ),
+    "weight that is NaN": (lambda: small_env(reward={"map_error": float("nan")}), "reward.*map_error.*finite number"),
+    "negative seed": (_reset(seed=-1), "seed: expected an int >= 0, got -1"),
+    "seed as text": (_reset(seed="x"), "seed: expected an int >= 0, got 'x'"),
+    "options as list": (_reset(options=[1]), r"options: expected a dict or None, got \[1\]"),
+    "world seed": (_reset(options={"world_seed": 1.5}), r"options\['world_seed'\]: expected an int >= 0, got 1.5"),
+    "starts of a wrong shape": (_reset(options={"start_poses": [[1, 2, 3]]}), r"start_poses: expected an array of shape"),
+    "start that is NaN": (
+        _reset(options={"start_poses": [[np.nan, 3, 0], [4, 4, 0]]}),
+        "start_poses: expected finite numbers",
+    ),
+    "start in a wall": (_reset(options={"start_poses": [[3, 3, 0], [0.1, 5, 0]]}), r"start_poses\[1\]: expected a place"),
+    "starts that overlap": (
+        _reset(options={"start_poses": [MEETING[0], MEETING[0]]}),
+        r"start_poses\[1\]: expected a place at least 0.4 m from the other robots",
+    ),
+    "actions as list": (_step([1, 2]), r"actions: expected a dict from agent to action, got \[1, 2\]"),
+    "unknown agent": (
+        _step({"robot_0": [0, 0], "robot_1": [0, 0], "robot_7": [0, 0]}),
+        r"actions: expected actions of \['robot_0', 'robot_1'\], got 'robot_7'",
+    ),
+    "missing agent": (_step({"robot_0": [0, 0]}), "actions: expected an action of 'robot_1', got no 'robot_1'"),
+    "action that is NaN": (
+        _step({"robot_0": [0, np.nan], "robot_1": [0, 0]}),
+        r"actions\['robot_0'\]: expected two numbers in \[-1, 1\]",
+    ),
+    "action out of bounds": (_step({"robot_0": [0, 0], "robot_1": [2, 0]}), r"actions\['robot_1'\]: expected two numbers"),
+    "action of a wrong shape": (
+        _step({"robot_0": [0, 0, 0], "robot_1": [0, 0]}),
+        r"actions\['robot_0'\]: expected an array of shape \(2,\), got shape \(3,\)",
+    ),
+    "action as text": (_step({"robot_0": "go", "robot_1": [0, 0]}), r"actions\['robot_0'\]: expected an array of shape"),
+    "discrete action out of range": (
+        _step({"robot_0": 4, "robot_1": 0}, action_type="discrete"),
+        r"actions\['robot_0'\]: expected an int from 0 to 3, got 4",
+    ),
+    "goal out of range": (
+        _step({"robot_0": 0, "robot_1": -1}, action_type="goal"),
+        r"actions\['robot_1'\]: expected an int from 0 to 16, got -1",
+    ),
+    "goal as float": (_step({"robot_0": 1.5, "robot_1": 0}, action_type="goal"), "expected an int from 0 to 16, got 1.5"),
+    "team in a solo environment": (lambda: SoloExplorationEnv(num_robots=2), "num_robots: expected 1, got 2"),
+    "belief of a stranger": (
+        lambda: (env := small_env(), env.reset(seed=0), env.belief("robot_9")),
+        r"agent: expected one of \['robot_0', 'robot_1'\], got 'robot_9'",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_bad_input_is_refused_clearly(name: str) -> None:
+    """Bad input raises one ValueError that names the argument, what was expected, what came, and a cure."""
+    call, message = CASES[name]
+    with pytest.raises(ValueError, match=message) as caught:
+        call()
+    text = str(caught.value)
+    assert ": expected " in text
+    assert ", got " in text
+    assert text.rstrip().endswith((".", "?"))
+
+
+@pytest.mark.parametrize("name", ["step", "state", "belief", "events", "readings", "scene", "true_poses"])
+def test_nothing_works_before_a_reset(name: str) -> None:
+    """What needs an episode says so before the first reset."""
+    env = small_env()
+    calls: dict[str, Callable[[], Any]] = {
+        "step": lambda: env.step({}),
+        "state": env.state,
+        "belief": lambda: env.belief("robot_0"),
+        "scene": env.scene,
+    }
+    with pytest.raises(RuntimeError, match=rf"{name}: expected a running episode, got none\. Call reset\(\) first\."):
+        calls.get(name, lambda: getattr(env, name))()
+
+
+def test_no_step_after_the_end() -> None:
+    """After the end of an episode a step says that it has ended."""
+    env = small_env(max_cycles=1)
+    env.reset(seed=0)
+    env.step({agent: np.zeros(2) for agent in env.agents})
+    with pytest.raises(RuntimeError, match=r"step: expected a running episode, got one that has ended"):
+        env.step({agent: np.zeros(2) for agent in env.possible_agents})
+
+
+def test_refused_actions_move_nothing() -> None:
+    """After a refused action the environment is as before."""
+    env = small_env()
+    env.reset(seed=0)
+    before = env.state()
+    with pytest.raises(ValueError, match="expected two numbers"):
+        env.step({"robot_0": [1, 0], "robot_1": [0, 9]})
+    assert np.array_equal(env.state(), before)
+
+
+def test_a_failed_reset_leaves_no_episode(tmp_path: Path) -> None:
+    """After a reset that failed there is nothing to step, and a good reset works."""
+    env = vslam_v0.parallel_env(num_robots=1, num_particles=5, world="fig5")
+    with pytest.raises(ValueError, match="start_poses"):
+        env.reset(seed=0, options={"start_poses": [[-50.0, 0.0, 0.0]]})
+    assert env.agents == []
+    env.reset(seed=0)
+    assert env.agents == ["robot_0"]

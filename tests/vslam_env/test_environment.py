@@ -1,0 +1,355 @@
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from small_env import MEETING, room, small_env, turning, wander
+
+from slam_backend.geometry import between, compose
+from vslam_env import World
+from vslam_env.actions import DISCRETE_COMMANDS, command_of
+
+INFO_KEYS = [
+    "map_error",
+    "map_rmse",
+    "map_recall",
+    "map_precision",
+    "pose_error",
+    "heading_error",
+    "coverage",
+    "group",
+    "group_size",
+    "merges",
+    "collisions",
+    "distance",
+    "bytes_sent",
+    "invalid_action",
+    "reward/map_error",
+]
+BARE = World("bare", [[0, 0, 9, 0], [9, 0, 9, 7], [9, 7, 0, 7], [0, 7, 0, 0]])
+
+
+@pytest.mark.parametrize("action_type", ["continuous", "discrete", "goal"])
+def test_infos_are_flat_finite_and_always_the_same(action_type: str) -> None:
+    """At the reset and at every step each agent's info has the same keys, with finite Python numbers."""
+    env = small_env(action_type=action_type, max_cycles=12)
+    infos = env.reset(seed=2)[1]
+    rng = np.random.default_rng(0)
+    while env.agents:
+        for agent in env.possible_agents:
+            assert list(infos[agent]) == INFO_KEYS
+            assert all(type(value) in (int, float) and math.isfinite(value) for value in infos[agent].values())
+        infos = env.step(wander(env, rng))[4]
+
+
+def test_everybody_is_truncated_together() -> None:
+    """After `max_cycles` steps, which may be assigned, all agents are truncated, none terminated, and gone."""
+    env = small_env()
+    env.max_cycles = 3
+    env.reset(seed=0)
+    for cycle in range(3):
+        _, rewards, terminations, truncations, _ = env.step(turning(env.agents))
+        assert terminations == {"robot_0": False, "robot_1": False}
+        assert truncations == dict.fromkeys(env.possible_agents, cycle == 2)
+        assert all(type(reward) is float for reward in rewards.values())
+    assert env.agents == []
+
+
+def test_stop_at_recall_terminates_everybody() -> None:
+    """With `stop_at_recall` all agents terminate in the step in which the poorest map holds that share."""
+    env = small_env(stop_at_recall=0.03, max_cycles=300)
+    env.reset(seed=1)
+    while env.agents:
+        _, _, terminations, truncations, infos = env.step(turning(env.agents, 0.1, 0.6))
+    assert terminations == {"robot_0": True, "robot_1": True}
+    assert truncations == {"robot_0": False, "robot_1": False}
+    assert min(info["map_recall"] for info in infos.values()) >= 0.03
+
+
+@pytest.mark.parametrize(
+    ("action", "command"), [((1, 1), (1.0, 1.5)), ((-1, -1), (-0.3, -1.5)), ((0, 0), (0, 0)), ((0.5, -0.2), (0.5, -0.3))]
+)
+def test_continuous_actions_are_scaled(action: Any, command: Any) -> None:
+    """Actions in [-1, 1] are scaled to -0.3 .. 1 m/s and -1.5 .. 1.5 rad/s; zeros stand still."""
+    assert np.allclose(command_of("continuous", action), command)
+
+
+def test_robots_do_what_they_are_told() -> None:
+    """In free space a robot ends where its command leads; discrete actions are stay, ahead, left, right."""
+    env = small_env(action_type="discrete", num_robots=1)
+    for action, (speed, turn) in enumerate(DISCRETE_COMMANDS):
+        env.reset(seed=0, options={"start_poses": [[3.0, 3.0, 0.5]]})
+        env.step({"robot_0": action})
+        moved = between([3.0, 3.0, 0.5], env.true_poses[0])
+        assert np.allclose(moved, [0.1 * speed, 0.0, 0.1 * turn], atol=1e-9)
+
+
+def test_a_step_is_several_ticks() -> None:
+    """With `decision_ticks` an action is held for so many ticks, and rewards are those of the ticks summed."""
+    coarse, fine = small_env(decision_ticks=4), small_env()
+    for env in (coarse, fine):
+        env.reset(seed=3)
+    action = turning(coarse.agents)
+    total = dict.fromkeys(coarse.agents, 0.0)
+    for _ in range(5):
+        rewards = coarse.step(action)[1]
+        for _ in range(4):
+            for agent, reward in fine.step(action)[1].items():
+                total[agent] += reward
+        for agent, reward in rewards.items():
+            total[agent] -= reward
+    assert np.array_equal(coarse.true_poses, fine.true_poses)
+    assert np.allclose(list(total.values()), 0.0, atol=1e-12)
+
+
+def test_goals_are_reached() -> None:
+    """A robot that always chooses one living candidate comes to it, on its own belief alone."""
+    env = small_env(action_type="goal", num_robots=1)
+    env.reset(seed=4)
+    slot = int(np.flatnonzero(env.belief("robot_0").candidates.valid)[0])
+    goal = env.belief("robot_0").candidates.goals[slot]
+    nearest = math.inf
+    for _ in range(12):
+        if env.belief("robot_0").candidates.valid[slot]:
+            goal = env.belief("robot_0").candidates.goals[slot]
+        env.step({"robot_0": 1 + slot if env.belief("robot_0").candidates.valid[slot] else 0})
+        nearest = min(nearest, float(np.linalg.norm(env.belief("robot_0").pose[:2] - goal)))
+    assert nearest < 0.5
+
+
+def test_masked_goals_act_as_staying() -> None:
+    """A masked candidate moves nothing and is told as `invalid_action`; staying is no invalid action."""
+    results = []
+    for masked in (False, True):
+        env = small_env(action_type="goal")
+        env.reset(seed=3)
+        empty = np.flatnonzero(~env.belief("robot_0").candidates.valid)
+        assert len(empty)
+        observations, *_, infos = env.step({"robot_0": 1 + int(empty[0]) if masked else 0, "robot_1": 0})
+        assert infos["robot_0"]["invalid_action"] == masked
+        assert infos["robot_1"]["invalid_action"] == 0
+        results.append(observations["robot_0"])
+    assert all(np.array_equal(results[0][name], results[1][name]) for name in results[0])
+
+
+def test_reset_takes_the_first_frame() -> None:
+    """After a reset robots have seen their first frame at the origin of their start frames; they stand as asked."""
+    env = small_env()
+    observations, infos = env.reset(seed=0, options={"start_poses": MEETING, "unknown": 3})
+    assert np.allclose(env.true_start_poses, MEETING)
+    assert np.array_equal(env.true_poses, env.true_start_poses)
+    for robot, agent in enumerate(env.agents):
+        assert np.abs(observations[agent]["pose"]).max() < 1e-6
+        assert env.readings[robot].odometry is None
+        assert len(env.readings[robot].measurements) > 0
+        assert infos[agent]["distance"] == 0.0
+        assert infos[agent]["group"] == robot
+
+
+def test_robots_start_apart() -> None:
+    """Robots start at least 5 m apart and see no landmark in common."""
+    env = small_env(world="office", num_robots=3)
+    for seed in range(3):
+        env.reset(seed=seed)
+        starts = env.true_start_poses[:, :2]
+        gaps = np.linalg.norm(starts[:, None] - starts[None], axis=-1) + 1e3 * np.eye(3)
+        assert gaps.min() >= 5.0
+        seen = [set(frame.true_ids[frame.true_ids >= 0].tolist()) for frame in env.episode.frames]
+        assert not (seen[0] & seen[1] or seen[0] & seen[2] or seen[1] & seen[2])
+
+
+def test_oracle_pose_is_the_true_pose() -> None:
+    """With `oracle_pose` a robot's pose in its own start frame is exact, and its landmarks are still estimated."""
+    env = small_env(oracle_pose=True)
+    env.reset(seed=1)
+    for _ in range(20):
+        infos = env.step(turning(env.agents))[4]
+    for robot, agent in enumerate(env.agents):
+        true = between(env.true_start_poses[robot], env.true_poses[robot])
+        assert np.allclose(env.belief(agent).pose, true, atol=1e-9)
+        assert infos[agent]["pose_error"] < 1e-9
+        assert infos[agent]["map_rmse"] > 1e-4
+
+
+def test_oracle_association_makes_no_false_landmark() -> None:
+    """With `oracle_association` no map holds a false landmark or a duplicate, however many false points there are."""
+    config = small_env().config.replace(landmark_sensor={"false_points": 1.5}, oracle_association=True)
+    env = small_env(config=config)
+    env.reset(seed=1)
+    for _ in range(30):
+        infos = env.step(turning(env.agents))[4]
+    assert all(info["map_precision"] == 1.0 for info in infos.values())
+
+
+def test_oracle_merge_is_exact_and_alone() -> None:
+    """With `oracle_merge` groups merge as soon as they share three landmarks, with the true transform, untried."""
+    env = small_env(oracle_merge=True, max_cycles=200)
+    env.reset(seed=5, options={"start_poses": MEETING})
+    while env.agents and not env.events:
+        env.step(turning(env.agents))
+    (event,) = env.events
+    assert event.kind == "merge"
+    assert np.allclose(event.alignment.transform, between(*MEETING))
+    infos = env.step(turning(env.possible_agents))[4] if env.agents else None
+    assert infos is not None
+    assert all(info["merges"] == 1 and info["group_size"] == 2 and info["group"] == 0 for info in infos.values())
+
+
+def test_beliefs_are_in_the_own_start_frame() -> None:
+    """Maps, particles and teammates lie where they truly are once the own true start pose is applied, also in groups."""
+    env = small_env(oracle_merge=True, oracle_pose=True, oracle_association=True, max_cycles=200)
+    env.reset(seed=5, options={"start_poses": MEETING})
+    for _ in range(60):
+        env.step(turning(env.agents))
+    assert env.events
+    landmarks = env.true_landmarks
+    for robot, agent in enumerate(env.agents):
+        belief, start = env.belief(agent), env.true_start_poses[robot]
+        assert np.allclose(compose(start, belief.particles), env.true_poses[robot], atol=0.01)
+        placed = belief.map.moved(start).means
+        gaps = np.linalg.norm(placed[:, None] - landmarks[None], axis=-1).min(axis=1)
+        assert np.median(gaps) < 0.05
+        (mate,) = belief.teammates
+        assert mate.robot == 1 - robot
+        assert np.allclose(compose(start, mate.pose)[:2], env.true_poses[1 - robot, :2], atol=0.05)
+        assert belief.frame == 0
+        assert belief.group == (0, 1)
+
+
+def test_beliefs_are_frozen() -> None:
+    """A policy can change neither a belief nor the grid behind it."""
+    env = small_env()
+    env.reset(seed=0)
+    belief = env.belief("robot_0")
+    with pytest.raises(AttributeError, match="cannot assign to field"):
+        belief.pose = np.zeros(3)  # type: ignore[misc]
+    with pytest.raises(ValueError, match="read-only"):
+        belief.grid.cells[0, 0] = 1
+    with pytest.raises(RuntimeError, match="read-only view"):
+        belief.grid.clear_disc(np.zeros(3))
+    with pytest.raises(ValueError, match="read-only"):
+        belief.map.means[0, 0] = 1.0
+
+
+def test_grids_are_joined_at_a_merge() -> None:
+    """At a merge each robot's grid gains what the other has seen, in its own frame; later scans go to both."""
+    env = small_env(oracle_merge=True, max_cycles=200)
+    env.reset(seed=5, options={"start_poses": MEETING})
+    known = [0, 0]
+    while not env.events:
+        known = [int(np.count_nonzero(env.belief(agent).grid.cells)) for agent in env.agents]
+        env.step(turning(env.agents))
+    joint = [int(np.count_nonzero(env.belief(agent).grid.cells)) for agent in env.agents]
+    assert min(joint) > max(known)
+    assert abs(joint[0] - joint[1]) < 0.1 * joint[0]
+    for _ in range(20):
+        env.step(turning(env.agents))
+    later = [int(np.count_nonzero(env.belief(agent).grid.cells)) for agent in env.agents]
+    assert min(later) > min(joint)
+    assert abs(later[0] - later[1]) < 0.1 * later[0]
+
+
+def test_coverage_grows_to_what_is_seen() -> None:
+    """Coverage starts near the first view, grows while robots look around, and stays a share."""
+    env = small_env(max_cycles=60)
+    first = env.reset(seed=1)[1]["robot_0"]["coverage"]
+    while env.agents:
+        infos = env.step(turning(env.agents, 0.0, 0.7))[4]
+    last = infos["robot_0"]["coverage"]
+    assert 0.0 < first < 0.3
+    assert first + 0.1 < last <= 1.0
+    assert infos["robot_1"]["coverage"] == last
+
+
+def test_collisions_and_distance() -> None:
+    """A robot that drives into a wall is told its bumps; its way ends at the wall."""
+    env = small_env(num_robots=1, world=BARE)
+    env.reset(seed=1, options={"start_poses": [[8.0, 3.0, 0.0]]})
+    for _ in range(20):
+        infos = env.step({"robot_0": np.array([1.0, 0.0])})[4]
+    assert 10 <= infos["robot_0"]["collisions"] <= 13
+    assert abs(infos["robot_0"]["distance"] - 0.8) < 0.03
+    assert env.readings[0].bump
+
+
+def test_state_holds_the_truth() -> None:
+    """The state is a float32 vector in its space that begins with the true pose."""
+    env = small_env()
+    env.reset(seed=1)
+    env.step(turning(env.agents))
+    state = env.state()
+    assert env.state_space.contains(state)
+    x, y, theta = env.true_poses[0]
+    assert np.allclose(state[:4], [x, y, np.cos(theta), np.sin(theta)], atol=1e-5)
+    x, y, _ = env.true_poses[1]
+    assert np.allclose(state[12:14], [x, y], atol=1e-5)
+
+
+def test_rgb_array() -> None:
+    """A picture comes with `rgb_array`; without a render mode there is none."""
+    env = small_env(render_mode="rgb_array")
+    env.reset(seed=1)
+    env.step(turning(env.agents))
+    frame = env.render()
+    assert frame is not None
+    assert frame.shape == (720, 960, 3)
+    assert frame.dtype == np.uint8
+    assert frame.std() > 5.0
+    assert small_env().render() is None
+
+
+def test_human_without_a_screen(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without a screen `human` warns once, shows nothing and goes on."""
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER"):
+        monkeypatch.delenv(name, raising=False)
+    env = small_env(render_mode="human")
+    env.reset(seed=1)
+    with pytest.warns(UserWarning, match="render_mode='human' shows nothing"):
+        env.step(turning(env.agents))
+    assert env.render() is None
+    env.close()
+
+
+def test_human_with_a_screen(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With a screen, here a dummy one, `human` shows frames and returns None."""
+    pytest.importorskip("pygame")
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    env = small_env(render_mode="human")
+    env.reset(seed=1)
+    assert env.render() is None
+    env.close()
+
+
+def test_scene_shows_the_truth_and_the_estimates() -> None:
+    """A scene has the true walls and poses, and estimates laid at the true starts, near the truth."""
+    env = small_env()
+    env.reset(seed=1)
+    for _ in range(12):
+        env.step(turning(env.agents))
+    scene = env.scene()
+    assert scene.tick == 12
+    assert np.array_equal(scene.walls, room().walls)
+    for robot, view in enumerate(scene.robots):
+        assert np.array_equal(view.true_pose, env.true_poses[robot])
+        assert view.true_path.shape == view.estimated_path.shape == (13, 2)
+        assert np.linalg.norm(view.estimated_pose[:2] - view.true_pose[:2]) < 0.2
+        assert view.particles.shape == (20, 3)
+        assert len(view.sight_lines) <= 5
+        assert view.group == robot
+
+
+def test_worlds_of_all_kinds() -> None:
+    """A world can be a name, a `World` with landmarks and starts of its own, or a function of a generator."""
+
+    def drawn(rng: np.random.Generator) -> World:
+        return World("drawn", [[0, 0, 9, 0], [9, 0, 9, rng.uniform(6, 8)], [9, 8, 0, 8], [0, 8, 0, 0], [9, 5, 9, 8]])
+
+    env = small_env(world=drawn)
+    assert env.config.world == "drawn"
+    env.reset(seed=1)
+    assert env.world.name == "drawn"
+    own = World("own", env.world.walls, env.world.landmarks, [[2.0, 2.0, 0.1], [7.0, 4.0, 0.2]])
+    env = small_env(world=own)
+    env.reset(seed=1)
+    assert np.allclose(env.true_start_poses, own.start_poses)
+    assert small_env(world="fig5").reset(seed=0)
