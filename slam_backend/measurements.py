@@ -38,7 +38,9 @@ class Measurements:
         if self.covariances is not None:
             covariances: Any = check_array("covariances", self.covariances, (len(points), 3, 3), cure)
             if not np.allclose(covariances, covariances.transpose(0, 2, 1), rtol=1e-6, atol=1e-12):
-                raise bad_argument("covariances", "symmetric matrices", "a different transpose", "Symmetrise them first.")
+                raise bad_argument(
+                    "covariances", "symmetric matrices", "a different transpose", "Symmetrise them first."
+                )
             if len(points) and np.linalg.eigvalsh(covariances).min() <= 0.0:
                 raise bad_argument(
                     "covariances",
