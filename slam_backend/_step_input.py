@@ -29,7 +29,7 @@ def check_step(
         if value is None and name in ("identities", "poses"):
             continue
         if isinstance(value, Measurements) or not hasattr(value, "__len__") or len(value) != k:
-            got = f"a sequence of {len(value)}" if hasattr(value, "__len__") else repr(value)
+            got = f"a sequence of {len(value)}" if hasattr(value, "__len__") else value
             raise bad_argument(name, f"a sequence with one entry per robot ({k})", got, "Use None for no reading.")
     identities = none if identities is None else identities
     poses = none if poses is None else poses
