@@ -22,9 +22,10 @@ from mapped_once import (
 from slam_backend.alignment import Alignment
 from slam_backend.filter import UNPACK, FastSlam
 from slam_backend.fusion import fuse_landmarks
-from slam_backend.geometry import inverse, rotate_covariances, transform_points, wrap_angle
+from slam_backend.geometry import between, inverse, rotate_covariances, rotation, transform_points, wrap_angle
 from slam_backend.measurements import Measurements
 from slam_backend.merging import inverse_alignment, merge_filters
+from slam_backend.motion import OdometryModel
 
 NO_PAIRS = np.empty((0, 2), np.int64)
 
@@ -232,3 +233,42 @@ def test_the_same_stream_gives_the_same_merge() -> None:
     for name, value in arrays_of(one).items():
         np.testing.assert_array_equal(value, getattr(other, name), err_msg=name)
     assert one._rng.bit_generator.state == other._rng.bit_generator.state
+
+
+def test_particles_of_a_are_paired_with_any_of_b() -> None:
+    """Pairs are drawn at random, not by index, so that either group's particles meet many of the other's.
+
+    Of 50 pairs about one has equal indices; eight or more have a probability below 1e-4.
+    """
+    rng = np.random.default_rng(2)
+    a = map_once(NAMES_A, np.zeros(3), 0.05, rng, 50, moves=1)
+    b = map_once(NAMES_B, A_FROM_B, 0.05, rng, 50, moves=1)
+    joint, _ = merge_filters(a, b, known_alignment(), PAIRS, np.random.default_rng(1))
+    own_paths = [between(joint._start_poses[robot], joint.particles(robot)[0]) for robot in range(2)]
+    parents = [
+        np.abs(paths[:, None] - slam.particles()[0]).sum(axis=2).argmin(axis=1)
+        for paths, slam in zip(own_paths, (a, b), strict=True)
+    ]
+    assert len(np.unique(parents[0])) > 20
+    assert len(np.unique(parents[1])) > 20
+    assert np.count_nonzero(parents[0] == parents[1]) < 8
+
+
+def test_the_uncertainty_of_b_s_pose_is_turned_with_its_map() -> None:
+    """The covariance of b's pose before the merge, turned by the alignment, is that after it.
+
+    Both are those of 400 particles: entries agree to a third of the largest variance of position.
+    """
+    b = FastSlam(1, 400, motion=OdometryModel(sigma_along=0.4, sigma_across=0.01), seed=3)
+    names = np.array([4])
+    b.step([None], [frame_of(LANDMARKS[names], names, 1.0)])
+    b.step([np.array([1.0, 0.0, 0.0])], [frame_of(LANDMARKS[names] - [1.0, 0.0, 0.0], names, 1.0)])
+    a, _ = both()
+    joint, _ = merge_filters(a, b, known_alignment(sigma=1e-6), NO_PAIRS, np.random.default_rng(1))
+    turn = np.eye(3)
+    turn[:2, :2] = rotation(A_FROM_B[2])
+    expected = turn @ b.pose().covariance @ turn.T
+    position = np.s_[:2, :2]
+    largest = np.abs(expected[position]).max()
+    assert np.abs(b.pose().covariance - expected)[position].max() > 0.5 * largest  # turning matters here
+    np.testing.assert_allclose(joint.pose(1).covariance[position], expected[position], atol=largest / 3)
