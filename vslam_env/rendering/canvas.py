@@ -19,8 +19,8 @@ MARGIN_M = 0.4  # [m] of paper around the world
 UNSEEN_PX = 0.3  # a path may be off by so much
 CHI_SQUARE_95 = 5.991  # 95 % of a planar Gaussian lie inside this squared Mahalanobis distance
 FONT = cv2.FONT_HERSHEY_SIMPLEX
-_CORNERS = np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False)
-_CIRCLE = np.stack([np.cos(_CORNERS), np.sin(_CORNERS)], axis=-1)
+_TURN = 2.0 * np.pi * np.arange(16) / 16
+_CIRCLE = np.stack([np.cos(_TURN), np.sin(_TURN)], axis=-1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,18 +125,24 @@ def ellipse_outlines(means: FloatArray, covariances: FloatArray, view: Viewport,
 
     Args:
         means: (n, 2) float64 [m].
-        covariances: (n, 2, 2) float64 [m^2]. Ones that are not positive semi-definite are drawn as far as they are.
+        covariances: (n, 2, 2) float64 [m^2]. Of ones that are not positive semi-definite the sound part is drawn.
         view: From metres to pixels.
         smallest: [px] Ellipses whose long half axis is shorter are left out: a dot would hide them.
 
     Returns:
         (m, 16, 2) [px], m <= n.
     """
-    variances, axes = np.linalg.eigh(0.5 * (covariances + covariances.swapaxes(-1, -2)))
-    half_axes = np.sqrt(CHI_SQUARE_95 * np.maximum(variances, 0.0))
-    visible = half_axes[:, 1] * view.scale >= smallest
-    roots = axes[visible] * half_axes[visible, None, :]
-    return view.pixels(means[visible, None, :] + _CIRCLE @ roots.swapaxes(-1, -2))
+    xx, xy, yy = covariances[:, 0, 0], 0.5 * (covariances[:, 0, 1] + covariances[:, 1, 0]), covariances[:, 1, 1]
+    largest = 0.5 * (xx + yy) + np.hypot(0.5 * (xx - yy), xy)
+    visible = (xx > 0.0) & (CHI_SQUARE_95 * largest * view.scale**2 >= smallest**2)
+    xx, xy, yy = xx[visible], xy[visible], yy[visible]
+    # Any square root of the covariance maps the circle onto the ellipse; Cholesky's is the cheapest.
+    roots = np.zeros((len(xx), 2, 2))
+    roots[:, 0, 0] = np.sqrt(xx)
+    roots[:, 1, 0] = xy / roots[:, 0, 0]
+    roots[:, 1, 1] = np.sqrt(np.maximum(yy - roots[:, 1, 0] ** 2, 0.0))
+    circle = np.sqrt(CHI_SQUARE_95) * _CIRCLE
+    return view.pixels(means[visible, None, :] + circle @ roots.swapaxes(-1, -2))
 
 
 def text_width(text: str, size: float) -> float:

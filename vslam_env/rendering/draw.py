@@ -12,7 +12,7 @@ from vslam_env.rendering.strips import draw_footer, draw_header
 
 SMALLEST_SIZE = (160, 120)
 WALL_WIDTH_M = 0.08
-PARTICLES_SHOWN = 150
+PARTICLES_SHOWN = 100
 # What may stretch the picture when there are no walls to frame it.
 EMPTY_EXTENT_M = 2.0
 
