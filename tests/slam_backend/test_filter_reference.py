@@ -163,9 +163,9 @@ def test_compiled_filter_equals_the_plain_one() -> None:
 
 @pytest.mark.slow
 def test_compiled_filter_equals_the_plain_one_in_many_worlds() -> None:
-    """The same over a thousand steps, with all combinations of proposal, covariances, names and exact poses."""
-    happened = run_worlds(range(144))
-    assert min(happened.values()) > 80, "each kind of decision has to occur"
+    """The same over some thousand steps, with all combinations of proposal, covariances, names and exact poses."""
+    happened = run_worlds(range(120))
+    assert min(happened.values()) > 40, "each kind of decision has to occur"
 
 
 def test_a_named_landmark_behind_the_camera_or_a_motion_without_noise_is_no_special_case() -> None:
