@@ -17,7 +17,7 @@ from slam_backend._step_input import check_step
 from slam_backend.camera import ROBOT_FROM_CAMERA, StereoCamera
 from slam_backend.errors import FloatArray, IntArray, bad_argument, check_array, check_choice, check_int
 from slam_backend.filter_options import FilterOptions
-from slam_backend.geometry import compose, wrap_angle
+from slam_backend.geometry import between, compose, rotate_covariances, rotation, wrap_angle
 from slam_backend.landmark_map import LandmarkMap
 from slam_backend.measurements import Measurements
 from slam_backend.motion import OdometryModel
@@ -177,6 +177,26 @@ class FastSlam:
     def start_pose(self, robot: int = 0) -> FloatArray:
         """Return (3,) where the robot started, map frame, by the most probable particle. A copy."""
         return np.array(self._start_poses[self._check_robot(robot), self.best_particle])
+
+    def pose_from_start(self, robot: int = 0) -> PoseEstimate:
+        """Return the mean and covariance of a robot's pose in its own start frame.
+
+        Each particle's pose is seen from where the robot started in that particle, so that what the filter does not
+        know of the start, after a merge, does not blur it.
+        """
+        starts = self._start_poses[self._check_robot(robot)]
+        if (starts == starts[0]).all():
+            estimate = self._estimates[robot]
+            pose = between(starts[0], estimate.mean)
+            return PoseEstimate(pose, rotate_covariances(-starts[0, 2], estimate.covariance))
+        turn = np.zeros((len(starts), 3, 3))
+        turn[:, :2, :2], turn[:, 2, 2] = rotation(-starts[:, 2]), 1.0
+        covariances = turn @ self._pose_covariances[robot] @ turn.transpose(0, 2, 1)
+        return _mixture(between(starts, self._pose_means[robot]), covariances, self.weights)
+
+    def particles_from_start(self, robot: int = 0) -> FloatArray:
+        """Return a robot's poses (M, 3), each seen from where it started in that particle."""
+        return between(self._start_poses[self._check_robot(robot)], self._poses[robot])
 
     def map(self, estimate: Literal["best", "mixture"] = "best") -> LandmarkMap:
         """Return the map in the map frame, landmarks by ascending id.
@@ -416,14 +436,7 @@ class FastSlam:
         self._ids[~self._present.any(axis=1)] = -1  # held by no survivor
 
     def _mixture(self, robot: int, weights: FloatArray) -> PoseEstimate:
-        means = self._pose_means[robot]
-        theta = float(np.arctan2(weights @ np.sin(means[:, 2]), weights @ np.cos(means[:, 2])))
-        mean = np.array([weights @ means[:, 0], weights @ means[:, 1], wrap_angle(theta)])
-        offsets = means - mean
-        offsets[:, 2] = wrap_angle(offsets[:, 2])
-        covariance = (offsets * weights[:, None]).T @ offsets
-        covariance += np.tensordot(weights, self._pose_covariances[robot], axes=1)
-        return PoseEstimate(mean, 0.5 * (covariance + covariance.T))
+        return _mixture(self._pose_means[robot], self._pose_covariances[robot], weights)
 
     def _check_robot(self, robot: int) -> int:
         if isinstance(robot, bool) or not isinstance(robot, (int, np.integer)) or not 0 <= robot < self.num_robots:
@@ -461,3 +474,14 @@ class FastSlam:
         for name in self._STATE:
             setattr(self, name, copy.deepcopy(state[name]))
         self._rng.bit_generator.state = copy.deepcopy(state["rng"])
+
+
+def _mixture(means: FloatArray, covariances: FloatArray, weights: FloatArray) -> PoseEstimate:
+    """Return mean and covariance of a weighted mixture of Gaussian poses: means (M, 3), covariances (M, 3, 3)."""
+    theta = float(np.arctan2(weights @ np.sin(means[:, 2]), weights @ np.cos(means[:, 2])))
+    mean = np.array([weights @ means[:, 0], weights @ means[:, 1], wrap_angle(theta)])
+    offsets = means - mean
+    offsets[:, 2] = wrap_angle(offsets[:, 2])
+    covariance = (offsets * weights[:, None]).T @ offsets
+    covariance += np.tensordot(weights, covariances, axes=1)
+    return PoseEstimate(mean, 0.5 * (covariance + covariance.T))

@@ -138,6 +138,16 @@ class TeamSlam:
         group, index = self._find(robot)
         return group.filter.particles(index)
 
+    def pose_from_start(self, robot: int) -> PoseEstimate:
+        """Return the robot's pose in its own start frame; see `FastSlam.pose_from_start`."""
+        group, index = self._find(robot)
+        return group.filter.pose_from_start(index)
+
+    def particles_from_start(self, robot: int) -> FloatArray:
+        """Return the robot's poses (M, 3) in its own start frame; see `FastSlam.particles_from_start`."""
+        group, index = self._find(robot)
+        return group.filter.particles_from_start(index)
+
     def map(self, robot: int, estimate: Literal["best", "mixture"] = "best") -> LandmarkMap:
         """Return the map of the robot's group in the group's map frame; see `FastSlam.map`."""
         return self._find(robot)[0].filter.map(estimate)

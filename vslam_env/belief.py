@@ -155,30 +155,31 @@ class TeamBelief:
         robots, team = range(self.num_robots), self._team
         self._groups = team.groups
         self._starts = np.array([team.start_from_group(robot) for robot in robots])
-        self._estimates = [team.pose(robot) for robot in robots]
-        self._means = np.array([estimate.mean for estimate in self._estimates])
-        self._poses = compose(self._starts, self._means)
+        self._means = np.array([team.pose(robot).mean for robot in robots])
+        self._estimates = [team.pose_from_start(robot) for robot in robots]
+        self._poses = np.array([estimate.mean for estimate in self._estimates])
         self._beliefs.clear()
         self._maps.clear()
 
     def _make_belief(self, robot: int) -> Belief:
         group, start = self.group(robot), self._starts[robot]
-        poses = compose(start, self._means)
-        covariances = [rotate_covariances(start[2], self._estimates[member].covariance) for member in group]
-        mates = [
-            Teammate(member, poses[member], covariance)
-            for member, covariance in zip(group, covariances, strict=True)
-            if member != robot
-        ]
-        particles, log_weights = self._team.particles(robot)
+        mates = []
+        for mate in group:
+            if mate != robot:
+                estimate = self._team.pose(mate)
+                covariance = rotate_covariances(start[2], estimate.covariance)
+                mates.append(Teammate(mate, compose(start, estimate.mean), covariance))
+        own = self._estimates[robot]
+        log_weights = self._team.particles(robot)[1]
         slots = self._slots[robot]
         return Belief(
             robot=robot,
             tick=self._tick,
             frame=group[0],
             group=group,
-            pose=poses[robot],
-            covariance=covariances[group.index(robot)],
+            pose=own.mean,
+            covariance=own.covariance,
+            particles=self._team.particles_from_start(robot),
             log_weights=log_weights,
             ess=self._team.diagnostics[robot]["ess"] / len(log_weights),
             grid=self._grids[robot].frozen(),
@@ -187,12 +188,11 @@ class TeamBelief:
                 headings=slots.headings,
                 lengths=slots.lengths,
                 valid=slots.valid,
-                features=slots.features(poses[robot], [mate.pose[:2] for mate in mates]),
+                features=slots.features(own.mean, [mate.pose[:2] for mate in mates]),
             ),
             teammates=tuple(mates),
             start_from_group=start,
             group_map=self.group_map(robot),
-            group_particles=particles,
         )
 
     def _candidates_are_due(self, robot: int) -> bool:
@@ -219,7 +219,9 @@ class TeamBelief:
         body = self._body
         for owner in group:
             grid = self._grids[owner]
-            for robot, pose in zip(group, compose(self._starts[owner], self._means[list(group)]), strict=True):
+            poses = compose(self._starts[owner], self._means[list(group)])
+            poses[group.index(owner)] = self._poses[owner]
+            for robot, pose in zip(group, poses, strict=True):
                 grid.paint_scan(pose, readings[robot].scan, body.ray_angles, body.scan_range)
                 grid.clear_disc(pose, body.radius)
                 if readings[robot].bump:

@@ -12,7 +12,6 @@ import tomli_w
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from slam_backend.errors import bad_argument, check_choice, check_float, check_int
-from slam_backend.filter_options import FilterOptions
 from slam_backend.motion import OdometryModel
 from vslam_env.robot_belief import BeliefConfig
 from vslam_env.sensors import LandmarkSensorConfig, ScanConfig
@@ -163,25 +162,16 @@ def preset_config(name: str) -> EnvConfig:
     if name == "standard":
         return EnvConfig()
     scale = 0.5 if name == "easy" else 2.0
-    odometry, motion = OdometryNoise(), OdometryModel()
-    return EnvConfig(
-        odometry=OdometryNoise(**{f.name: scale * getattr(odometry, f.name) for f in dataclasses.fields(odometry)}),
-        belief=BeliefConfig(
-            filter=FilterOptions(
-                motion=OdometryModel(
-                    sigma_along=scale * motion.sigma_along,
-                    sigma_across=scale * motion.sigma_across,
-                    sigma_heading=scale * motion.sigma_heading,
-                )
-            )
-        ),
-        landmark_sensor=LandmarkSensorConfig(
-            max_measurements=10, detection_probability=0.95, false_points=0.0, descriptor_noise=0.1
-        )
-        if name == "easy"
-        else LandmarkSensorConfig(
-            max_measurements=3, detection_probability=0.8, false_points=0.1, descriptor_noise=0.2
-        ),
+    standard, motion = EnvConfig(), OdometryModel()
+    sensors = {
+        "easy": {"max_measurements": 10, "detection_probability": 0.95, "false_points": 0.0, "descriptor_noise": 0.1},
+        "hard": {"max_measurements": 3, "detection_probability": 0.8, "false_points": 0.1, "descriptor_noise": 0.2},
+    }
+    assumed = {part: scale * getattr(motion, part) for part in ("sigma_along", "sigma_across", "sigma_heading")}
+    return standard.replace(
+        odometry={f.name: scale * getattr(standard.odometry, f.name) for f in dataclasses.fields(standard.odometry)},
+        belief={"filter": {"motion": assumed}},
+        landmark_sensor=sensors[name],
     )
 
 

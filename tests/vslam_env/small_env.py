@@ -34,12 +34,11 @@ def small_env(**kwargs: Any) -> ExplorationEnv:
 def wander(env: ExplorationEnv, rng: np.random.Generator) -> dict[str, Any]:
     """Return valid random actions: mostly ahead, gently turning, or candidates."""
     if env.config.action_type == "continuous":
-        return {
-            agent: np.array([0.6, np.clip(0.8 * rng.standard_normal(), -1, 1)], np.float32) for agent in env.agents
-        }
+        return {agent: np.array([0.6, np.clip(0.8 * rng.standard_normal(), -1, 1)], np.float32) for agent in env.agents}
     if env.config.action_type == "discrete":
         return {agent: int(rng.integers(4)) for agent in env.agents}
-    return {agent: int(rng.choice([0, *(1 + np.flatnonzero(env.belief(agent).candidates.valid))])) for agent in env.agents}
+    valid = {agent: 1 + np.flatnonzero(env.belief(agent).candidates.valid) for agent in env.agents}
+    return {agent: int(rng.choice([0, *valid[agent]])) for agent in env.agents}
 
 
 def turning(agents: list[str], speed: float = 0.25, turn: float = 0.4) -> dict[str, FloatArray]:

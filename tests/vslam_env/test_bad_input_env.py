@@ -52,18 +52,27 @@ CASES: dict[str, tuple[Callable[[], Any], str]] = {
     "robots as text": (lambda: small_env(num_robots="many"), "num_robots: expected a valid integer.*got 'many'"),
     "unknown sensor": (lambda: small_env(sensor="stereo"), "sensor: expected 'landmark', got 'stereo'"),
     "unknown action type": (lambda: small_env(action_type="jump"), "action_type: expected 'continuous', .*'jump'"),
-    "unknown observations": (lambda: small_env(observation_type="image"), "observation_type: expected 'dict' or 'flat'"),
+    "unknown observations": (
+        lambda: small_env(observation_type="image"),
+        "observation_type: expected 'dict' or 'flat'",
+    ),
     "unknown preset": (lambda: small_env(preset="brutal"), "preset: expected one of 'easy', 'standard', 'hard'"),
     "unknown render mode": (lambda: small_env(render_mode="ansi"), "render_mode: expected one of 'human', 'rgb_array'"),
     "no cycles": (lambda: small_env(max_cycles=0), "max_cycles: expected an int >= 1, got 0"),
     "no ticks": (lambda: small_env(decision_ticks=0), "decision_ticks: expected an int >= 1, got 0"),
-    "recall above one": (lambda: small_env(stop_at_recall=1.5), "stop_at_recall: expected a finite number > 0 and <= 1"),
+    "recall above one": (
+        lambda: small_env(stop_at_recall=1.5),
+        "stop_at_recall: expected a finite number > 0 and <= 1",
+    ),
     "preset and config": (
         lambda: small_env(preset="easy", config=small_env().config),
         "preset: expected None beside a config",
     ),
     "config of a wrong type": (lambda: small_env(config=7), "config: expected an EnvConfig, a path or None, got 7"),
-    "missing config": (lambda: small_env(config="nowhere.toml"), r"config: expected a readable TOML file.*nowhere\.toml"),
+    "missing config": (
+        lambda: small_env(config="nowhere.toml"),
+        r"config: expected a readable TOML file.*nowhere\.toml",
+    ),
     "unknown field": (lambda: small_env().config.replace(robots=2), "robots: expected a known field, got 2"),
     "unknown nested field": (
         lambda: small_env().config.replace(belief={"filter": {"particles": 5}}),
@@ -71,7 +80,10 @@ CASES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "unknown reward": (lambda: small_env(reward={"fame": 1.0}), "reward: expected one of 'map_error', .*got 'fame'"),
     "reward as text": (lambda: small_env(reward="map_error"), "reward: expected weights by name, or a list of terms"),
-    "reward without a name": (lambda: small_env(reward=[_Nameless()]), "reward: expected terms with name, weight and a call"),
+    "reward without a name": (
+        lambda: small_env(reward=[_Nameless()]),
+        "reward: expected terms with name, weight and a call",
+    ),
     "repeated reward": (lambda: small_env(reward=[_Twice(), _Twice()]), "reward: expected terms with different names"),
     "reward that is NaN": (
         _step({"robot_0": [0, 0], "robot_1": [0, 0]}, reward=[_Twice()]),
@@ -82,12 +94,18 @@ CASES: dict[str, tuple[Callable[[], Any], str]] = {
     "seed as text": (_reset(seed="x"), "seed: expected an int >= 0, got 'x'"),
     "options as list": (_reset(options=[1]), r"options: expected a dict or None, got \[1\]"),
     "world seed": (_reset(options={"world_seed": 1.5}), r"options\['world_seed'\]: expected an int >= 0, got 1.5"),
-    "starts of a wrong shape": (_reset(options={"start_poses": [[1, 2, 3]]}), r"start_poses: expected an array of shape"),
+    "starts of a wrong shape": (
+        _reset(options={"start_poses": [[1, 2, 3]]}),
+        r"start_poses: expected an array of shape",
+    ),
     "start that is NaN": (
         _reset(options={"start_poses": [[np.nan, 3, 0], [4, 4, 0]]}),
         "start_poses: expected finite numbers",
     ),
-    "start in a wall": (_reset(options={"start_poses": [[3, 3, 0], [0.1, 5, 0]]}), r"start_poses\[1\]: expected a place"),
+    "start in a wall": (
+        _reset(options={"start_poses": [[3, 3, 0], [0.1, 5, 0]]}),
+        r"start_poses\[1\]: expected a place",
+    ),
     "starts that overlap": (
         _reset(options={"start_poses": [MEETING[0], MEETING[0]]}),
         r"start_poses\[1\]: expected a place at least 0.4 m from the other robots",
@@ -102,12 +120,18 @@ CASES: dict[str, tuple[Callable[[], Any], str]] = {
         _step({"robot_0": [0, np.nan], "robot_1": [0, 0]}),
         r"actions\['robot_0'\]: expected two numbers in \[-1, 1\]",
     ),
-    "action out of bounds": (_step({"robot_0": [0, 0], "robot_1": [2, 0]}), r"actions\['robot_1'\]: expected two numbers"),
+    "action out of bounds": (
+        _step({"robot_0": [0, 0], "robot_1": [2, 0]}),
+        r"actions\['robot_1'\]: expected two numbers",
+    ),
     "action of a wrong shape": (
         _step({"robot_0": [0, 0, 0], "robot_1": [0, 0]}),
         r"actions\['robot_0'\]: expected an array of shape \(2,\), got shape \(3,\)",
     ),
-    "action as text": (_step({"robot_0": "go", "robot_1": [0, 0]}), r"actions\['robot_0'\]: expected an array of shape"),
+    "action as text": (
+        _step({"robot_0": "go", "robot_1": [0, 0]}),
+        r"actions\['robot_0'\]: expected an array of shape",
+    ),
     "discrete action out of range": (
         _step({"robot_0": 4, "robot_1": 0}, action_type="discrete"),
         r"actions\['robot_0'\]: expected an int from 0 to 3, got 4",
@@ -116,7 +140,10 @@ CASES: dict[str, tuple[Callable[[], Any], str]] = {
         _step({"robot_0": 0, "robot_1": -1}, action_type="goal"),
         r"actions\['robot_1'\]: expected an int from 0 to 16, got -1",
     ),
-    "goal as float": (_step({"robot_0": 1.5, "robot_1": 0}, action_type="goal"), "expected an int from 0 to 16, got 1.5"),
+    "goal as float": (
+        _step({"robot_0": 1.5, "robot_1": 0}, action_type="goal"),
+        "expected an int from 0 to 16, got 1.5",
+    ),
     "team in a solo environment": (lambda: SoloExplorationEnv(num_robots=2), "num_robots: expected 1, got 2"),
     "belief of a stranger": (
         lambda: (env := small_env(), env.reset(seed=0), env.belief("robot_9")),

@@ -78,7 +78,9 @@ def test_a_first_reset_without_a_seed_is_random() -> None:
 def test_streams_are_apart() -> None:
     """More measurements a frame shift neither the odometry nor the scans, nor does another number of particles."""
     logs = []
-    for change in ({}, {"num_particles": 7}, {"config": small_env().config.replace(landmark_sensor={"max_measurements": 9})}):
+    eager = small_env().config.replace(landmark_sensor={"max_measurements": 9})
+    changes: list[dict[str, Any]] = [{}, {"num_particles": 7}, {"config": eager}]
+    for change in changes:
         env = small_env(max_cycles=15, **change)
         env.reset(seed=6)
         log = []

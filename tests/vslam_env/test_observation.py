@@ -35,9 +35,7 @@ def test_observations_are_rebuilt_from_readings_alone(action_type: str, steps: i
 
     goal = action_type == "goal"
     episode = env.episode
-    belief = TeamBelief(
-        env.config.belief, 2, episode.belief_seed, episode.body, decision_ticks=ticks if goal else None
-    )
+    belief = TeamBelief(env.config.belief, 2, episode.belief_seed, episode.body, decision_ticks=ticks if goal else None)
     for tick, now in enumerate(readings):
         belief.step(now)
         if tick % ticks:

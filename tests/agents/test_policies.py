@@ -1,0 +1,121 @@
+from typing import Any
+
+import numpy as np
+import pytest
+
+from agents import POLICIES, make_policy
+from agents.nearest_frontier import choose_slot, far_place
+from vslam_env import ExplorationEnv, World, vslam_v0
+from vslam_env.belief import Belief, Teammate
+from vslam_env.navigation import plan_path
+
+ROOM = World("room", [[0, 0, 11, 0], [11, 0, 11, 9], [11, 9, 0, 9], [0, 9, 0, 0], [5, 0, 5, 5]])
+MATCHES = [
+    (name, action_type)
+    for name in POLICIES
+    for action_type in ("continuous", "discrete", "goal")
+    if name == "frontier" or (name == "random_goals") == (action_type == "goal")
+]
+
+
+def _env(action_type: str, **kwargs: Any) -> ExplorationEnv:
+    options: dict[str, Any] = {"world": ROOM, "num_robots": 2, "num_particles": 20, "max_cycles": 30}
+    return vslam_v0.parallel_env(action_type=action_type, **options | kwargs)
+
+
+def _run(env: ExplorationEnv, name: str, seed: int) -> tuple[list[Any], float]:
+    """Return all actions of an episode and the coverage at its end."""
+    policies = {agent: make_policy(name, env.config.action_type) for agent in env.possible_agents}
+    rng = np.random.default_rng(seed)
+    observations, infos = env.reset(seed=seed)
+    log = []
+    while env.agents:
+        actions = {agent: policies[agent].act(observations[agent], env.belief(agent), rng) for agent in env.agents}
+        for agent, action in actions.items():
+            assert env.action_space(agent).contains(action)
+        log.append(actions)
+        observations, _, _, _, infos = env.step(actions)
+        assert not any(info["invalid_action"] for info in infos.values())
+    return log, infos["robot_0"]["coverage"]
+
+
+@pytest.mark.parametrize(("name", "action_type"), MATCHES)
+def test_policies_act_within_the_rules(name: str, action_type: str) -> None:
+    """Every policy's actions are in the space and unmasked, and the same seed gives the same actions."""
+    first, _ = _run(_env(action_type), name, 3)
+    second, _ = _run(_env(action_type), name, 3)
+    for one, other in zip(first, second, strict=True):
+        assert all(np.array_equal(one[agent], other[agent]) for agent in one)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("action_type", "cycles"), [("continuous", 500), ("discrete", 500), ("goal", 50)])
+def test_the_frontier_policy_explores(action_type: str, cycles: int) -> None:
+    """In 50 s two robots see nearly all of a room of 11 x 9 m."""
+    _, coverage = _run(_env(action_type, max_cycles=cycles), "frontier", 1)
+    assert coverage > 0.93
+
+
+def _belief(env: ExplorationEnv, **changes: Any) -> Belief:
+    belief = env.belief("robot_0")
+    fields = {name: getattr(belief, name) for name in belief.__dataclass_fields__}
+    return Belief(**fields | changes)
+
+
+def _candidates(env: ExplorationEnv, goals: dict[int, tuple[float, float, float]]) -> Any:
+    """Return candidates with a goal (x, y) and a path length in some slots."""
+    given = env.belief("robot_0").candidates
+    places, lengths, valid = np.full((16, 2), np.nan), np.zeros(16), np.zeros(16, np.bool_)
+    for slot, (x, y, length) in goals.items():
+        places[slot], lengths[slot], valid[slot] = (x, y), length, True
+    return type(given)(places, np.zeros(16), lengths, valid, np.zeros((16, 5), np.float32))
+
+
+def test_the_nearest_slot_is_chosen_and_kept() -> None:
+    """The shortest path wins; a slot that was chosen is kept unless it is gone or another is less than half as far."""
+    env = _env("goal")
+    env.reset(seed=0)
+    both = _belief(env, candidates=_candidates(env, {2: (1.0, 0.0, 4.0), 9: (0.0, 2.0, 3.0)}))
+    assert choose_slot(both) == 9
+    assert choose_slot(both, held=2) == 2
+    assert choose_slot(both, held=5) == 9
+    close = _belief(env, candidates=_candidates(env, {2: (1.0, 0.0, 4.0), 9: (0.0, 2.0, 1.9)}))
+    assert choose_slot(close, held=2) == 9
+    assert choose_slot(_belief(env, candidates=_candidates(env, {}))) is None
+
+
+def test_what_a_teammate_is_nearer_to_is_left_to_it() -> None:
+    """A candidate beside a teammate is avoided, unless there is no other."""
+    env = _env("goal")
+    env.reset(seed=0)
+    mates = (Teammate(1, np.array([-1.5, 2.0, 0.0]), np.eye(3)),)
+    two = _candidates(env, {2: (7.0, 0.0, 7.5), 9: (0.0, 2.0, 3.0)})
+    assert choose_slot(_belief(env, candidates=two, teammates=mates)) == 2
+    one = _candidates(env, {9: (0.0, 2.0, 3.0)})
+    assert choose_slot(_belief(env, candidates=one, teammates=mates)) == 9
+
+
+def test_patrols_lead_far_over_seen_floor() -> None:
+    """A far place can be reached over floor that has been seen, and lies far off."""
+    env = _env("continuous", max_cycles=100, num_robots=1)
+    env.reset(seed=1, options={"start_poses": [[8.0, 2.0, 1.0]]})
+    while env.agents:
+        env.step({"robot_0": np.array([0.1, 0.8])})
+    belief = env.belief("robot_0")
+    places = np.array([far_place(belief, np.random.default_rng(seed)) for seed in range(5)])
+    for place in places:
+        assert plan_path(belief.grid.cells, belief.pose[:2], place) is not None
+    assert np.linalg.norm(places - belief.pose[:2], axis=1).min() > 2.0
+    assert len(np.unique(places, axis=0)) > 1
+
+
+def test_unknown_names_and_mismatches() -> None:
+    """An unknown policy, and one that does not know the type of action, are refused with the names that would do."""
+    with pytest.raises(ValueError, match=r"policy: expected one of 'frontier', 'random_.*, got 'best'"):
+        make_policy("best", "goal")
+    with pytest.raises(ValueError, match="action_type: expected one of 'continuous', 'discrete', 'goal', got 'jump'"):
+        make_policy("frontier", "jump")
+    with pytest.raises(ValueError, match="action_type: expected 'goal' for policy 'random_goals', got 'discrete'"):
+        make_policy("random_goals", "discrete")
+    with pytest.raises(ValueError, match="expected 'continuous' or 'discrete' for policy 'random_walk', got 'goal'"):
+        make_policy("random_walk", "goal")

@@ -1,0 +1,46 @@
+import numpy as np
+
+from slam_backend.filter import FastSlam
+from slam_backend.geometry import between, compose, wrap_angle
+from slam_backend.measurements import Measurements
+
+STARTS = np.array([[1.0, -2.0, 0.7], [4.0, 3.0, -2.0]])
+
+
+def _moved(seed: int) -> FastSlam:
+    """Return a filter of two robots that have driven a little, seeing two landmarks."""
+    slam = FastSlam(num_robots=2, num_particles=13, seed=seed, initial_poses=STARTS)
+    frame = Measurements([[0.2, 0.1, 3.0], [-0.5, 0.0, 2.0]], np.eye(2))
+    for _ in range(5):
+        slam.step([[0.1, 0.0, 0.05], [0.08, 0.0, -0.1]], [frame, None])
+    return slam
+
+
+def test_known_starts() -> None:
+    """Where a start is known, the pose in the start frame is the pose in the map frame, moved."""
+    slam = _moved(1)
+    for robot in range(2):
+        own, pose = slam.pose_from_start(robot), slam.pose(robot)
+        assert np.allclose(compose(STARTS[robot], own.mean), pose.mean)
+        assert np.isclose(np.trace(own.covariance), np.trace(pose.covariance))
+        assert np.allclose(compose(STARTS[robot], slam.particles_from_start(robot)), slam.particles(robot)[0])
+
+
+def test_unknown_starts_do_not_blur_the_pose() -> None:
+    """Moving robot and start of each particle alike, as a merge does, leaves the pose in the start frame as it was."""
+    slam = _moved(2)
+    before, particles = slam.pose_from_start(1), slam.particles_from_start(1)
+    state = slam.get_state()
+    motions = np.random.default_rng(5).normal(0.0, 0.5, (13, 3))
+    for name in ("_start_poses", "_poses", "_pose_means"):
+        state[name][1] = compose(motions, state[name][1])
+    turn = np.tile(np.eye(3), (13, 1, 1))
+    turn[:, :2, :2] = np.array([[[np.cos(t), -np.sin(t)], [np.sin(t), np.cos(t)]] for t in motions[:, 2]])
+    state["_pose_covariances"][1] = turn @ state["_pose_covariances"][1] @ turn.transpose(0, 2, 1)
+    slam.set_state(state)
+    after = slam.pose_from_start(1)
+    assert np.allclose(between(before.mean, after.mean), 0.0, atol=1e-3)  # resampling noise of the estimate before
+    assert np.allclose(after.covariance, before.covariance, atol=1e-3)
+    difference = slam.particles_from_start(1) - particles
+    difference[:, 2] = wrap_angle(difference[:, 2])
+    assert np.allclose(difference, 0.0, atol=1e-12)

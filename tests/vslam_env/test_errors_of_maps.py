@@ -1,0 +1,124 @@
+import numpy as np
+from small_env import MEETING, small_env, turning
+
+from slam_backend.errors import IntArray
+from slam_backend.landmark_map import LandmarkMap
+from slam_backend.metrics import gospa
+from slam_backend.reports import Renaming, TeamReport
+from vslam_env.coverage import CoverageMeter
+from vslam_env.errors_of_maps import ClaimLedger
+from vslam_env.navigation import FREE, SeenGrid, cell_of
+
+TRUTHS = np.array([[0.0, 0.0, 0.0], [5.0, 0.0, 0.3], [0.0, 6.0, -0.2], [7.0, 7.0, 0.0], [9.0, 1.0, 0.0]])
+COUNTABLE = np.array([True, True, False, True, True])
+STAY = np.zeros(3)
+
+
+def _ids(*values: int) -> IntArray:
+    return np.array(values, dtype=np.int64)
+
+
+def _report(created: tuple[IntArray, ...], renamings: tuple[Renaming, ...] = ()) -> TeamReport:
+    return TeamReport(0, created, created, tuple((r,) for r in range(len(created))), (), renamings)
+
+
+def _map(means: np.ndarray, ids: IntArray) -> LandmarkMap:
+    return LandmarkMap(means, np.tile(np.eye(3), (len(means), 1, 1)), np.zeros((len(means), 2)), ids=ids)
+
+
+def _ledger() -> ClaimLedger:
+    """Return books of two robots: the first holds 0, 1 and a false point, the second 1, 3 and what does not count."""
+    ledger = ClaimLedger(2, TRUTHS, COUNTABLE, 1.0)
+    ledger.record(_report((_ids(0, 1, -1, 2), _ids(0, 1, 2))), [_ids(0, 1, 3, -1), _ids(1, 3, 2)])
+    return ledger
+
+
+def test_claims_follow_creation() -> None:
+    """A landmark claims the true one whose measurement created it: -1 if that was false, -2 if it does not count."""
+    ledger = _ledger()
+    assert ledger.claims((0,), _ids(0, 1, 2)).tolist() == [0, 1, -1]
+    assert ledger.claims((1,), _ids(2, 1, 0)).tolist() == [-2, 2, 1]  # of the four that count, 3 is the third
+
+
+def test_claims_follow_a_merge() -> None:
+    """At a merge landmarks of a keep their claims, fused ones too, and those of b bring theirs under their new ids."""
+    ledger = _ledger()
+    ledger.rename(Renaming((0,), (1,), np.array([[0, 1], [1, 3], [2, 4]])))
+    assert ledger.claims((0, 1), _ids(0, 1, 2, 3, 4)).tolist() == [0, 1, -1, 2, -2]
+
+
+def test_a_fused_false_landmark_stays_false() -> None:
+    """What a false point created is false, even if the other map's landmark fused into it was a true one."""
+    ledger = _ledger()
+    ledger.rename(Renaming((0,), (1,), np.array([[0, 2], [1, 3], [2, 4]])))
+    assert ledger.claims((0, 1), _ids(2)).tolist() == [-1]
+
+
+def test_score_of_a_small_map() -> None:
+    """E is the number that one counts by hand: two held, one false, two missed."""
+    ledger = _ledger()
+    means = TRUTHS[[0, 1, 3]] + np.array([[0.3, 0.0, 0.0], [0.0, 0.0, 0.4], [0.0, 0.0, 0.0]])
+    score = ledger.score((0,), _map(means, _ids(0, 1, 2)), STAY)
+    assert np.isclose(score.error, np.sqrt((0.3**2 + 0.4**2 + 0.5 * (2 + 1)) / 4))
+    assert np.isclose(score.rmse, np.sqrt((0.3**2 + 0.4**2) / 2))
+    assert (score.recall, score.precision) == (0.5, 2 / 3)
+
+
+def test_score_of_nothing() -> None:
+    """An empty map misses everything; its RMSE is the cutoff."""
+    score = _ledger().score((0,), LandmarkMap.empty(2), STAY)
+    assert np.isclose(score.error, np.sqrt(0.5))
+    assert (score.rmse, score.recall, score.precision) == (1.0, 0.0, 0.0)
+
+
+def test_duplicates_false_points_and_wrong_merges_cost() -> None:
+    """Each raises E: a second claimant, a false landmark, and a map that lies where it should not."""
+    ledger = _ledger()
+    ledger.record(_report((_ids(3, 4), _ids())), [_ids(0, -1), _ids()])
+    means = np.vstack([TRUTHS[[0, 1]], [[0.1, 0.0, 0.0], [4.0, 4.0, 0.0]]])
+    right = ledger.score((0,), _map(means[:2], _ids(0, 1)), STAY).error
+    duplicate = ledger.score((0,), _map(means[:3], _ids(0, 1, 3)), STAY).error
+    false = ledger.score((0,), _map(means[[0, 1, 3]], _ids(0, 1, 4)), STAY).error
+    wrong = ledger.score((0,), _map(means[:2], _ids(0, 1)), np.array([1.0, 0.2, 0.1])).error
+    assert right < min(duplicate, false, wrong)
+    assert np.isclose(duplicate, false)
+
+
+def test_error_agrees_with_gospa_where_landmarks_are_apart() -> None:
+    """Without duplicates and with true landmarks over 2 c apart, E equals GOSPA with its optimal assignment."""
+    ledger = _ledger()
+    rng = np.random.default_rng(3)
+    means = TRUTHS[[0, 1]] + rng.normal(0.0, 0.2, (2, 3))
+    score = ledger.score((0,), _map(means, _ids(0, 1)), STAY)
+    assert np.isclose(score.error, gospa(means, TRUTHS[COUNTABLE], cutoff=1.0).error)
+
+
+def test_infos_agree_with_the_own_start_frame() -> None:
+    """In a running episode E is that of the belief's own map, laid at the true start pose, before and after a merge."""
+    env = small_env(max_cycles=400)
+    env.reset(seed=5, options={"start_poses": MEETING})
+    for step in range(120):
+        infos = env.step(turning(env.agents))[4]
+        if step % 40 == 39:
+            for robot, agent in enumerate(env.agents):
+                belief, ledger = env.belief(agent), env.episode.ledger
+                placed = belief.map.moved(env.true_start_poses[robot])
+                score = ledger.score(belief.group, placed, STAY)
+                assert np.isclose(infos[agent]["map_error"], score.error)
+    assert any(event.kind == "merge" for event in env.events)
+
+
+def test_coverage_of_known_floor() -> None:
+    """Coverage is the share of floor cells that are free in some robot's grid, laid at its true start pose."""
+    centres = np.array([[x, y] for x in (1.0, 2.0, 3.0) for y in (1.0, 2.0)])
+    starts = np.array([[1.0, 1.0, 0.0], [3.0, 2.0, np.pi / 2]])
+    meter = CoverageMeter(centres, starts)
+    grids = [SeenGrid(), SeenGrid()]
+    assert meter.share([grid.cells for grid in grids]) == 0.0
+    grids[0].clear_disc(STAY)
+    assert np.isclose(meter.share([grid.cells for grid in grids]), 1 / 6)
+    grids[1].clear_disc(STAY)
+    grids[1].clear_disc([0.0, 1.0, 0.0])  # one metre to the left of a robot that looks up: (2, 2)
+    row, col = cell_of([0.0, 1.0])
+    assert grids[1].cells[row, col] == FREE
+    assert np.isclose(meter.share([grid.cells for grid in grids]), 3 / 6)
