@@ -143,12 +143,12 @@ def _print_tables(console: Console, metrics: dict[str, Any]) -> None:
     """Print scores of paths, maps and merges."""
     aligned, start = "after the best rigid fit", "from the true start, no fit"
     paths = {
-        f"path [m],\n{aligned}": "ate_aligned_m", "odometry,\nfitted too": "dead_reckoning_ate_aligned_m",
-        f"path [m],\n{start}": "ate_start_m", "odometry,\nno fit": "dead_reckoning_ate_start_m",
+        f"path (m),\n{aligned}": "ate_aligned_m", "odometry,\nfitted too": "dead_reckoning_ate_aligned_m",
+        f"path (m),\n{start}": "ate_start_m", "odometry,\nno fit": "dead_reckoning_ate_start_m",
     }  # fmt: skip
     maps = {
-        f"RMSE [m],\n{aligned}": "map_rmse_m", "recall": "map_recall", "precision": "map_precision",
-        f"map error [m],\n{start}": "map_error",
+        f"RMSE (m),\n{aligned}": "map_rmse_m", "recall": "map_recall", "precision": "map_precision",
+        f"map error (m),\n{start}": "map_error",
     }  # fmt: skip
     for title, columns in (("Paths", paths), ("Maps", maps)):
         table = Table(title=title)
@@ -158,7 +158,7 @@ def _print_tables(console: Console, metrics: dict[str, Any]) -> None:
             table.add_row(str(row["robot"]), *(_number(row[key]) for key in columns.values()))
         console.print(table)
     merges = Table(title="Merges")
-    for name in ("time [s]", "group", "with", "shared landmarks", "off by [m]", "off by [deg]"):
+    for name in ("time (s)", "group", "with", "shared landmarks", "off by (m)", "off by (°)"):
         merges.add_column(name, justify="right")
     for row in metrics["merges"]:
         sides = [", ".join(map(str, row[side])) for side in ("robots_a", "robots_b")]
