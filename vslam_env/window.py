@@ -1,6 +1,7 @@
 """A window on the screen for `render_mode="human"`, where there is a screen."""
 
 import os
+import sys
 import warnings
 from typing import Any
 
@@ -9,7 +10,9 @@ from numpy.typing import NDArray
 
 
 def _screen_is_there() -> bool:
-    return os.name == "nt" or any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER"))
+    if sys.platform in ("win32", "darwin"):
+        return True
+    return any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER"))
 
 
 class Window:
