@@ -93,7 +93,7 @@ def main(
     world: Annotated[str, typer.Option(help="A family name or a path.")] = "office",
     robots: Annotated[int, typer.Option(help="How many.")] = 3,
     action_type: Annotated[str, typer.Option(help="continuous, discrete or goal.")] = "continuous",
-    max_cycles: Annotated[int | None, typer.Option(help="Steps of an episode.", show_default="240 s worth")] = None,
+    max_cycles: Annotated[int | None, typer.Option(help="Steps of an episode.", show_default="180 s worth")] = None,
     processes: Annotated[int, typer.Option(help="At a time.")] = os.cpu_count() or 1,
     json_file: Annotated[Path | None, typer.Option("--json", help="Write all figures to this file.")] = None,
 ) -> None:

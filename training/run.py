@@ -25,7 +25,7 @@ def run(
     action_type: Annotated[
         str | None, typer.Option(help="continuous, discrete or goal.", show_default="continuous")
     ] = None,
-    max_cycles: Annotated[int | None, typer.Option(help="Steps of the episode.", show_default="240 s worth")] = None,
+    max_cycles: Annotated[int | None, typer.Option(help="Steps of the episode.", show_default="180 s worth")] = None,
     particles: Annotated[int | None, typer.Option(help="Particles per filter.", show_default="100")] = None,
     preset: Annotated[str | None, typer.Option(help="easy, standard or hard noise.", show_default="standard")] = None,
     out: Annotated[Path | None, typer.Option(help="New run folder.", show_default="the next runs/run-*")] = None,

@@ -12,7 +12,7 @@ from vslam_env.config import ACTION_TYPES, GOAL_DECISION_TICKS, PRESETS, TICK
 from vslam_env.environment import ExplorationEnv
 
 # Time for three robots to see the office and to meet each other's traces there [s].
-EPISODE_S = 240.0
+EPISODE_S = 180.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
