@@ -80,12 +80,14 @@ def test_the_pair_with_the_most_new_candidates_tries() -> None:
 def test_a_merge_forgets_the_attempts_of_the_groups_that_are_gone() -> None:
     """After a success, no record names a robot of the merged groups; others keep waiting."""
     plan = schedule()
+    third: PairKey = ((1, 3), (2,))
     other: PairKey = ((4,), (5,))
-    for pair in (FIRST, SECOND, other):
+    for pair in (FIRST, SECOND, third, other):
         plan.record(pair, 24, success=False)
-    plan.record(FIRST, 49, success=True)
+    plan.record(SECOND, 49, success=True)
     assert plan.may_try(FIRST, 25)
     assert plan.may_try(SECOND, 25)
+    assert plan.may_try(third, 25)
     assert not plan.may_try(other, 25)
 
 

@@ -20,6 +20,7 @@ from mapped_once import (
 )
 
 from slam_backend.alignment import Alignment
+from slam_backend.errors import IntArray
 from slam_backend.filter import UNPACK, FastSlam
 from slam_backend.fusion import fuse_landmarks
 from slam_backend.geometry import between, inverse, rotate_covariances, rotation, transform_points, wrap_angle
@@ -111,6 +112,14 @@ def test_ids_of_a_stay_and_those_of_b_are_renamed_one_to_one() -> None:
     assert sorted(renamed[:, 0]) == sorted(names_b)
     assert len(np.unique(renamed[:, 1])) == len(renamed)
     assert [names[new] for new in renamed[:, 1].tolist()] == [names_b[old] for old in renamed[:, 0].tolist()]
+
+
+def test_a_landmark_keeps_the_caller_s_name_that_either_robot_was_given() -> None:
+    """Where a's landmark has no name of the caller's, the fused one takes that of b."""
+    a, b = both()
+    a._identities[a._ids == 2] = -1
+    joint, _ = merge_filters(a, b, known_alignment(), PAIRS, np.random.default_rng(1))
+    assert names_of(joint)[2] == NAMES_A[2]
 
 
 def test_every_landmark_of_either_map_is_in_the_joint_map_exactly_once() -> None:
@@ -235,6 +244,12 @@ def test_the_same_stream_gives_the_same_merge() -> None:
     assert one._rng.bit_generator.state == other._rng.bit_generator.state
 
 
+def parents_of(joint: FastSlam, robot: int, slam: FastSlam) -> IntArray:
+    """Return which particle of a one-robot filter each joint particle stems from, told by the path of that robot."""
+    paths = between(joint._start_poses[robot], joint.particles(robot)[0])
+    return np.abs(paths[:, None] - slam.particles()[0]).sum(axis=2).argmin(axis=1)
+
+
 def test_particles_of_a_are_paired_with_any_of_b() -> None:
     """Pairs are drawn at random, not by index, so that either group's particles meet many of the other's.
 
@@ -244,11 +259,7 @@ def test_particles_of_a_are_paired_with_any_of_b() -> None:
     a = map_once(NAMES_A, np.zeros(3), 0.05, rng, 50, moves=1)
     b = map_once(NAMES_B, A_FROM_B, 0.05, rng, 50, moves=1)
     joint, _ = merge_filters(a, b, known_alignment(), PAIRS, np.random.default_rng(1))
-    own_paths = [between(joint._start_poses[robot], joint.particles(robot)[0]) for robot in range(2)]
-    parents = [
-        np.abs(paths[:, None] - slam.particles()[0]).sum(axis=2).argmin(axis=1)
-        for paths, slam in zip(own_paths, (a, b), strict=True)
-    ]
+    parents = [parents_of(joint, robot, slam) for robot, slam in enumerate((a, b))]
     assert len(np.unique(parents[0])) > 20
     assert len(np.unique(parents[1])) > 20
     assert np.count_nonzero(parents[0] == parents[1]) < 8
@@ -272,3 +283,24 @@ def test_the_uncertainty_of_b_s_pose_is_turned_with_its_map() -> None:
     largest = np.abs(expected[position]).max()
     assert np.abs(b.pose().covariance - expected)[position].max() > 0.5 * largest  # turning matters here
     np.testing.assert_allclose(joint.pose(1).covariance[position], expected[position], atol=largest / 3)
+
+
+def test_the_most_probable_particle_takes_both_pasts_into_account() -> None:
+    """Accumulated log-weights add (Eq. 12), up to the evidence, which is equal for pairs whose maps fit equally."""
+    rng = np.random.default_rng(2)
+    a = map_once(NAMES_A, np.zeros(3), 0.05, rng, 50, moves=1)
+    b = map_once(NAMES_B, A_FROM_B, 0.05, rng, 50, moves=1)
+    a._path_log_weights, b._path_log_weights = rng.normal(size=(2, 50))
+    joint, _ = merge_filters(a, b, known_alignment(), PAIRS, np.random.default_rng(1))
+    pasts = a._path_log_weights[parents_of(joint, 0, a)] + b._path_log_weights[parents_of(joint, 1, b)]
+    np.testing.assert_allclose(np.ptp(joint._path_log_weights - pasts), 0.0, atol=1e-6)
+
+
+def test_pairs_whose_maps_fit_each_other_survive() -> None:
+    """Particles of b in which a common landmark stands ten deviations off do not outlive the merge."""
+    a, b = both(sigma=0.05, particles=(50, 50))
+    b._landmarks[1, 0, 35:] += 0.5  # landmark 1 of b is one of the common ones
+    b._landmarks[0, 2, 35:] += 9.0  # landmark 0 is b's alone: it tells which particles survive
+    joint, renamed = merge_filters(a, b, known_alignment(), PAIRS, np.random.default_rng(1))
+    row = joint._ids.tolist().index(dict(renamed.tolist())[0])
+    assert np.abs(joint._landmarks[row, 2] - LANDMARKS[NAMES_B[0], 2]).max() < 1.0
