@@ -1,9 +1,6 @@
 """Visual FastSLAM for one robot or a team, without any simulator or learner.
 
-    slam = FastSlam(num_particles=100, seed=0)
-    for odometry, measurements in log:
-        slam.step([odometry], [measurements])
-    print(slam.pose().mean, len(slam.map()))
+`FastSlam` is the filter, `TeamSlam` a team of them that merges maps; `align_maps` and `fuse_maps` work on any two maps.
 """
 
 from slam_backend.alignment import Alignment, AlignmentOptions, align_maps

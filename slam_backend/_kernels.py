@@ -21,6 +21,7 @@ from slam_backend.errors import BoolArray, FloatArray, IntArray
 
 REJECTED = -1
 MIN_DEPTH = 0.05  # [m]; nothing is predicted nearer to the camera plane than this
+MIN_CONTRADICTIONS = 3  # three points fix a pose with one to spare
 LOG_2PI = math.log(2.0 * math.pi)
 
 
@@ -113,8 +114,8 @@ def _whitened(
 def _gate(
     pose: FloatArray, local: FloatArray, q: int, points: FloatArray, noises: FloatArray, n: int, given: bool,
     camera: FloatArray, factor: FloatArray, spread: FloatArray,
-) -> tuple[float, float]:
-    """Return the squared Mahalanobis distance D and log|S|, pose uncertainty C L^-1 C^T included.
+) -> tuple[float, float, float]:
+    """Return the squared Mahalanobis distance D and log|S|, pose uncertainty C L^-1 C^T included, and |r| [m].
 
     `local[q]` is the landmark (9), `factor` is C (3, 3), `spread` is L^-1 (3, 3). D is infinite where the landmark is
     predicted behind the camera. Unless `given`, S is that of the image coordinates (up to a constant of the camera):
@@ -124,7 +125,7 @@ def _gate(
         pose[0], pose[1], pose[3], pose[4], local[q, 0], local[q, 1], local[q, 2], points, noises, n, given, camera
     )
     if not given and depth < MIN_DEPTH:
-        return np.inf, 0.0
+        return np.inf, 0.0, np.inf
     a0, a1, a2, b0, b1, b2 = _whitened(local[q, 0], local[q, 1], pose[0], pose[1], factor)
     u0 = spread[0, 0] * a0 + spread[0, 1] * a1 + spread[0, 2] * a2
     u1 = spread[1, 0] * a0 + spread[1, 1] * a1 + spread[1, 2] * a2
@@ -140,7 +141,8 @@ def _gate(
         local[q, 7] + s4,
         local[q, 8] + s5,
     )  # Eq. 7, plus what the pose adds
-    return _form(inverse, rx, ry, rz), math.log(inverse[6] if given else inverse[6] / depth**8)
+    log_det = math.log(inverse[6] if given else inverse[6] / depth**8)
+    return _form(inverse, rx, ry, rz), log_det, math.sqrt(rx * rx + ry * ry + rz * rz)
 
 
 @inlined
@@ -406,7 +408,7 @@ def update_fastslam1(
                     if taken:
                         continue
                 _load(landmarks, slot, m, local, 0)
-                distance, _ = _gate(pose, local, 0, points, noises, b, given, camera, zero, zero)
+                distance, _, _ = _gate(pose, local, 0, points, noises, b, given, camera, zero, zero)
                 if distance <= position_gate or (known[b] and distance < np.inf):
                     match = slot  # l. 23-24: the nearest descriptor inside the gate
                     distances[b, m] = distance
@@ -430,11 +432,36 @@ def update_fastslam1(
 
 
 @jit
+def _is_lost(
+    start: FloatArray, local: FloatArray, held: BoolArray, points: FloatArray, noises: FloatArray, given: bool,
+    camera: FloatArray, factor: FloatArray, identity: FloatArray, starts: IntArray, costs: FloatArray,
+    position_gate: float, ambiguity: float,
+) -> bool:
+    """Tell whether at least three, and most, of the measurements with one look-alike contradict the predicted pose."""
+    sure = 0
+    contradict = 0
+    for b in range(points.shape[0]):
+        first, second = REJECTED, REJECTED
+        for q in range(starts[b], starts[b + 1]):
+            if held[q] and first == REJECTED:
+                first = q
+            elif held[q] and second == REJECTED:
+                second = q
+        if first == REJECTED or (second != REJECTED and costs[second] - costs[first] < ambiguity):
+            continue
+        distance, _, _ = _gate(start, local, first, points, noises, b, given, camera, factor, identity)
+        sure += 1
+        if distance > position_gate:
+            contradict += 1
+    return contradict >= MIN_CONTRADICTIONS and 2 * contradict > sure
+
+
+@jit
 def update_fastslam2(
     poses: FloatArray, odometry: FloatArray, sigmas: FloatArray, normals: FloatArray,
     landmarks: FloatArray, present: BoolArray, counts: IntArray, points: FloatArray, noises: FloatArray, given: bool,
     camera: FloatArray, starts: IntArray, slots: IntArray, costs: FloatArray, known: BoolArray, new_slots: IntArray,
-    position_gate: float, dead_zone: float, ambiguity: float, log_p0: float,
+    position_gate: float, dead_zone: float, dead_radius: float, ambiguity: float, recovery: FloatArray, log_p0: float,
     associations: IntArray, distances: FloatArray, log_weights: FloatArray,
     pose_means: FloatArray, pose_covariances: FloatArray,
 ) -> None:
@@ -442,7 +469,9 @@ def update_fastslam2(
 
     The pose is x0 + C xi, x0 = x_{t-1} composed with u, C C^T the covariance of the motion, xi ~ N(0, I): nothing is
     inverted, so a motion without noise needs no special case. Association takes two passes: unambiguous candidates
-    first refine the pose robustly, then all decisions are taken at the refined pose.
+    first refine the pose robustly, then all decisions are taken at the refined pose. A particle filter forgets how
+    wrong its pose may be; where most of the measurements with one look-alike in the map contradict the predicted pose,
+    its stated uncertainty is not believed, and a wide one takes its place.
 
     Args:
         poses: (M, 3), poses before the motion; replaced by the sampled ones.
@@ -451,7 +480,9 @@ def update_fastslam2(
         normals: (M, 3) standard normal draws.
         costs: (q,) what each candidate's descriptor adds to its cost.
         dead_zone: Between `position_gate` and this D a measurement is neither matched nor new.
+        dead_radius: Nor is it new this near to a landmark that looks like it [m].
         ambiguity: A runner-up within this cost makes a measurement ambiguous: it is held back.
+        recovery: (3,) standard deviations of the pose [m, m, rad] where most matches contradict it; zeros: never.
         pose_means, pose_covariances: (M, 3), (M, 3, 3), written: N(x^, P^) of each particle before sampling.
         landmarks, present, counts, points, noises, given, camera, starts, slots, known, new_slots, position_gate,
         log_p0, associations, distances, log_weights: As in `update_fastslam1`; rejected measurements get -1.
@@ -480,6 +511,7 @@ def update_fastslam2(
         start[2] = poses[m, 2] + odometry[2]
         start[3] = math.cos(start[2])
         start[4] = math.sin(start[2])
+        factor[:] = 0.0
         factor[0, 0], factor[0, 1] = c * sigmas[0], -s * sigmas[1]
         factor[1, 0], factor[1, 1] = s * sigmas[0], c * sigmas[1]
         factor[2, 2] = sigmas[2]
@@ -488,13 +520,20 @@ def update_fastslam2(
             if held[q]:
                 _load(landmarks, slots[q], m, local, q)
 
+        lost = recovery[0] > 0.0 and _is_lost(
+            start, local, held, points, noises, given, camera, factor, identity, starts, costs, position_gate, ambiguity
+        )
+        if lost:
+            factor[:] = 0.0
+            factor[0, 0], factor[1, 1], factor[2, 2] = recovery[0], recovery[1], recovery[2]
+
         # Pass A: refine the pose with what is beyond doubt.
         for b in range(num):
             best, runner_up, chosen = np.inf, np.inf, REJECTED
             for q in range(starts[b], starts[b + 1]):
                 if not held[q]:
                     continue
-                distance, log_det = _gate(start, local, q, points, noises, b, given, camera, factor, identity)
+                distance, log_det, _ = _gate(start, local, q, points, noises, b, given, camera, factor, identity)
                 if distance <= position_gate or (known[b] and distance < np.inf):
                     cost = distance + log_det + costs[q]
                     if cost < best:
@@ -507,22 +546,23 @@ def update_fastslam2(
                     if tentative[earlier] >= 0 and slots[tentative[earlier]] == slots[chosen]:
                         tentative[b] = REJECTED
         xi[:] = 0.0
-        _refine(
-            start, factor, tentative, local, points, noises, given, camera, position_gate, xi, pose, spread,
-            information, gradient,
-        )
+        for _ in range(2 if lost else 1):  # a wide prior is a long way for two iterations
+            _refine(
+                start, factor, tentative, local, points, noises, given, camera, position_gate, xi, pose, spread,
+                information, gradient,
+            )
 
         # Pass B: decide at the refined pose.
         clutter = 0.0
         for b in range(num):
-            best, runner_up, nearest, chosen, log_best = np.inf, np.inf, np.inf, REJECTED, 0.0
+            best, runner_up, dead, chosen, log_best = np.inf, np.inf, False, REJECTED, 0.0
             for q in range(starts[b], starts[b + 1]):
                 if not held[q]:
                     continue
-                distance, log_det = _gate(pose, local, q, points, noises, b, given, camera, factor, spread)
+                distance, log_det, metres = _gate(pose, local, q, points, noises, b, given, camera, factor, spread)
                 if known[b] and distance < np.inf:
                     distance = min(distance, position_gate)
-                nearest = min(nearest, distance)
+                dead = dead or distance <= dead_zone or metres <= dead_radius
                 if distance > position_gate:
                     continue
                 taken = False
@@ -546,7 +586,7 @@ def update_fastslam2(
                 else:
                     matches[b] = chosen
                     associations[b, m] = slots[chosen]
-            elif nearest <= dead_zone:
+            elif dead:
                 associations[b, m] = REJECTED
                 clutter += log_clutter
             else:

@@ -18,7 +18,8 @@ class AttemptOptions:
 
     Attributes:
         every: At most one pair tries in so many steps.
-        new_candidates: A refused pair tries again only when so many of its candidate matches are new.
+        new_candidates: A refused pair tries again only when so many of its candidate matches are new, or the last
+            attempt is more than `longest_wait` steps ago: by then the same landmarks are known better.
         longest_wait: After each refusal a pair waits twice as long as before, at most so many steps.
     """
 
@@ -36,6 +37,7 @@ class _Record:
     """What one pair of groups has tried."""
 
     wait: int
+    last_step: int = 0
     next_step: int = 0
     tried: set[tuple[int, int]] = field(default_factory=set)  # candidate matches of the last attempt, by landmark ids
 
@@ -62,7 +64,7 @@ class AttemptSchedule:
         """Tell whether the pair's wait is over."""
         return pair not in self._records or step >= self._records[pair].next_step
 
-    def choose(self, maps: Mapping[PairKey, tuple[LandmarkMap, LandmarkMap]]) -> PairKey | None:
+    def choose(self, maps: Mapping[PairKey, tuple[LandmarkMap, LandmarkMap]], step: int) -> PairKey | None:
         """Return the pair with the most new candidate matches, if it has enough for an attempt; the first of equals."""
         best: PairKey | None = None
         most = 0
@@ -74,8 +76,9 @@ class AttemptSchedule:
             if len(rows) < self._alignment.min_inliers:
                 continue
             found = set(zip(map_a.ids[rows[:, 0]].tolist(), map_b.ids[rows[:, 1]].tolist(), strict=True))
-            tried = self._records[pair].tried if pair in self._records else set()
-            new = len(found - tried)
+            record = self._records.get(pair)
+            stale = record is None or step - record.last_step > self._options.longest_wait
+            new = len(found if record is None or stale else found - record.tried)
             if new >= self._options.new_candidates and new > most:
                 best, most = pair, new
                 self._proposed = {pair: found}
@@ -89,6 +92,7 @@ class AttemptSchedule:
             return
         record = self._records.setdefault(pair, _Record(self._options.every))
         record.tried = self._proposed.get(pair, set())
+        record.last_step = step
         record.next_step = step + record.wait
         record.wait = min(2 * record.wait, self._options.longest_wait)
 

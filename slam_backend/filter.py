@@ -36,7 +36,8 @@ class FastSlam:
         seed: Of the filter's own random stream: an int, a `numpy.random.SeedSequence` or a Generator.
         initial_poses: (K, 3) [m, m, rad], map frame. None: all at the origin.
         num_particles, camera, motion, proposal, resampling, resample_threshold, position_gate, descriptor_gate,
-        dead_zone, descriptor_sigma, ambiguity, new_landmark_density, one_to_one: See `FilterOptions`.
+        dead_zone, dead_radius, recovery_position, recovery_heading, descriptor_sigma, ambiguity,
+        new_landmark_density, one_to_one: See `FilterOptions`.
 
     Raises:
         ValueError: If an argument is out of its range; the text names it.
@@ -62,6 +63,9 @@ class FastSlam:
         position_gate: float = 11.34,
         descriptor_gate: float = 0.45,
         dead_zone: float = 25.0,
+        dead_radius: float = 1.0,
+        recovery_position: float = 0.5,
+        recovery_heading: float = 0.1,
         descriptor_sigma: float = 0.1,
         ambiguity: float = 6.0,
         new_landmark_density: float = 0.01,
@@ -79,6 +83,9 @@ class FastSlam:
             position_gate=position_gate,
             descriptor_gate=descriptor_gate,
             dead_zone=dead_zone,
+            dead_radius=dead_radius,
+            recovery_position=recovery_position,
+            recovery_heading=recovery_heading,
             descriptor_sigma=descriptor_sigma,
             ambiguity=ambiguity,
             new_landmark_density=new_landmark_density,
@@ -321,6 +328,9 @@ class FastSlam:
             poses[:] = compose(self._start_poses[robot], exact)
             move, sigmas = None, np.zeros(3)
         normals = self._rng.standard_normal((m, 3))
+        recovery = np.zeros(3)
+        if exact is None:
+            recovery[:2], recovery[2] = options.recovery_position, options.recovery_heading
         if options.proposal == "fastslam1":
             if move is not None:
                 poses[:] = compose(poses, move + normals * sigmas)  # Eq. 4
@@ -336,7 +346,7 @@ class FastSlam:
                 poses, np.zeros(3) if move is None else move, sigmas, normals,
                 self._landmarks, self._present, self._counts, points, noises, given, self._camera,
                 starts, slots, squares / options.descriptor_sigma**2, known, new_slots,
-                options.position_gate, options.dead_zone, options.ambiguity, log_p0,
+                options.position_gate, options.dead_zone, options.dead_radius, options.ambiguity, recovery, log_p0,
                 found, at, log_likelihood, self._pose_means[robot], self._pose_covariances[robot],
             )
         self._release(new_slots)

@@ -27,6 +27,10 @@ class FilterOptions:
         descriptor_gate: Square root of E0, largest L2 distance between matched descriptors [-].
         dead_zone: Measurements whose nearest candidate lies between `position_gate` and this are neither matched nor
             new (`fastslam2`) [-].
+        dead_radius: Nor is a measurement new within this distance of a landmark that looks like it (`fastslam2`) [m].
+        recovery_position: Where most matches contradict a particle's pose, its position is taken to be this uncertain
+            before they correct it (`fastslam2`) [m]; 0: its own uncertainty is always believed.
+        recovery_heading: Likewise its heading [rad].
         descriptor_sigma: L2 distance between descriptors that costs a match as much as one sigma of position
             (`fastslam2`) [-].
         ambiguity: A runner-up whose cost (squared Mahalanobis + log-determinant + descriptor) is nearer than this
@@ -44,6 +48,9 @@ class FilterOptions:
     position_gate: float = 11.34
     descriptor_gate: float = 0.45
     dead_zone: float = 25.0
+    dead_radius: float = 1.0
+    recovery_position: float = 0.5
+    recovery_heading: float = 0.1
     descriptor_sigma: float = 0.1
     ambiguity: float = 6.0
     new_landmark_density: float = 0.01
@@ -60,6 +67,8 @@ class FilterOptions:
         for name in ("position_gate", "descriptor_gate", "descriptor_sigma", "new_landmark_density"):
             check_float(name, getattr(self, name), "Give a positive number.", above=0.0)
         check_float("dead_zone", self.dead_zone, "It starts where the gate ends.", at_least=self.position_gate)
+        for name in ("dead_radius", "recovery_position", "recovery_heading"):
+            check_float(name, getattr(self, name), "Use 0 to switch it off.", at_least=0.0)
         check_float("ambiguity", self.ambiguity, "Use 0 to hold nothing back.", at_least=0.0)
         if not isinstance(self.one_to_one, bool):
             raise bad_argument("one_to_one", "a bool", self.one_to_one, "Say True or False.")

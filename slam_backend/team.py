@@ -260,7 +260,7 @@ class TeamSlam:
                     for group in (a, b):
                         if group.robots not in maps:
                             maps[group.robots] = group.filter.map("mixture")
-        chosen = self._schedule.choose({key: (maps[key[0]], maps[key[1]]) for key in pairs})
+        chosen = self._schedule.choose({key: (maps[key[0]], maps[key[1]]) for key in pairs}, self._step)
         if chosen is None:
             return ()
         a, b = pairs[chosen]

@@ -85,8 +85,11 @@ class ReferenceFastSlam:
             for m, particle in enumerate(self.particles):  # l. 13
                 before = particle.poses[robot] if exact is None else compose(particle.starts[robot], exact)
                 prior = self._predict(before, move if exact is None else None)
-                advance = self._fastslam1 if self.options.proposal == "fastslam1" else self._fastslam2
-                posterior, pose, chosen, log_likelihood = advance(particle, prior, frame, normals[m])
+                if self.options.proposal == "fastslam1":
+                    advanced = self._fastslam1(particle, prior, frame, normals[m])
+                else:
+                    advanced = self._fastslam2(particle, prior, frame, normals[m], is_exact=exact is not None)
+                posterior, pose, chosen, log_likelihood = advanced
                 particle.posteriors[robot], particle.poses[robot] = posterior, pose
                 found.append(chosen)
                 log_likelihoods[m] += log_likelihood  # l. 9, in logarithms
@@ -147,12 +150,19 @@ class ReferenceFastSlam:
     # ------------------------------------------------------------------ fastslam2
 
     def _fastslam2(
-        self, particle: Particle, prior: Prior, frame: Frame, normals: FloatArray
+        self, particle: Particle, prior: Prior, frame: Frame, normals: FloatArray, is_exact: bool
     ) -> tuple[Prior, FloatArray, list[int], float]:
         """Let the measurements shape the pose that is sampled; associate in two passes."""
+        options = self.options
         candidates = self._candidates(particle, frame)
+        passes = 1
+        if options.recovery_position > 0.0 and not is_exact and self._is_lost(particle, prior, frame, candidates):
+            sigmas = [options.recovery_position, options.recovery_position, options.recovery_heading]
+            prior, passes = Prior(prior.mean, np.diag(sigmas)), 2
         tentative = self._beyond_doubt(particle, prior, frame, candidates)
-        refined, _ = self._refine(particle, prior, prior.xi, frame, tentative, robust=self.options.position_gate)
+        refined = prior
+        for _ in range(passes):
+            refined, _ = self._refine(particle, prior, refined.xi, frame, tentative, robust=options.position_gate)
         chosen, log_unmatched = self._decide(particle, refined, frame, candidates)
         matches = {b: name for b, name in enumerate(chosen) if name >= 0}
         posterior, log_evidence = self._refine(particle, prior, refined.xi, frame, matches, robust=None)
@@ -163,6 +173,16 @@ class ReferenceFastSlam:
             elif name != REJECTED:
                 particle.landmarks[name] = frame.new_landmark(pose, b)
         return posterior, wrapped(pose), chosen, log_unmatched + log_evidence
+
+    def _is_lost(self, particle: Particle, prior: Prior, frame: Frame, candidates: Candidates) -> bool:
+        """Tell whether three or more, and most, of the measurements with one look-alike contradict the prior."""
+        verdicts = []
+        for b, possible in enumerate(candidates):
+            looks = [e / self.options.descriptor_sigma**2 for e, _ in possible]
+            if looks and (len(looks) == 1 or looks[1] - looks[0] >= self.options.ambiguity):
+                gate = frame.compare(prior, particle.landmarks[possible[0][1]], b)
+                verdicts.append(gate is None or gate.distance > self.options.position_gate)
+        return sum(verdicts) >= 3 and 2 * sum(verdicts) > len(verdicts)
 
     def _beyond_doubt(self, particle: Particle, prior: Prior, frame: Frame, candidates: Candidates) -> dict[int, int]:
         """Pass A: match, at the predicted pose, what has one good candidate and no good second."""
@@ -191,7 +211,7 @@ class ReferenceFastSlam:
         chosen: list[int] = []
         total = 0.0
         for b, possible in enumerate(candidates):
-            nearest = np.inf
+            is_dead = False
             costs = []
             for e, name in possible:
                 gate = frame.compare(refined, particle.landmarks[name], b)
@@ -199,7 +219,8 @@ class ReferenceFastSlam:
                     continue
                 if frame.names is not None:
                     gate = gate.within(options.position_gate)
-                nearest = min(nearest, gate.distance)
+                near = frame.metres(refined, particle.landmarks[name], b) <= options.dead_radius
+                is_dead |= near or gate.distance <= options.dead_zone
                 if gate.distance <= options.position_gate and name not in chosen:
                     costs.append((gate.cost + e / options.descriptor_sigma**2, name, gate.log_density))
             costs.sort()
@@ -209,7 +230,7 @@ class ReferenceFastSlam:
             elif costs:
                 chosen.append(costs[0][1])
             else:
-                chosen.append(REJECTED if nearest <= options.dead_zone else NEW - b)
+                chosen.append(REJECTED if is_dead else NEW - b)
                 total += frame.log_clutter(b, options.new_landmark_density)
         return chosen, total
 

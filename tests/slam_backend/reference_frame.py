@@ -151,6 +151,13 @@ class Frame:
         covariance = term.covariance + term.by_pose @ prior.covariance @ term.by_pose.T
         return replace(term, covariance=covariance)
 
+    def metres(self, prior: Prior, landmark: Landmark, b: int) -> float:
+        """Return how far a measured point lies from a landmark [m]; a camera's are scaled to the landmark's depth."""
+        offset = landmark.mean - [prior.pose[0], prior.pose[1], 0.0]
+        point = self.camera.camera_from_robot(turn_about_vertical(prior.pose[2]).T @ offset)
+        scale = point[2] / self.points[b, 2] if self.in_image else 1.0
+        return float(scale * np.linalg.norm(self.points[b] - point))
+
     def log_clutter(self, b: int, p0: float) -> float:
         """Return the log-density of a measurement that matches nothing: p0 per m^3, where it was measured (l. 32)."""
         jacobian = 4.0 * np.log(self.points[b, 2]) if self.in_image else 0.0

@@ -51,30 +51,40 @@ def test_a_refused_pair_needs_new_candidates() -> None:
     """The same candidates are not tried again, nor with two new ones; with three new ones they are."""
     plan = schedule()
     names = [0, 1, 2, 3, 4]
-    assert plan.choose({FIRST: pair_of(names)}) == FIRST
+    assert plan.choose({FIRST: pair_of(names)}, 49) == FIRST
     plan.record(FIRST, 24, success=False)
-    assert plan.choose({FIRST: pair_of(names)}) is None
-    assert plan.choose({FIRST: pair_of([*names, 5, 6])}) is None
-    assert plan.choose({FIRST: pair_of([*names, 5, 6, 7])}) == FIRST
+    assert plan.choose({FIRST: pair_of(names)}, 49) is None
+    assert plan.choose({FIRST: pair_of([*names, 5, 6])}, 49) is None
+    assert plan.choose({FIRST: pair_of([*names, 5, 6, 7])}, 49) == FIRST
+
+
+def test_old_evidence_may_be_tried_again() -> None:
+    """After `longest_wait` steps the same candidates count as new: their landmarks are known better by then."""
+    plan = schedule(longest_wait=200)
+    same = {FIRST: pair_of([0, 1, 2, 3])}
+    plan.choose(same, 24)
+    plan.record(FIRST, 24, success=False)
+    assert plan.choose(same, 224) is None
+    assert plan.choose(same, 225) == FIRST
 
 
 def test_too_few_candidates_are_no_attempt() -> None:
     """A pair with fewer candidates than an alignment needs does not try."""
-    assert schedule().choose({FIRST: pair_of([0, 1, 2])}) is None
-    assert schedule().choose({FIRST: pair_of([0, 1, 2, 3])}) == FIRST
-    assert schedule().choose({}) is None
+    assert schedule().choose({FIRST: pair_of([0, 1, 2])}, 49) is None
+    assert schedule().choose({FIRST: pair_of([0, 1, 2, 3])}, 49) == FIRST
+    assert schedule().choose({}, 49) is None
 
 
 def test_the_pair_with_the_most_new_candidates_tries() -> None:
     """Most new candidate matches win; of equals, the first."""
     few, many = pair_of([0, 1, 2, 3]), pair_of([0, 1, 2, 3, 4])
-    assert schedule().choose({FIRST: few, SECOND: many}) == SECOND
-    assert schedule().choose({FIRST: many, SECOND: few}) == FIRST
-    assert schedule().choose({FIRST: few, SECOND: few}) == FIRST
+    assert schedule().choose({FIRST: few, SECOND: many}, 49) == SECOND
+    assert schedule().choose({FIRST: many, SECOND: few}, 49) == FIRST
+    assert schedule().choose({FIRST: few, SECOND: few}, 49) == FIRST
     plan = schedule()
-    plan.choose({SECOND: many})
+    plan.choose({SECOND: many}, 49)
     plan.record(SECOND, 24, success=False)
-    assert plan.choose({FIRST: few, SECOND: many}) == FIRST
+    assert plan.choose({FIRST: few, SECOND: many}, 49) == FIRST
 
 
 def test_a_merge_forgets_the_attempts_of_the_groups_that_are_gone() -> None:
@@ -94,14 +104,14 @@ def test_a_merge_forgets_the_attempts_of_the_groups_that_are_gone() -> None:
 def test_a_schedule_goes_on_from_its_state() -> None:
     """A restored schedule has the same waits, memory and options, and shares nothing with the first."""
     plan, twin = schedule(every=10), schedule()
-    plan.choose({FIRST: pair_of([0, 1, 2, 3])})
+    plan.choose({FIRST: pair_of([0, 1, 2, 3])}, 49)
     plan.record(FIRST, 9, success=False)
     twin.set_state(plan.get_state())
     plan.record(FIRST, 19, success=False)
     assert twin.may_try(FIRST, 19)
     assert not twin.may_try(FIRST, 18)
     assert twin.is_due(9)
-    assert twin.choose({FIRST: pair_of([0, 1, 2, 3])}) is None
+    assert twin.choose({FIRST: pair_of([0, 1, 2, 3])}, 49) is None
 
 
 # ---------------------------------------------------------------------- in a team

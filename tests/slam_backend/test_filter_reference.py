@@ -60,6 +60,8 @@ class SmallWorld:
             return None
         move = self.rng.normal([0.2, 0.0, 0.0], [0.3, 0.1, 0.3])
         self.poses[robot] = compose(self.poses[robot], move)
+        if self.rng.random() < 0.2:  # a slip that the odometry misses, and after which a filter has to recover
+            self.poses[robot] = compose(self.poses[robot], self.rng.normal(0.0, [0.3, 0.3, 0.05]))
         return move + self.rng.standard_normal(3) * self.motion.sigmas(move)
 
     def look(self, robot: int, most: int) -> tuple[Measurements | None, IntArray | None]:
@@ -115,6 +117,8 @@ def run_both(seed: int, steps: int, **choices: Any) -> dict[str, int]:
         resampling=str(rng.choice(list(RESAMPLING))),
         resample_threshold=float(rng.choice([0.0, 0.5, 1.0])),
         ambiguity=float(rng.choice([0.0, 2.0, 6.0])),
+        dead_radius=float(rng.choice([0.0, 0.4, 1.0])),
+        recovery_position=float(rng.choice([0.0, 0.5])),
         one_to_one=bool(rng.random() < 0.7),
         **choices,
     )
