@@ -39,24 +39,24 @@ def compose(a_from_b: ArrayLike, b_from_c: ArrayLike) -> FloatArray:
     """
     a, b = np.asarray(a_from_b, dtype=np.float64), np.asarray(b_from_c, dtype=np.float64)
     c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
-    return np.stack(
-        [
-            a[..., 0] + c * b[..., 0] - s * b[..., 1],
-            a[..., 1] + s * b[..., 0] + c * b[..., 1],
-            wrap_angle(a[..., 2] + b[..., 2]),
-        ],
-        axis=-1,
-    )
+    x, y = b[..., 0], b[..., 1]
+    result = np.empty(a.shape if a.shape == b.shape else np.broadcast_shapes(a.shape, b.shape))
+    result[..., 0] = a[..., 0] + c * x - s * y
+    result[..., 1] = a[..., 1] + s * x + c * y
+    result[..., 2] = wrap_angle(a[..., 2] + b[..., 2])
+    return result
 
 
 def inverse(a_from_b: ArrayLike) -> FloatArray:
     """Turn a motion around: the pose (..., 3) of a in b from the pose (..., 3) of b in a."""
     a = np.asarray(a_from_b, dtype=np.float64)
     c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
-    return np.stack(
-        [-c * a[..., 0] - s * a[..., 1], s * a[..., 0] - c * a[..., 1], wrap_angle(-a[..., 2])],
-        axis=-1,
-    )
+    x, y = a[..., 0], a[..., 1]
+    result = np.empty(a.shape)
+    result[..., 0] = -c * x - s * y
+    result[..., 1] = s * x - c * y
+    result[..., 2] = wrap_angle(-a[..., 2])
+    return result
 
 
 def between(w_from_a: ArrayLike, w_from_b: ArrayLike) -> FloatArray:

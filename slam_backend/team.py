@@ -118,7 +118,7 @@ class TeamSlam:
             new = int(np.count_nonzero((found >= 0) & (found == made)))
             rows.append(
                 {
-                    "ess": float(group.filter.num_particles) if report is None else report.ess,
+                    "ess": self.ess(robot),
                     "nis": float("nan") if report is None else report.nis,
                     "landmarks": float(group.filter.map_size),
                     "accepted": float(np.count_nonzero(found >= 0) - new),
@@ -127,6 +127,11 @@ class TeamSlam:
                 }
             )
         return tuple(rows)
+
+    def ess(self, robot: int) -> float:
+        """Return the effective sample size of the robot's filter at its last step, in [1, M]."""
+        group = self._find(robot)[0]
+        return float(group.filter.num_particles) if group.report is None else group.report.ess
 
     def pose(self, robot: int) -> PoseEstimate:
         """Return the robot's pose in the map frame of its group."""

@@ -181,7 +181,7 @@ class TeamBelief:
             covariance=own.covariance,
             particles=self._team.particles_from_start(robot),
             log_weights=log_weights,
-            ess=self._team.diagnostics[robot]["ess"] / len(log_weights),
+            ess=self._team.ess(robot) / len(log_weights),
             grid=self._grids[robot].frozen(),
             candidates=Candidates(
                 goals=slots.goals,
