@@ -21,7 +21,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend._jit import jit
 from slam_backend.alignment import Alignment
 from slam_backend.errors import BoolArray, FloatArray, IntArray
 from slam_backend.filter import UNPACK, UPPER, FastSlam
@@ -30,6 +29,7 @@ from slam_backend.geometry import compose, inverse, rotation
 from slam_backend.resampling import systematic
 
 MIN_PAIRS = 3  # fewer shared landmarks in a particle do not fix a motion better than the consensus does
+_UNIT = np.array([1.0, 0.0, 0.0, 1.0, 0.0, 1.0])[:, None]  # a packed identity, where a particle lacks a landmark
 CANDIDATES = 4  # pairs of particles weighed for each that is kept
 
 
@@ -210,18 +210,6 @@ def _fuse_rows(
     a[2][rows_a] += np.where(in_b, b[2][rows_b], 0)
 
 
-@jit
-def _unpack(landmarks: FloatArray, row: int, m: int, matrix: FloatArray) -> None:
-    """Write the covariance of a landmark in a particle as a full matrix."""
-    c = 3
-    for i in range(3):
-        for j in range(i, 3):
-            matrix[i, j] = landmarks[row, c, m]
-            matrix[j, i] = matrix[i, j]
-            c += 1
-
-
-@jit
 def _align_pairs(
     landmarks_a: FloatArray, present_a: BoolArray, landmarks_b: FloatArray, present_b: BoolArray,
     from_a: IntArray, from_b: IntArray, initial: FloatArray,
@@ -237,48 +225,35 @@ def _align_pairs(
         Motions (c, 3), information matrices (c, 3, 3), chi^2 (c,), sums of log|2 pi S| (c,), and how many landmarks
         both particles of a pair hold (c,).
     """
-    count = len(from_a)
-    motions = np.empty((count, 3))
-    informations = np.zeros((count, 3, 3))
-    chi2 = np.zeros(count)
-    log_dets = np.zeros(count)
-    shared = np.zeros(count, dtype=np.int64)
-    sigma = np.empty((3, 3))
-    sigma_b = np.empty((3, 3))
-    turn = np.eye(3)
-    jacobian = np.zeros((3, 3))
-    residual = np.empty(3)
-    for p in range(count):
-        ma, mb = from_a[p], from_b[p]
-        motions[p] = initial
-        for iteration in range(4):
-            c, s = math.cos(motions[p, 2]), math.sin(motions[p, 2])
-            turn[0, 0], turn[0, 1], turn[1, 0], turn[1, 1] = c, -s, s, c
-            information = np.zeros((3, 3))
-            gradient = np.zeros(3)
-            chi2[p], log_dets[p], shared[p] = 0.0, 0.0, 0
-            for k in range(landmarks_a.shape[0]):
-                if not (present_a[k, ma] and present_b[k, mb]):
-                    continue
-                shared[p] += 1
-                x, y = landmarks_b[k, 0, mb], landmarks_b[k, 1, mb]
-                residual[0] = landmarks_a[k, 0, ma] - (c * x - s * y + motions[p, 0])
-                residual[1] = landmarks_a[k, 1, ma] - (s * x + c * y + motions[p, 1])
-                residual[2] = landmarks_a[k, 2, ma] - landmarks_b[k, 2, mb]
-                _unpack(landmarks_a, k, ma, sigma)
-                _unpack(landmarks_b, k, mb, sigma_b)
-                total = sigma + turn @ sigma_b @ turn.T
-                jacobian[0, 0] = jacobian[1, 1] = 1.0
-                jacobian[0, 2] = -s * x - c * y
-                jacobian[1, 2] = c * x - s * y
-                weighted = np.linalg.solve(total, residual)
-                information += jacobian.T @ np.linalg.solve(total, jacobian)
-                gradient += jacobian.T @ weighted
-                chi2[p] += residual[0] * weighted[0] + residual[1] * weighted[1] + residual[2] * weighted[2]
-                log_dets[p] += math.log(np.linalg.det(total)) + 3.0 * math.log(2.0 * math.pi)
-            informations[p] = information
-            if shared[p] < MIN_PAIRS:
-                break
-            if iteration < 3:
-                motions[p] += np.linalg.solve(information, gradient)
-    return motions, informations, chi2, log_dets, shared
+    a, b = landmarks_a[:, :, from_a], landmarks_b[:, :, from_b]
+    both = present_a[:, from_a] & present_b[:, from_b]
+    shared = np.count_nonzero(both, axis=0)
+    enough = np.flatnonzero(shared >= MIN_PAIRS)
+    motions = np.tile(initial, (len(from_a), 1))
+    for iteration in range(4):
+        moved = b.copy()
+        _move_landmarks(moved, motions)
+        residual = a[:, :3] - moved[:, :3]
+        information, log_det = _inverse(np.where(both[:, None], a[:, 3:] + moved[:, 3:], _UNIT))
+        information *= both[:, None]
+        jacobian = np.stack([motions[:, 1] - moved[:, 1], moved[:, 0] - motions[:, 0]])  # dR/dtheta p_b
+        xx, xy, xz, yy, yz, zz = information.transpose(1, 0, 2)
+        rx, ry, rz = residual.transpose(1, 0, 2)
+        weighted = np.stack([xx * rx + xy * ry + xz * rz, xy * rx + yy * ry + yz * rz, xz * rx + yz * ry + zz * rz])
+        chi2 = np.sum(weighted[0] * rx + weighted[1] * ry + weighted[2] * rz, axis=0)
+        turned = np.stack([xx * jacobian[0] + xy * jacobian[1], xy * jacobian[0] + yy * jacobian[1]])
+        rows = [xx, xy, turned[0], yy, turned[1], jacobian[0] * turned[0] + jacobian[1] * turned[1]]
+        normal = np.array([row.sum(axis=0) for row in rows]).T[:, UNPACK]
+        if iteration < 3:
+            gradient = np.stack([weighted[0], weighted[1], np.sum(jacobian * weighted[:2], axis=0)]).sum(axis=1).T
+            motions[enough] += np.linalg.solve(normal[enough], gradient[enough][..., None])[..., 0]
+    log_dets = np.sum(both * (log_det + 3.0 * math.log(2.0 * math.pi)), axis=0)
+    return motions, normal, chi2, log_dets, shared
+
+
+def _inverse(packed: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return inverses (n, 6, c) and log-determinants (n, c) of symmetric 3 x 3 matrices (n, 6, c), upper triangles."""
+    a, b, c, d, e, f = packed.transpose(1, 0, 2)
+    cofactors = np.stack([d * f - e * e, c * e - b * f, b * e - c * d, a * f - c * c, b * c - a * e, a * d - b * b])
+    det = a * cofactors[0] + b * cofactors[1] + c * cofactors[2]
+    return (cofactors / det).transpose(1, 0, 2), np.log(det)
