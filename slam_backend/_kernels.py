@@ -110,7 +110,7 @@ def _whitened(
     )
 
 
-@inlined
+@jit
 def _gate(
     pose: FloatArray, local: FloatArray, q: int, points: FloatArray, noises: FloatArray, n: int, given: bool,
     camera: FloatArray, factor: FloatArray, spread: FloatArray,
