@@ -8,6 +8,8 @@ from slam_backend import _kernels
 from slam_backend.errors import FloatArray, IntArray, bad_argument, check_array
 from slam_backend.measurements import Measurements
 
+FARTHEST_MOVE = 1e4  # [m, rad]; no robot moves so far between two steps
+
 
 def check_step(
     k: int, size: int, odometry: Any, measurements: Any, identities: Any, poses: Any
@@ -30,6 +32,7 @@ def check_step(
             continue
         if isinstance(value, Measurements) or not hasattr(value, "__len__") or len(value) != k:
             got = f"a sequence of {len(value)}" if hasattr(value, "__len__") else value
+            got = "a bare frame" if isinstance(value, Measurements) else got
             raise bad_argument(name, f"a sequence with one entry per robot ({k})", got, "Use None for no reading.")
     identities = none if identities is None else identities
     poses = none if poses is None else poses
@@ -40,6 +43,9 @@ def check_step(
         move, frame, identity, pose = odometry[robot], measurements[robot], identities[robot], poses[robot]
         cure = "Give the motion (dx, dy, dtheta) in the previous robot frame, or None."
         moves.append(None if move is None else check_array(f"odometry[{robot}]", move, (3,), cure))
+        if moves[-1] is not None and np.abs(moves[-1]).max() > FARTHEST_MOVE:
+            cure = "Check the units: metres and radians since the robot's last step."
+            raise bad_argument(f"odometry[{robot}]", f"numbers within +-{FARTHEST_MOVE:g}", move, cure)
         if frame is not None:
             if not isinstance(frame, Measurements):
                 raise bad_argument(f"measurements[{robot}]", "Measurements or None", frame, "Wrap the arrays.")

@@ -81,6 +81,11 @@ def align_maps(
     """
     check_choice("method", method, METHODS)
     options = AlignmentOptions() if options is None else options
+    for name, value, kind in (
+        ("map_a", map_a, LandmarkMap), ("map_b", map_b, LandmarkMap), ("options", options, AlignmentOptions)
+    ):
+        if not isinstance(value, kind):
+            raise bad_argument(name, f"a {kind.__name__}", value, f"Build one: {kind.__name__}(...).")
     rng = np.random.default_rng(0) if rng is None else rng
     if not isinstance(rng, np.random.Generator):
         raise bad_argument("rng", "a numpy.random.Generator or None", rng, "Give np.random.default_rng(seed).")

@@ -68,6 +68,16 @@ def check_float(
     return float(value)
 
 
+def check_seed(seed: Any) -> Any:
+    """Return `seed` if it can seed a random stream: an int >= 0, a SeedSequence or a Generator; or raise."""
+    if isinstance(seed, (np.random.SeedSequence, np.random.Generator)):
+        return seed
+    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
+        cure = "Give an int, so that the run can be repeated."
+        raise bad_argument("seed", "an int >= 0, a SeedSequence or a Generator", seed, cure)
+    return int(seed)
+
+
 def check_choice(name: str, value: Any, choices: tuple[str, ...], cure: str = "Choose one of these names.") -> str:
     """Return `value` if it is one of `choices`, or raise with the list of them."""
     if not isinstance(value, str) or value not in choices:

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from slam_backend import _kernels
 from slam_backend._step_input import check_step
 from slam_backend.camera import ROBOT_FROM_CAMERA, StereoCamera
-from slam_backend.errors import FloatArray, IntArray, bad_argument, check_array, check_choice, check_int
+from slam_backend.errors import FloatArray, IntArray, bad_argument, check_array, check_choice, check_int, check_seed
 from slam_backend.filter_options import FilterOptions
 from slam_backend.geometry import between, compose, rotate_covariances, rotation, wrap_angle
 from slam_backend.landmark_map import LandmarkMap
@@ -112,7 +112,7 @@ class FastSlam:
         k = check_int("num_robots", num_robots, 1, "Use at least one robot.")
         m = options.num_particles
         self.options = options
-        self._rng = np.random.default_rng(seed)
+        self._rng = np.random.default_rng(check_seed(seed))
         self._poses = np.zeros((k, m, 3))  # x_t^[m] of each robot, map frame
         self._start_poses = np.zeros((k, m, 3))  # where each robot started, map frame; spreads at a merge
         self._pose_means = np.zeros((k, m, 3))  # N(x^, P^) of each particle before sampling

@@ -126,6 +126,9 @@ class LandmarkMap:
     def save(self, path: str | Path) -> None:
         """Write the map to `path`, exactly as named, as a numpy archive that `load` reads back bit for bit."""
         arrays: dict[str, Any] = {name: getattr(self, name) for name in FIELDS}
+        if not Path(path).parent.is_dir():
+            cure = f"Make the folder {str(Path(path).parent)!r} first."
+            raise bad_argument("path", "a file in an existing folder", str(path), cure)
         with Path(path).open("wb") as file:
             np.savez(file, format=np.array(FORMAT), version=np.array(FORMAT_VERSION), **arrays)
 

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from slam_backend._step_input import check_step
 from slam_backend.alignment import Alignment, AlignmentOptions, align_maps
 from slam_backend.attempts import AttemptOptions, AttemptSchedule, PairKey
-from slam_backend.errors import BoolArray, FloatArray, IntArray, bad_argument, check_array, check_int
+from slam_backend.errors import BoolArray, FloatArray, IntArray, bad_argument, check_array, check_int, check_seed
 from slam_backend.exchange import ExchangeLedger
 from slam_backend.filter import FastSlam
 from slam_backend.filter_options import FilterOptions
@@ -64,14 +64,17 @@ class TeamSlam:
         known = {field.name for field in fields(FilterOptions)}
         for name in fastslam_options:
             if name not in known:
-                raise bad_argument(name, "a known argument", f"no option of {sorted(known)}", "Check the spelling.")
+                cure = f"Options of the filters are {', '.join(sorted(known))}."
+                raise bad_argument(name, "a known argument", "a name that no option has", cure)
         options = FilterOptions(**fastslam_options)
         for name, value, kind in (
             ("alignment", alignment, AlignmentOptions), ("attempts", attempts, AttemptOptions)
         ):
             if value is not None and not isinstance(value, kind):
                 raise bad_argument(name, f"{kind.__name__} or None", value, f"Build one: {kind.__name__}(...).")
-        sequence = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(seed)
+        if isinstance(seed, np.random.Generator):
+            raise bad_argument("seed", "an int >= 0 or a SeedSequence", seed, "A team spawns a stream for each robot.")
+        sequence = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(check_seed(seed))
         own, *streams = sequence.spawn(1 + count)
         self._rng = np.random.default_rng(own)
         self._alignment = AlignmentOptions() if alignment is None else alignment
