@@ -43,6 +43,7 @@ def test_world_is_frozen_and_knows_its_bounds() -> None:
         (lambda: World("w", [[0, 0, 1]]), r"world\.walls: expected an array of shape \(n, 4\), got shape \(1, 3\)"),
         (lambda: World("w", [[0, 0, 1, np.nan]]), r"world\.walls: expected finite numbers, got NaN"),
         (lambda: World("w", [*ROOM, [1, 1, 1, 1]]), r"world\.walls\[4\]: expected a wall longer than 0\.001 m"),
+        (lambda: World("w", [[0, 0, 5000, 0]]), r"world\.walls: expected an extent of at most 200 m, .* 5000 m"),
         (lambda: World(3, ROOM), r"world\.name: expected a string, got 3"),
         (lambda: World("w", ROOM, start_poses=[[1, 2]]), r"world\.start_poses: expected an array of shape \(n, 3\)"),
         (lambda: World("w", ROOM, landmarks(walls=[0, 9])), r"world\.landmarks\.walls: expected wall indices 0 to 3"),

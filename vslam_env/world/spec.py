@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from slam_backend.errors import FloatArray, IntArray, bad_argument, check_array
 
 SHORTEST_WALL = 1e-3  # [m] anything shorter has no direction worth the name
+LARGEST_EXTENT = 200.0  # [m] grids of free space grow with its square
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,7 +63,8 @@ class World:
         start_poses: None, or (K, 3) float64 [m, m, rad], world frame. None: an environment draws them.
 
     Raises:
-        ValueError: If there is no wall, a wall has no length, a number is not finite, or a landmark names no wall.
+        ValueError: If there is no wall, a wall has no length, the world spans more than 200 m, a number is not
+            finite, or a landmark names no wall.
 
     >>> World("room", [[0, 0, 4, 0], [4, 0, 4, 3], [4, 3, 0, 3], [0, 3, 0, 0]]).bounds
     (0.0, 0.0, 4.0, 3.0)
@@ -87,6 +89,14 @@ class World:
                 f"a wall longer than {SHORTEST_WALL:g} m",
                 f"a length of {lengths[at]:g} m",
                 "Drop it, or check that the unit is metres.",
+            )
+        extent = float(np.ptp(walls.reshape(-1, 2), axis=0).max())
+        if extent > LARGEST_EXTENT:
+            raise bad_argument(
+                "world.walls",
+                f"an extent of at most {LARGEST_EXTENT:g} m",
+                f"a width or height of {extent:g} m",
+                "Check that the unit is metres.",
             )
         walls.setflags(write=False)
         object.__setattr__(self, "walls", walls)
