@@ -27,7 +27,7 @@ from slam_backend.errors import check_int
 from training.episode import run_episode
 from training.episode_scores import score_episode
 from training.run_config import RunConfig
-from training.run_folder import plain
+from training.run_folder import check_writable, plain
 
 
 def play(config: RunConfig) -> dict[str, Any]:
@@ -99,6 +99,8 @@ def main(
 ) -> None:
     """Run the trial and print it."""
     check_int("seeds", seeds, 1, "Run at least one episode.")
+    if json_file is not None:
+        check_writable(json_file, "json")
     configs = [
         RunConfig(world=world, robots=robots, action_type=action_type, max_cycles=max_cycles, seed=seed)
         for seed in range(seeds)

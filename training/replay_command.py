@@ -49,8 +49,10 @@ def replay_mrclam(
     from training.figures_replay import draw_replay
     from training.replay_mrclam import ReplayConfig, replay
     from training.replay_scores import score_path, summarise
-    from training.run_folder import RunFolder, read_config, to_json, write_whole
+    from training.run_folder import RunFolder, check_writable, plain, read_config, to_json, write_whole
 
+    if json is not None and json.parent != out:  # the run's own folder does not exist yet
+        check_writable(json, "json")
     values: dict[str, Any] = {}
     if config is not None:
         values, values["seed"] = read_config(config, COMMAND)
@@ -69,12 +71,13 @@ def replay_mrclam(
     console = Console()
     result = _replay_live(console, log, chosen, replay)
     paths = [score_path(result, robot, own.truth) for robot, own in enumerate(log.robots)]
-    metrics = folder.write_metrics(summarise(result, log, paths))
+    scores = plain(summarise(result, log, paths))
+    _print_tables(console, scores)
+    metrics = folder.write_metrics(scores)
     _write_paths(folder, log, result)
     draw_replay(folder.path / "replay.png", log, result, paths)
     if json is not None:
-        write_whole(json, to_json(metrics))
-    _print_tables(console, metrics)
+        write_whole(json, to_json(metrics), "json")
     console.print(f"Run folder: {folder.path}", soft_wrap=True, highlight=False)
 
 

@@ -40,9 +40,11 @@ def run(
     from training.episode_scores import score_episode
     from training.figures import draw_errors, draw_maps
     from training.run_config import RunConfig
-    from training.run_folder import RunFolder, read_config, to_json, write_whole
+    from training.run_folder import RunFolder, check_writable, plain, read_config, to_json, write_whole
     from training.run_tables import print_tables
 
+    if json is not None and json.parent != out:  # the run's own folder does not exist yet
+        check_writable(json, "json")
     values: dict[str, Any] = {}
     if config is not None:
         values, values["seed"] = read_config(config, COMMAND)
@@ -63,13 +65,14 @@ def run(
     folder = RunFolder.create(out, COMMAND, chosen.to_mapping(), chosen.seed)
     console = Console()
     record = _run_live(console, env, policies, chosen, folder.path / "video.mp4" if video else None)
-    metrics = folder.write_metrics(score_episode(record))
+    scores = plain(score_episode(record))
+    print_tables(console, scores)
+    metrics = folder.write_metrics(scores)
     _write_paths(folder, record)
     draw_maps(record, folder.path / "map.png")
     draw_errors(record, folder.path / "error.png")
     if json is not None:
-        write_whole(json, to_json(metrics))
-    print_tables(console, metrics)
+        write_whole(json, to_json(metrics), "json")
     console.print(f"Run folder: {folder.path}", soft_wrap=True, highlight=False)
 
 

@@ -127,8 +127,12 @@ def to_json(content: Any) -> str:
     return json.dumps(content, indent=2, allow_nan=False) + "\n"
 
 
-def write_whole(file: Path, text: str) -> Path:
-    """Write a text file by way of a temporary one beside it, so that no reader ever finds a part."""
+def write_whole(file: Path, text: str, argument: str = "out") -> Path:
+    """Write a text file by way of a temporary one beside it, so that no reader ever finds a part.
+
+    Raises:
+        ValueError: If it cannot be written; the message names `argument`.
+    """
     try:
         handle, temporary = tempfile.mkstemp(dir=file.parent, prefix=f".{file.name}-")
         with os.fdopen(handle, "w", encoding="utf-8") as stream:
@@ -136,9 +140,28 @@ def write_whole(file: Path, text: str) -> Path:
         Path(temporary).chmod(0o666 & ~_umask())  # mkstemp makes files that only their owner can read
         Path(temporary).replace(file)
     except OSError as error:
-        cure = f"Choose another than {str(file)!r}: {error.strerror}."
-        raise bad_argument("out", "a place that can be written", "no access", cure) from error
+        raise _no_access(argument, file, error) from error
     return file
+
+
+def check_writable(file: Path, argument: str) -> None:
+    """Refuse a file that cannot be written, before the work whose result it is to hold.
+
+    Raises:
+        ValueError: If it is a folder, or its folder is missing or takes no files; the message names `argument`.
+    """
+    if file.is_dir():
+        raise bad_argument(argument, "a file", "a folder", f"Name a file in {str(file)!r}.")
+    try:
+        tempfile.TemporaryFile(dir=file.parent).close()
+    except OSError as error:
+        raise _no_access(argument, file, error) from error
+
+
+def _no_access(argument: str, file: Path, error: OSError) -> ValueError:
+    """Return the error that says that `file` cannot be written."""
+    cure = f"Choose another than {str(file)!r}: {error.strerror}."
+    return bad_argument(argument, "a place that can be written", "no access", cure)
 
 
 def installed_versions() -> dict[str, str]:

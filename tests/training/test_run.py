@@ -270,6 +270,8 @@ def test_an_interrupted_run_writes_what_it_has(monkeypatch: pytest.MonkeyPatch, 
         (("--config", "/nowhere"), "config: expected the config.toml of an earlier run"),
         (("--world", "broken.json"), "world: expected"),
         (("--world", "fig5", "--out", "/proc/version/run"), "out: expected a folder that can be written"),
+        (("--json", "none/copy.json"), "json: expected a place that can be written, got no access."),
+        (("--json", "full"), "json: expected a file, got a folder. Name a file in 'full'."),
         (("--world", "fig5", "--out", "full"), "out: expected a new or empty folder"),
     ],
 )
