@@ -1,7 +1,8 @@
 """`Belief`: what one robot believes after a tick, and `BeliefConfig`: what it assumes."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,6 +79,9 @@ class Teammate:
     pose: FloatArray
     covariance: FloatArray
 
+    def __post_init__(self) -> None:
+        _freeze_arrays(self)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Candidates:
@@ -97,10 +101,15 @@ class Candidates:
     valid: BoolArray
     features: NDArray[np.float32]
 
+    def __post_init__(self) -> None:
+        _freeze_arrays(self)
+
 
 @dataclass(frozen=True, eq=False)
 class Belief:
     """What one robot believes after a tick; everything is in its own start frame, and nothing of it is the truth.
+
+    Its arrays, those of its candidates and teammates included, are read-only copies.
 
     Attributes:
         robot: Its index.
@@ -134,7 +143,20 @@ class Belief:
     start_from_group: FloatArray
     group_map: LandmarkMap
 
+    def __post_init__(self) -> None:
+        _freeze_arrays(self)
+
     @cached_property
     def map(self) -> LandmarkMap:
         """The confirmed landmarks of the group's most probable particle."""
         return self.group_map.moved(self.start_from_group)
+
+
+def _freeze_arrays(record: Any) -> None:
+    """Replace the arrays of a frozen record by read-only copies: what a policy holds is not what the filters use."""
+    for item in fields(record):
+        value = getattr(record, item.name)
+        if isinstance(value, np.ndarray):
+            copy = value.copy()
+            copy.setflags(write=False)
+            object.__setattr__(record, item.name, copy)

@@ -1,4 +1,5 @@
 import math
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -215,6 +216,23 @@ def test_beliefs_are_in_the_own_start_frame() -> None:
         assert np.allclose(compose(start, mate.pose)[:2], env.true_poses[1 - robot, :2], atol=0.05)
         assert belief.frame == 0
         assert belief.group == (0, 1)
+
+
+def test_arrays_of_beliefs_are_read_only() -> None:
+    """No array that a policy gets, of itself, its candidates or its teammates, can be written."""
+    env = small_env(oracle_merge=True, oracle_pose=True)
+    env.reset(seed=3, options={"start_poses": MEETING})
+    for _ in range(20):
+        env.step(turning(env.agents, 0.0, 0.0))
+    belief = env.belief("robot_0")
+    assert belief.teammates
+    for record in (belief, belief.candidates, *belief.teammates):
+        values = [getattr(record, item.name) for item in fields(record)]
+        arrays = [value for value in values if isinstance(value, np.ndarray)]
+        assert len(arrays) >= 2
+        for array in arrays:
+            with pytest.raises(ValueError, match="read-only"):
+                array.flat[0] = 7
 
 
 def test_beliefs_are_frozen() -> None:
