@@ -57,7 +57,7 @@ def replay_mrclam(
     if config is not None:
         values, values["seed"] = read_config(config, COMMAND)
     given = {
-        "path": None if path is None else str(path),
+        "path": None if path is None else str(path.resolve()),  # so that the config repeats from any folder
         "robots": None if robots is None else parse_numbers(robots),
         "duration": duration,
         "particles": particles,
@@ -106,7 +106,7 @@ def default_path() -> Path:
     data = os.environ.get("VSLAM_DATA")
     if not data:
         raise bad_argument("path", "a folder of the MR.CLAM log", "no --path", "Name it, or set VSLAM_DATA.")
-    return Path(data) / DATASET
+    return Path(data).resolve() / DATASET
 
 
 def _replay_live(console: Console, log: "MrclamLog", config: "ReplayConfig", replay: Any) -> "Replay":

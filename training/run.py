@@ -63,6 +63,7 @@ def run(
     policies = chosen.make_policies(env)
     env.reset(seed=chosen.seed)  # what is wrong with the world shows before there is a folder
     folder = RunFolder.create(out, COMMAND, chosen.to_mapping(), chosen.seed)
+    folder.write_text("environment.toml", env.config.replace(world=folder.config["world"]).to_toml())
     console = Console()
     record = _run_live(console, env, policies, chosen, folder.path / "video.mp4" if video else None)
     scores = plain(score_episode(record))

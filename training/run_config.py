@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
+from pathlib import Path
 from typing import Any, Self
 
 from agents.policy import Policy
@@ -10,6 +11,7 @@ from slam_backend.errors import bad_argument, check_choice, check_int
 from vslam_env import vslam_v0
 from vslam_env.config import ACTION_TYPES, GOAL_DECISION_TICKS, PRESETS, TICK
 from vslam_env.environment import ExplorationEnv
+from vslam_env.world import WORLD_FAMILIES
 
 # Time for three robots to see the office and to meet each other's traces there [s].
 EPISODE_S = 180.0
@@ -58,8 +60,10 @@ class RunConfig:
         return cls(**values)
 
     def to_mapping(self) -> dict[str, Any]:
-        """Return the plain values that repeat this run, the seed apart."""
-        return {name: value for name, value in asdict(self).items() if name != "seed"}
+        """Return the plain values that repeat this run from any folder, the seed apart."""
+        is_path = self.world not in WORLD_FAMILIES
+        told = {"world": str(Path(self.world).resolve()) if is_path else self.world, "max_cycles": self.num_steps}
+        return {name: value for name, value in (asdict(self) | told).items() if name != "seed"}
 
     @property
     def step_s(self) -> float:

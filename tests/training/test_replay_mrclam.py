@@ -90,7 +90,8 @@ def test_a_run_is_written_and_repeats_itself(
     log.mkdir()
     _write_log(log, noise=1.0)
     monkeypatch.setenv("VSLAM_DATA", str(tmp_path))
-    options = ("--path", str(log), "--duration", "20", "--particles", "7", "--seed", "5")
+    monkeypatch.chdir(tmp_path)
+    options = ("--path", "log", "--duration", "20", "--particles", "7", "--seed", "5")
     for arguments in (
         (*options, "--out", str(first), "--json", str(tmp_path / "copy.json")),
         ("--config", str(first), "--out", str(second)),
@@ -99,6 +100,7 @@ def test_a_run_is_written_and_repeats_itself(
         with pytest.raises(SystemExit) as end:
             cli.main()
         assert not end.value.code
+        monkeypatch.chdir(first)  # the config works from any folder
     assert "odometry" in capsys.readouterr().out
     names = {f"robot{n}_{kind}.tum" for n in (2, 5) for kind in ("estimate", "dead_reckoning", "truth")}
     assert {file.name for file in first.iterdir()} == {"config.toml", "metrics.json", "replay.png", *names}

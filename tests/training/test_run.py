@@ -20,6 +20,7 @@ from training.live import LiveProgress, describe
 from training.run_config import EPISODE_S, RunConfig
 from training.run_tables import print_tables
 from vslam_env import vslam_v0
+from vslam_env.config import EnvConfig
 from vslam_env.world import World
 
 # A room of 7 x 5 m in which two robots look at the same wall from places that are not the same.
@@ -224,11 +225,14 @@ def test_a_run_folder_repeats_itself(monkeypatch: pytest.MonkeyPatch, tmp_path: 
     assert _vslam(monkeypatch, "run", "--config", str(one / "config.toml"), "--no-video", "--out", str(two)) == 0
     names = {file.name for file in one.iterdir()}
     paths = {f"robot{k}_{kind}.tum" for k in range(2) for kind in ("estimate", "dead_reckoning", "truth")}
-    assert names == paths | {"config.toml", "metrics.json", "map.png", "error.png", "video.mp4"}
+    assert names == paths | {"config.toml", "environment.toml", "metrics.json", "map.png", "error.png", "video.mp4"}
     assert {file.name for file in two.iterdir()} == names - {"video.mp4"}
     first, second = (json.loads((folder / "metrics.json").read_text()) for folder in (one, two))
     assert first == second == json.loads(copy.read_text())
     assert (first["seed"], first["config"]["world"], first["complete"]) == (5, "fig5", True)
+    for folder in (one, two):
+        config = EnvConfig.from_toml(folder / "environment.toml")
+        assert (config.world, config.num_robots, config.max_cycles) == ("fig5", 2, 23)
     for name in paths:
         assert (one / name).read_bytes() == (two / name).read_bytes()
         assert len(Trajectory.load_tum(one / name)) == 24
@@ -307,4 +311,11 @@ def test_an_episode_lasts_as_long_with_any_actions(action_type: str, step_s: flo
     config = RunConfig(action_type=action_type)
     assert config.step_s == pytest.approx(step_s)
     assert config.num_steps * config.step_s == pytest.approx(EPISODE_S)
-    assert RunConfig.from_mapping(config.to_mapping()) == config
+    assert RunConfig.from_mapping(config.to_mapping()) == replace(config, max_cycles=config.num_steps)
+
+
+def test_a_config_repeats_a_run_from_any_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """The path of a world is stored whole; the name of a family stays a name."""
+    monkeypatch.chdir(tmp_path)
+    assert RunConfig(world="plan.png").to_mapping()["world"] == str(tmp_path.resolve() / "plan.png")
+    assert RunConfig(world="fig5").to_mapping()["world"] == "fig5"
