@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from agents.policy import Policy
-from slam_backend.errors import FloatArray, bad_argument
+from slam_backend.errors import FloatArray, IntArray, bad_argument
 from slam_backend.geometry import between
 from slam_backend.landmark_map import LandmarkMap
 from slam_backend.reports import MergeEvent
@@ -17,6 +17,11 @@ from vslam_env.environment import ExplorationEnv
 from vslam_env.rendering import Scene
 
 FALSE_MERGE_M, FALSE_MERGE_DEG = 0.5, 5.0
+
+
+def is_false_merge(error_m: float, error_deg: float) -> bool:
+    """Return whether maps were joined in a way that is plainly wrong."""
+    return error_m > FALSE_MERGE_M or error_deg > FALSE_MERGE_DEG
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +49,7 @@ class MergeRecord:
     @property
     def is_false(self) -> bool:
         """Whether the maps were joined in a way that is plainly wrong."""
-        return self.error_m > FALSE_MERGE_M or self.error_deg > FALSE_MERGE_DEG
+        return is_false_merge(self.error_m, self.error_deg)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,6 +69,9 @@ class EpisodeRecord:
         infos: Per robot its last info.
         own_maps: Per robot its map just before its first merge, own start frame; the last map if it never merged.
         alone_until: Per robot the time of that merge [s], or None.
+        map_claims: Per robot the true landmark (n,) int64 behind each one of its map, as `map_rmse` reads claims.
+        maps: Per robot its map at the end, own start frame.
+        true_landmarks: (N, 3) float64 [m], world frame.
         scene: The last picture: truth and maps in the world frame.
         complete: Whether the episode ran to its end.
     """
@@ -80,6 +88,9 @@ class EpisodeRecord:
     infos: tuple[Mapping[str, Any], ...]
     own_maps: tuple[LandmarkMap, ...]
     alone_until: tuple[float | None, ...]
+    map_claims: tuple[IntArray, ...]
+    maps: tuple[LandmarkMap, ...]
+    true_landmarks: FloatArray
     scene: Scene
     complete: bool
 
@@ -202,6 +213,9 @@ class _Log:
             infos=tuple(dict(self._infos[agent]) for agent in self._agents),
             own_maps=tuple(maps[robot] for robot in range(len(self._agents))),
             alone_until=tuple(self._alone_until.get(robot) for robot in range(len(self._agents))),
+            map_claims=tuple(self._env.episode.ledger.claims(own.group, own.map.ids) for own in last.values()),
+            maps=tuple(own.map for own in last.values()),
+            true_landmarks=self._env.true_landmarks,
             scene=self._env.scene(),
             complete=not self._env.agents,
         )

@@ -166,7 +166,7 @@ def _print_tables(console: Console, metrics: dict[str, Any]) -> None:
     for row in metrics["merges"]:
         sides = [", ".join(map(str, row[side])) for side in ("robots_a", "robots_b")]
         merges.add_row(
-            f"{row['time_s']:.1f}", *sides, str(row["inliers"]), _number(row["error_m"]), _number(row["error_deg"])
+            f"{row['time_s']:.1f}", *sides, str(row["landmarks"]), _number(row["error_m"]), _number(row["error_deg"])
         )
     console.print(merges if metrics["merges"] else "No merge.")
     console.print("Groups at the end: " + "; ".join(", ".join(map(str, group)) for group in metrics["groups"]))

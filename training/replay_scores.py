@@ -12,6 +12,7 @@ from slam_backend.landmark_map import LandmarkMap
 from slam_backend.metrics import MapScore, align_se2, ate, map_error, map_rmse
 from slam_backend.readers.mrclam import MrclamLog
 from slam_backend.trajectory import Trajectory
+from training.episode_scores import merge_row
 from training.replay_mrclam import Merge, Replay
 
 
@@ -115,13 +116,19 @@ def merge_error(merge: Merge, log: MrclamLog) -> tuple[float, float] | None:
 
 
 def summarise(replay: Replay, log: MrclamLog, paths: Sequence[PathScore | None]) -> dict[str, Any]:
-    """Return the content of `metrics.json`; what cannot be known is NaN, robots carry the numbers of the log."""
+    """Return the content of `metrics.json`; what cannot be known is NaN.
+
+    Robots carry the numbers of the log, in `robot`, `groups` and `merges` alike. `map_rmse_m` = `map_rmse_aligned_m`,
+    `map_recall` and `map_precision` are after the best SE(2) fit of the map; `map_rmse_start_m` and `map_error` put the
+    start frame at the true start pose, without any fitting.
+    """
     numbers = [robot.robot for robot in log.robots]
     named = [[numbers[robot] for robot in group] for group in replay.groups]
     nan = float("nan")
     robots = []
     for robot, path in enumerate(paths):
         aligned = align_to_truth(replay.maps[robot], log)
+        start_error, start_rmse = _start_frame_errors(replay.maps[robot], path, log) if path else (nan, nan)
         robots.append(
             {
                 "robot": numbers[robot],
@@ -130,24 +137,26 @@ def summarise(replay: Replay, log: MrclamLog, paths: Sequence[PathScore | None])
                 "dead_reckoning_ate_aligned_m": path.reckoned_aligned if path else nan,
                 "dead_reckoning_ate_start_m": path.reckoned_start if path else nan,
                 "map_rmse_m": aligned.score.rmse if aligned else nan,
+                "map_rmse_aligned_m": aligned.score.rmse if aligned else nan,
+                "map_rmse_start_m": start_rmse,
                 "map_recall": aligned.score.recall if aligned else 0.0,
                 "map_precision": aligned.score.precision if aligned else 0.0,
-                "map_error": _start_frame_error(replay.maps[robot], path, log) if path else nan,
+                "map_error": start_error,
             }
         )
     merges = []
     for merge in replay.merges:
         error = merge_error(merge, log)
         merges.append(
-            {
-                "time_s": merge.time,
-                "step": merge.event.step,
-                "robots_a": [numbers[robot] for robot in merge.event.robots_a],
-                "robots_b": [numbers[robot] for robot in merge.event.robots_b],
-                "inliers": len(merge.event.alignment.inliers),
-                "error_m": error[0] if error else nan,
-                "error_deg": float(np.rad2deg(error[1])) if error else nan,
-            }
+            merge_row(
+                merge.event.step,
+                merge.time,
+                [numbers[robot] for robot in merge.event.robots_a],
+                [numbers[robot] for robot in merge.event.robots_b],
+                len(merge.event.alignment.inliers),
+                error[0] if error else nan,
+                float(np.rad2deg(error[1])) if error else nan,
+            )
         )
     duration = float(replay.times[-1] - replay.times[0])
     return {
@@ -156,10 +165,11 @@ def summarise(replay: Replay, log: MrclamLog, paths: Sequence[PathScore | None])
     }  # fmt: skip
 
 
-def _start_frame_error(landmarks: LandmarkMap, path: PathScore, log: MrclamLog) -> float:
-    """Return the map error with the start frame at the true start pose, without any fitting."""
+def _start_frame_errors(landmarks: LandmarkMap, path: PathScore, log: MrclamLog) -> tuple[float, float]:
+    """Return map error and RMSE [m] with the start frame at the true start pose, without any fitting."""
     claims = landmarks.descriptors.argmax(axis=1).astype(np.int64) if len(landmarks) else np.empty(0, dtype=np.int64)
-    return map_error(_flat(landmarks.moved(path.world_from_start).means), claims, _flat(log.positions))
+    means, truths = _flat(landmarks.moved(path.world_from_start).means), _flat(log.positions)
+    return map_error(means, claims, truths), map_rmse(means, truths, claims).rmse
 
 
 def _flat(points: FloatArray) -> FloatArray:

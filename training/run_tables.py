@@ -56,10 +56,10 @@ def _figure(value: float | None, form: str, factor: float) -> str:
 def _merges(rows: list[Mapping[str, Any]]) -> Table:
     """Return the table of merges."""
     table = Table(title="Merges, against the true motion between the start poses")
-    for heading in ("time [s]", "robots", "with", "landmarks", "off by [m]", "off by [deg]", ""):
+    for heading in ("time [s]", "robots", "with", "landmarks", "off by [m]", "off by [deg]", "verdict"):
         table.add_column(escape(heading), justify="right")
     for row in rows:
         sides = [", ".join(map(str, row[side])) for side in ("robots_a", "robots_b")]
         errors = f"{row['error_m']:.3f}", f"{row['error_deg']:.2f}"
-        table.add_row(f"{row['time_s']:.1f}", *sides, str(row["inliers"]), *errors, "false" if row["false"] else "")
+        table.add_row(f"{row['time_s']:.1f}", *sides, str(row["landmarks"]), *errors, "false" if row["false"] else "")
     return table

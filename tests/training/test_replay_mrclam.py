@@ -62,12 +62,16 @@ def test_without_noise_the_team_is_right(tmp_path: Path) -> None:
     assert metrics["groups"] == [[2, 5]]
     assert len(metrics["merges"]) == 1
     assert metrics["merges"][0]["error_m"] < 0.05
+    assert metrics["merges"][0]["false"] is False
+    assert {"step", "landmarks"} <= set(metrics["merges"][0])
     assert metrics["merges"][0]["error_deg"] < 1.0
     for row in metrics["robots"]:
         assert row["ate_aligned_m"] < 0.05
         assert row["dead_reckoning_ate_start_m"] < 1e-3
         assert row["map_rmse_m"] < 0.05
         assert row["map_precision"] == 1.0
+        assert row["map_rmse_aligned_m"] == row["map_rmse_m"]
+        assert row["map_rmse_m"] - 1e-3 < row["map_rmse_start_m"] < 0.1
 
 
 def test_noise_is_removed_that_dead_reckoning_keeps(tmp_path: Path) -> None:

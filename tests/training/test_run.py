@@ -30,6 +30,7 @@ ROOM = World(
     start_poses=np.array([[2.0, 1.5, 0.2], [1.5, 3.5, -0.4]]),
 )
 STEPS = 31
+MERGE_KEYS = {"step", "time_s", "robots_a", "robots_b", "landmarks", "error_m", "error_deg", "false"}
 
 
 def play(**options: object) -> EpisodeRecord:
@@ -129,10 +130,12 @@ def test_metrics_have_the_promised_names(record: EpisodeRecord) -> None:
     assert {"robots", "merges", "groups", "coverage"} <= set(metrics)
     promised = {
         "ate_aligned_m", "ate_start_m", "dead_reckoning_ate_aligned_m", "map_rmse_m", "map_recall", "map_precision",
-        "map_error",
+        "map_error", "map_rmse_start_m", "map_rmse_aligned_m", "robot",
     }  # fmt: skip
     assert all(promised <= set(robot) for robot in metrics["robots"])
-    assert {"time_s", "error_m", "error_deg", "robots_a", "robots_b", "false"} <= set(metrics["merges"][0])
+    assert set(metrics["merges"][0]) == MERGE_KEYS
+    for robot in metrics["robots"]:
+        assert robot["map_rmse_aligned_m"] <= robot["map_rmse_start_m"] == robot["map_rmse_m"]
 
 
 @pytest.mark.parametrize(("error_m", "error_deg", "false"), [(0.5, 5.0, False), (0.51, 0.0, True), (0.0, 5.1, True)])
