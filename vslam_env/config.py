@@ -1,6 +1,7 @@
 """`EnvConfig`: everything that defines an environment, frozen and validated, with presets and a TOML form."""
 
 import dataclasses
+import json
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -26,6 +27,13 @@ PRESETS = ("easy", "standard", "hard")
 MAX_ROBOTS = 8
 TICK = 0.1  # [s]
 GOAL_DECISION_TICKS = 10
+PARTS = {
+    "landmarks": LandmarkConfig,
+    "odometry": OdometryNoise,
+    "landmark_sensor": LandmarkSensorConfig,
+    "scan": ScanConfig,
+    "belief": BeliefConfig,
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -86,6 +94,8 @@ class EnvConfig:
         robots = check_int("num_robots", self.num_robots, 1, "Use 1 to 8 robots.")
         if robots > MAX_ROBOTS:
             raise bad_argument("num_robots", f"an int from 1 to {MAX_ROBOTS}", robots, "Use 1 to 8 robots.")
+        if not isinstance(self.world, str):
+            raise bad_argument("world", "a name or a path, as a string", self.world, "Pass a World to parallel_env.")
         check_choice("sensor", self.sensor, SENSORS)
         check_choice("action_type", self.action_type, ACTION_TYPES)
         check_choice("observation_type", self.observation_type, OBSERVATION_TYPES)
@@ -94,11 +104,19 @@ class EnvConfig:
         check_int("max_cycles", self.max_cycles, 1, "Give a number of steps.")
         if self.stop_at_recall is not None:
             check_float("stop_at_recall", self.stop_at_recall, "Give a share or None.", above=0.0, at_most=1.0)
+        for name in ("oracle_pose", "oracle_association", "oracle_merge", "shared_start_view"):
+            if not isinstance(getattr(self, name), bool):
+                raise bad_argument(name, "True or False", getattr(self, name), "Give a bool.")
+        if not isinstance(self.reward, Mapping):
+            raise bad_argument("reward", "weights by name", self.reward, "E.g. {'map_error': 1.0}.")
         for name, weight in self.reward.items():
             check_float(f"reward[{name!r}]", weight, "Give the weight of the term.")
         check_float("robot_radius", self.robot_radius, "Give metres.", above=0.0)
         check_float("min_start_distance", self.min_start_distance, "Give metres.", at_least=0.0)
         check_float("map_error_cutoff", self.map_error_cutoff, "Give metres.", above=0.0)
+        for name, kind in PARTS.items():
+            if not isinstance(getattr(self, name), kind):
+                raise bad_argument(name, f"a {kind.__name__}", getattr(self, name), f"Build one: {kind.__name__}(...).")
         check_float("scan.half_fov", self.scan.half_fov, "A scan spans less than a half circle.", at_most=1.57)
 
     @property
@@ -178,7 +196,8 @@ def preset_config(name: str) -> EnvConfig:
 def _validated(cls: type[T], values: Mapping[str, Any]) -> T:
     """Build `cls` from nested dicts, or raise the project's one error for the first thing that is wrong."""
     try:
-        return TypeAdapter(cls).validate_python(dict(values))
+        # Strict on JSON refuses 2.0, "2" and True as ints, but takes dicts for parts, lists for tuples, int for float.
+        return TypeAdapter(cls).validate_json(json.dumps(_plain(values), default=str), strict=True)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         own = first.get("ctx", {}).get("error")

@@ -1,4 +1,6 @@
+import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -61,6 +63,49 @@ def test_nested_changes_keep_the_rest() -> None:
     assert config.max_cycles == 77
     assert config.landmark_sensor.max_measurements == 9
     assert config.landmark_sensor.detection_probability == 0.9
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("num_robots", 2.0),
+        ("num_robots", "2"),
+        ("max_cycles", True),
+        ("max_cycles", "9"),
+        ("decision_ticks", 2.0),
+        ("stop_at_recall", True),
+        ("oracle_pose", "yes"),
+        ("oracle_merge", 1),
+        ("shared_start_view", 0.0),
+        ("robot_radius", "0.2"),
+        ("world", 3),
+        ("reward", 1.0),
+        ("belief", 5),
+    ],
+)
+def test_values_of_a_wrong_type_are_refused(field: str, value: Any) -> None:
+    """No value is silently turned into another type, however a configuration is made; the error names the field."""
+    message = f"^{field}: expected .*, got {re.escape(repr(value))}"
+    with pytest.raises(ValueError, match=message):
+        EnvConfig(**{field: value})
+    with pytest.raises(ValueError, match=message):
+        EnvConfig.from_dict({field: value})
+
+
+@pytest.mark.parametrize("particles", [True, "10", 10.0])
+def test_nested_values_of_a_wrong_type_are_refused(particles: Any) -> None:
+    """Nor in the nested parts."""
+    with pytest.raises(ValueError, match=r"num_particles: expected .*, got"):
+        EnvConfig().replace(belief={"filter": {"num_particles": particles}})
+
+
+def test_what_toml_writes_otherwise_is_accepted() -> None:
+    """Whole numbers do for floats, lists for tuples, and numbers of numpy for those of Python."""
+    config = EnvConfig().replace(
+        robot_radius=1, stop_at_recall=1, num_robots=np.int64(2), landmark_sensor={"camera": {"mount": [0, 0, 1]}}
+    )
+    assert (config.robot_radius, config.stop_at_recall, config.num_robots) == (1.0, 1.0, 2)
+    assert config.landmark_sensor.camera.mount == (0.0, 0.0, 1.0)
 
 
 @pytest.mark.parametrize(("action_type", "ticks"), [("continuous", 1), ("discrete", 1), ("goal", 10)])
