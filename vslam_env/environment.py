@@ -21,7 +21,7 @@ from vslam_env.rendering import Scene, draw_frame
 from vslam_env.reward import RewardSpec, Standing, evaluate, make_terms
 from vslam_env.scenes import scene_of
 from vslam_env.window import Window
-from vslam_env.world import World, WorldSource
+from vslam_env.world import World, WorldSource, check_source
 
 AgentID = str
 RENDER_MODES = ("human", "rgb_array")
@@ -60,6 +60,7 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         self.max_cycles = config.max_cycles
         self.recorder: Recorder | None = None
         self._source: WorldSource = config.world if world is None else world
+        check_source(self._source)
         self._terms = make_terms(config.reward if reward is None else reward)
         self.possible_agents = config.agents
         self.agents: list[AgentID] = []

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from small_env import MEETING, small_env
 
-from vslam_env import World, vslam_v0
+from vslam_env import EnvConfig, ExplorationEnv, World, vslam_v0
 from vslam_env.solo import SoloExplorationEnv
 
 NARROW = World("narrow", [[0, 0, 9, 0], [9, 0, 9, 0.3], [9, 0.3, 0, 0.3], [0, 0.3, 0, 0]])
@@ -40,9 +40,11 @@ class _Twice:
 
 
 CASES: dict[str, tuple[Callable[[], Any], str]] = {
-    "unknown world": (_reset(world="castle"), r"world.*expected.*'office'.*'castle'"),
-    "missing world file": (_reset(world="nowhere.png"), r"nowhere\.png"),
-    "world of a wrong type": (_reset(world=3), "world: expected a name, a path, a World or a function, got 3"),
+    "unknown world": (lambda: small_env(world="castle"), r"world.*expected.*'office'.*'castle'"),
+    "world without a name": (lambda: small_env(world=""), r"world: expected one of 'office'.*, got ''"),
+    "missing world file": (lambda: small_env(world="nowhere.png"), r"nowhere\.png"),
+    "missing world in a config": (lambda: ExplorationEnv(EnvConfig(world="nowhere.json")), r"nowhere\.json"),
+    "world of a wrong type": (lambda: small_env(world=3), "world: expected a name, a path, .*, got 3"),
     "function that makes no world": (_reset(world=lambda rng: 5), "world: expected a function that returns a World"),
     "robots do not fit": (_reset(world=NARROW), "a disc of radius 0.2 m fits"),
     "starts do not fit": (_reset(world=CLOSET, num_robots=8), "num_robots: expected as many as can start 5 m apart"),

@@ -8,7 +8,7 @@ from vslam_env.world.floorplan import load_floorplan, load_walls_json
 from vslam_env.world.freespace import FreeSpace
 from vslam_env.world.landmarks import LandmarkConfig, place_landmarks
 from vslam_env.world.odometry import OdometryNoise, draw_bias, read_odometry
-from vslam_env.world.registry import WORLD_FAMILIES, WorldSource, make_world
+from vslam_env.world.registry import WORLD_FAMILIES, WorldSource, check_source, make_world
 from vslam_env.world.simulator import Simulator
 from vslam_env.world.spec import Landmarks, World
 
@@ -21,6 +21,7 @@ __all__ = [
     "Simulator",
     "World",
     "WorldSource",
+    "check_source",
     "draw_bias",
     "load_floorplan",
     "load_walls_json",

@@ -30,37 +30,57 @@ def make_world(world: WorldSource, rng: np.random.Generator) -> World:
     Raises:
         ValueError: If there is no such family or file, or the function returns something else.
     """
+    check_source(world)
     if isinstance(world, World):
         return world
     if isinstance(world, str) and world in WORLD_FAMILIES:
         return WORLD_FAMILIES[world](rng)
     if isinstance(world, (str, Path)):
-        return _load(Path(world), rng)
-    if callable(world):
-        made = world(rng)
-        if not isinstance(made, World):
-            raise bad_argument("world", "a function that returns a World", made, "Return World(name, walls).")
-        return made
-    raise bad_argument("world", "a name, a path, a World or a function", world, f"Names: {', '.join(WORLD_FAMILIES)}.")
+        return _load(world, rng)
+    made = world(rng)
+    if not isinstance(made, World):
+        raise bad_argument("world", "a function that returns a World", made, "Return World(name, walls).")
+    return made
 
 
-def _load(path: Path, rng: np.random.Generator) -> World:
+def check_source(world: object) -> None:
+    """Refuse what `make_world` could not make a world from, without making one.
+
+    Raises:
+        ValueError: If there is no such family or file, or a folder holds none, or it is nothing of the kind.
+    """
+    if isinstance(world, (str, Path)):
+        if not (isinstance(world, str) and world in WORLD_FAMILIES):
+            _files(world)
+    elif not isinstance(world, World) and not callable(world):
+        cure = f"Names: {', '.join(WORLD_FAMILIES)}."
+        raise bad_argument("world", "a name, a path, a World or a function", world, cure)
+
+
+def _load(world: str | Path, rng: np.random.Generator) -> World:
     """Load the world at a path, or one of a folder's."""
-    if path.is_dir():
+    files = _files(world)
+    path = files[int(rng.integers(len(files)))] if Path(world).is_dir() else files[0]
+    return load_walls_json(path) if path.suffix.lower() == ".json" else load_floorplan(path)
+
+
+def _files(world: str | Path) -> list[Path]:
+    """Return the file at a path, or those of a folder; at least one."""
+    path = Path(world)
+    if path.is_dir() and world != "":  # the path of no characters would be the current folder
         files = sorted(p for p in path.iterdir() if p.suffix.lower() in (*IMAGE_SUFFIXES, ".json"))
         if not files:
             cure = "Put .png, .jpg, .pgm or .json files there."
             raise bad_argument("world", "a folder with floor plans", str(path), cure)
-        path = files[int(rng.integers(len(files)))]
-    suffix = path.suffix.lower()
-    if suffix == ".json":
-        return load_walls_json(path)
-    if suffix in IMAGE_SUFFIXES:
-        return load_floorplan(path)
-    names = ", ".join(repr(name) for name in WORLD_FAMILIES)
-    raise bad_argument(
-        "world",
-        f"one of {names}, or a path of an image, a .json file or a folder",
-        str(path),
-        "Check the spelling, or that the file ends in .png, .jpg, .pgm or .json.",
-    )
+        return files
+    if path.suffix.lower() not in (*IMAGE_SUFFIXES, ".json"):
+        names = ", ".join(repr(name) for name in WORLD_FAMILIES)
+        raise bad_argument(
+            "world",
+            f"one of {names}, or a path of an image, a .json file or a folder",
+            str(world),
+            "Check the spelling, or that the file ends in .png, .jpg, .pgm or .json.",
+        )
+    if not path.is_file():
+        raise bad_argument("world", "a file", str(path), "Check the path: there is no such file.")
+    return [path]
