@@ -20,23 +20,23 @@ DATASET = Path("mrclam") / "MRCLAM_Dataset7"
 
 def replay_mrclam(
     path: Annotated[
-        Path | None, typer.Option(help=f"Folder of the log.  [default: {DATASET} in $VSLAM_DATA]", show_default=False)
+        Path | None, typer.Option(help="Folder of the log.", show_default=f"{DATASET} in $VSLAM_DATA")
     ] = None,
     robots: Annotated[
-        str | None, typer.Option(help="Numbers with commas, e.g. 1,2,5.  [default: all]", show_default=False)
+        str | None, typer.Option(help="Numbers with commas, e.g. 1,2,5.", show_default="all")
     ] = None,
     duration: Annotated[
-        float | None, typer.Option(help="Seconds to replay.  [default: all]", show_default=False)
+        float | None, typer.Option(help="Seconds to replay.", show_default="all")
     ] = None,
     particles: Annotated[
-        int | None, typer.Option(help="Particles per filter.  [default: 100]", show_default=False)
+        int | None, typer.Option(help="Particles per filter.", show_default="100")
     ] = None,
     estimator: Annotated[
-        str | None, typer.Option(help="fastslam2 or fastslam1.  [default: fastslam2]", show_default=False)
+        str | None, typer.Option(help="fastslam2 or fastslam1.", show_default="fastslam2")
     ] = None,
-    seed: Annotated[int | None, typer.Option(help="Of all random draws.  [default: 0]", show_default=False)] = None,
+    seed: Annotated[int | None, typer.Option(help="Of all random draws.", show_default="0")] = None,
     out: Annotated[
-        Path | None, typer.Option(help="New run folder.  [default: the next runs/replay-mrclam-*]", show_default=False)
+        Path | None, typer.Option(help="New run folder.", show_default="the next runs/replay-mrclam-*")
     ] = None,
     json: Annotated[Path | None, typer.Option(help="Write the metrics to this file too.", show_default=False)] = None,
     config: Annotated[
