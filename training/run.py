@@ -20,7 +20,9 @@ def run(
         str | None, typer.Option(help="office, fig5, or the path of a floor plan.", show_default="office")
     ] = None,
     robots: Annotated[int | None, typer.Option(help="How many, 1 to 8.", show_default="3")] = None,
-    policy: Annotated[str | None, typer.Option(help="frontier, random_goals or random_walk.", show_default="frontier")] = None,
+    policy: Annotated[
+        str | None, typer.Option(help="frontier, random_goals or random_walk.", show_default="frontier")
+    ] = None,
     seed: Annotated[int | None, typer.Option(help="Of all random draws.", show_default="0")] = None,
     action_type: Annotated[
         str | None, typer.Option(help="continuous, discrete or goal.", show_default="continuous")
