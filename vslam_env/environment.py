@@ -78,10 +78,12 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
 
     def observation_space(self, agent: AgentID) -> spaces.Space[Any]:
         """Return the space of an agent's observations; always the same object."""
+        self._index(agent)
         return self.observation_spaces[agent]
 
     def action_space(self, agent: AgentID) -> spaces.Space[Any]:
         """Return the space of an agent's actions; always the same object."""
+        self._index(agent)
         return self.action_spaces[agent]
 
     def reset(
@@ -183,7 +185,7 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         """
         if self.render_mode is None:
             return None
-        frame = draw_frame(self.scene())
+        frame = draw_frame(scene_of(self._running_episode("render"), self._standing))
         if self.render_mode == "rgb_array":
             return frame
         self._window.show(frame)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend.errors import FloatArray, IntArray
+from slam_backend.errors import FloatArray, IntArray, bad_argument
 from slam_backend.geometry import between, compose, wrap_angle
 from vslam_env.belief import Body, TeamBelief
 from vslam_env.config import TICK, EnvConfig
@@ -166,7 +166,14 @@ class Episode:
         given = self.world.start_poses
         if start_poses is not None:
             return free_space.check_starts(start_poses, config.num_robots)
-        if given is not None and len(given) >= config.num_robots:
+        if given is not None:
+            if len(given) < config.num_robots:
+                raise bad_argument(
+                    "world.start_poses",
+                    f"a row for each of {config.num_robots} robots",
+                    f"shape {given.shape}",
+                    "Add rows, use fewer robots, or leave them out to have starts drawn.",
+                )
             return free_space.check_starts(given[: config.num_robots], config.num_robots)
         return free_space.draw_starts(
             config.num_robots,

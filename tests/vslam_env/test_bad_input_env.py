@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from small_env import MEETING, small_env
+from small_env import MEETING, WALLS, small_env
 
 from vslam_env import EnvConfig, ExplorationEnv, World, vslam_v0
 from vslam_env.solo import SoloExplorationEnv
@@ -147,6 +147,18 @@ CASES: dict[str, tuple[Callable[[], Any], str]] = {
         "expected an int from 0 to 16, got 1.5",
     ),
     "team in a solo environment": (lambda: SoloExplorationEnv(num_robots=2), "num_robots: expected 1, got 2"),
+    "fewer starts than robots": (
+        _reset(world=World("two", WALLS, start_poses=MEETING), num_robots=3),
+        r"world\.start_poses: expected a row for each of 3 robots, got shape \(2, 3\)",
+    ),
+    "observations of a stranger": (
+        lambda: small_env().observation_space("robot_7"),
+        r"agent: expected one of \['robot_0', 'robot_1'\], got 'robot_7'",
+    ),
+    "actions of a stranger": (
+        lambda: small_env().action_space("robot_7"),
+        r"agent: expected one of \['robot_0', 'robot_1'\], got 'robot_7'",
+    ),
     "belief of a stranger": (
         lambda: (env := small_env(), env.reset(seed=0), env.belief("robot_9")),
         r"agent: expected one of \['robot_0', 'robot_1'\], got 'robot_9'",
@@ -166,15 +178,16 @@ def test_bad_input_is_refused_clearly(name: str) -> None:
     assert text.rstrip().endswith((".", "?"))
 
 
-@pytest.mark.parametrize("name", ["step", "state", "belief", "events", "readings", "scene", "true_poses"])
+@pytest.mark.parametrize("name", ["step", "state", "belief", "events", "readings", "scene", "true_poses", "render"])
 def test_nothing_works_before_a_reset(name: str) -> None:
     """What needs an episode says so before the first reset."""
-    env = small_env()
+    env = small_env(render_mode="rgb_array")
     calls: dict[str, Callable[[], Any]] = {
         "step": lambda: env.step({}),
         "state": env.state,
         "belief": lambda: env.belief("robot_0"),
         "scene": env.scene,
+        "render": env.render,
     }
     with pytest.raises(RuntimeError, match=rf"{name}: expected a running episode, got none\. Call reset\(\) first\."):
         calls.get(name, lambda: getattr(env, name))()

@@ -159,3 +159,11 @@ def test_a_share_of_descriptors_is_repeated() -> None:
     """With `repeated` = 0.4 about 40 % of 500 landmarks look exactly like another (4 sigma: 0.09)."""
     vectors = draw_descriptors(500, LandmarkConfig(repeated=0.4), np.random.default_rng(2))
     assert abs(1.0 - len(np.unique(vectors, axis=0)) / 500 - 0.4) < 0.09
+
+
+def test_unknown_keys_of_json_worlds_are_named(tmp_path: Path) -> None:
+    """A key that means nothing, perhaps misspelt, is refused by its name."""
+    path = tmp_path / "room.json"
+    path.write_text(json.dumps({"walls": ROOM, "start_pose": [[1, 1, 0]]}), encoding="utf-8")
+    with pytest.raises(ValueError, match=r"world: expected no other keys in .*, got 'start_pose'"):
+        make_world(path, np.random.default_rng(0))

@@ -71,10 +71,12 @@ def load_walls_json(path: str | Path) -> World:
         content: Any = json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
         raise bad_argument("world", "a JSON file", f"a syntax error in {path}: {error}", cure) from error
-    known = {"walls", "start_poses", "name"}
-    if not isinstance(content, dict) or "walls" not in content or not set(content) <= known:
-        keys = sorted(content) if isinstance(content, dict) else content
-        raise bad_argument("world", "an object with the key 'walls'", keys, cure)
+    if not isinstance(content, dict) or "walls" not in content:
+        got = sorted(content) if isinstance(content, dict) else content
+        raise bad_argument("world", f"an object with the key 'walls' in {path}", got, cure)
+    unknown = sorted(set(content) - {"walls", "start_poses", "name"})
+    if unknown:
+        raise bad_argument("world", f"no other keys in {path}", unknown[0], cure)
     return World(content.get("name", path.stem), content["walls"], start_poses=content.get("start_poses"))
 
 

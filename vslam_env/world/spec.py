@@ -60,7 +60,8 @@ class World:
         name: Shown in tables and pictures.
         walls: (S, 4) float64 [m], world frame. Rows x1 y1 x2 y2: thin, opaque, solid segments.
         landmarks: None: an environment places them on the walls.
-        start_poses: None, or (K, 3) float64 [m, m, rad], world frame. None: an environment draws them.
+        start_poses: None, or (K, 3) float64 [m, m, rad], world frame, for K robots or fewer. None: an environment draws
+            them.
 
     Raises:
         ValueError: If there is no wall, a wall has no length, the world spans more than 200 m, a number is not
