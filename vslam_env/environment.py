@@ -1,5 +1,6 @@
 """`ExplorationEnv`: the PettingZoo parallel environment."""
 
+import dataclasses
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
@@ -55,13 +56,13 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
     ) -> None:
         if render_mode is not None:
             check_choice("render_mode", render_mode, RENDER_MODES, "Choose one of these, or None.")
-        self.config = config
         self.render_mode = render_mode
         self.max_cycles = config.max_cycles
         self.recorder: Recorder | None = None
         self._source: WorldSource = config.world if world is None else world
         check_source(self._source)
         self._terms = make_terms(config.reward if reward is None else reward)
+        self.config = dataclasses.replace(config, reward={term.name: term.weight for term in self._terms})
         self.possible_agents = config.agents
         self.agents: list[AgentID] = []
         goal, flat = config.action_type == "goal", config.observation_type == "flat"
@@ -160,7 +161,7 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         self._cycle += 1
 
         terms = evaluate(self._terms, before, self._standing)
-        rewards = np.sum(list(terms.values()), axis=0) if terms else np.zeros(len(agents))
+        rewards = np.sum(list(terms.values()), axis=0)
         goal = self.config.stop_at_recall
         terminated = goal is not None and bool(self._standing.map_recalls.min() >= goal)
         truncated = not terminated and self._cycle >= self.max_cycles

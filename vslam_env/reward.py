@@ -84,8 +84,10 @@ def make_terms(reward: RewardSpec) -> tuple[RewardTerm, ...]:
     """Turn names with weights, or ready-made terms, into terms.
 
     Raises:
-        ValueError: If a name is unknown or repeats, or an object is no term.
+        ValueError: If there is no term, a name is unknown or repeats, or an object is no term.
     """
+    if isinstance(reward, (Mapping, list, tuple)) and not reward:
+        raise bad_argument("reward", "at least one term", reward, "E.g. {'map_error': 1.0}.")
     if isinstance(reward, Mapping):
         for name in reward:
             if name not in TERMS:

@@ -81,6 +81,8 @@ CASES: dict[str, tuple[Callable[[], Any], str]] = {
         r"belief\.filter\.particles: expected a known field, got 5",
     ),
     "unknown reward": (lambda: small_env(reward={"fame": 1.0}), "reward: expected one of 'map_error', .*got 'fame'"),
+    "no weights": (lambda: small_env(reward={}), "reward: expected at least one term, got {}"),
+    "no terms": (lambda: small_env(reward=[]), r"reward: expected at least one term, got \[\]"),
     "reward as text": (lambda: small_env(reward="map_error"), "reward: expected weights by name, or a list of terms"),
     "reward without a name": (
         lambda: small_env(reward=[_Nameless()]),

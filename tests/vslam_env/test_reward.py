@@ -45,6 +45,7 @@ def test_terms_of_ones_own() -> None:
             return after.distances - before.distances
 
     env = small_env(reward=[*make_terms({"map_error": 1.0}), Frugal()])
+    assert env.config.reward == {"map_error": 1.0, "frugal": -0.5}
     env.reset(seed=0)
     for _ in range(5):
         _, rewards, _, _, infos = env.step(turning(env.agents))
