@@ -7,6 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend.errors import bad_argument
+from slam_backend.reports import MergeEvent
+from vslam_env.belief import Belief
+from vslam_env.config import EnvConfig
 from vslam_env.environment import ExplorationEnv
 from vslam_env.vslam_v0 import parallel_env
 
@@ -52,9 +55,23 @@ class SoloExplorationEnv(gymnasium.Env[Any, Any]):
         """Return a picture or show it; see `ExplorationEnv.render`."""
         return self.parallel.render()
 
+    @property
+    def config(self) -> EnvConfig:
+        """All that defines this environment."""
+        return self.parallel.config
+
+    @property
+    def events(self) -> tuple[MergeEvent, ...]:
+        """All attempts and merges since the reset: none, as there is nobody to merge with."""
+        return self.parallel.events
+
+    def belief(self) -> Belief:
+        """Return what the robot believes; see `ExplorationEnv.belief`."""
+        return self.parallel.belief(AGENT)
+
     def action_masks(self) -> NDArray[np.bool_]:
         """Return which `goal` actions are valid (17,) bool, under the name that sb3-contrib's MaskablePPO asks for."""
-        valid = self.parallel.belief(AGENT).candidates.valid
+        valid = self.belief().candidates.valid
         return np.concatenate([[True], valid])
 
     def close(self) -> None:

@@ -1,5 +1,6 @@
 """Version 0 of the environment under PettingZoo's names: `parallel_env`, `env`, `raw_env`."""
 
+from functools import wraps
 from pathlib import Path
 from typing import Any
 
@@ -77,21 +78,22 @@ def parallel_env(
         "oracle_association": oracle_association,
         "oracle_merge": oracle_merge,
         "stop_at_recall": stop_at_recall,
-        "reward": reward if isinstance(reward, dict) else None,
         "belief": None if num_particles is None else {"filter": {"num_particles": num_particles}},
     }
     config = config.replace(**{name: value for name, value in changes.items() if value is not None})
     return ExplorationEnv(config, world=world, reward=reward, render_mode=render_mode)
 
 
-def raw_env(**kwargs: Any) -> AECEnv[str, Any, Any]:
+@wraps(parallel_env, assigned=())  # the signature alone
+def raw_env(*args: Any, **kwargs: Any) -> AECEnv[str, Any, Any]:
     """Make the turn-based (AEC) environment, unwrapped; arguments as of `parallel_env`."""
-    return parallel_to_aec(parallel_env(**kwargs))
+    return parallel_to_aec(parallel_env(*args, **kwargs))
 
 
-def env(**kwargs: Any) -> AECEnv[str, Any, Any]:
+@wraps(parallel_env, assigned=())
+def env(*args: Any, **kwargs: Any) -> AECEnv[str, Any, Any]:
     """Make the turn-based (AEC) environment with PettingZoo's checks of the order of calls."""
-    return OrderEnforcingWrapper(raw_env(**kwargs))
+    return OrderEnforcingWrapper(raw_env(*args, **kwargs))
 
 
 def _world_name(world: WorldSource) -> str:

@@ -1,3 +1,7 @@
+import inspect
+from collections.abc import Callable
+from typing import Any
+
 import gymnasium
 import pettingzoo
 import pytest
@@ -92,3 +96,11 @@ def test_metadata_and_spaces() -> None:
         assert env.action_space(agent) is env.action_space(agent) is env.action_spaces[agent]
     assert env.action_space("robot_0") is not env.action_space("robot_1")
     assert env.action_space("robot_0") == env.action_space("robot_1")
+
+
+@pytest.mark.parametrize("make", [vslam_v0.env, vslam_v0.raw_env])
+def test_turn_based_environments_take_the_same_arguments(make: Callable[..., Any]) -> None:
+    """The signature is that of `parallel_env`, and the world may come first without its name."""
+    parameters = inspect.signature(make).parameters
+    assert parameters == inspect.signature(vslam_v0.parallel_env).parameters
+    assert make(room(), 2).possible_agents == ["robot_0", "robot_1"]

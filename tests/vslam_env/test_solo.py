@@ -56,3 +56,12 @@ def test_teams_are_refused() -> None:
     """More than one robot needs the parallel environment."""
     with pytest.raises(ValueError, match=r"num_robots: expected 1, got 3\. Use vslam_v0\.parallel_env for a team\."):
         SoloExplorationEnv(num_robots=3)
+
+
+def test_belief_config_and_events() -> None:
+    """What the environment tells beyond Gymnasium is that of the parallel one."""
+    env = SoloExplorationEnv(world=room(), num_particles=20)
+    env.reset(seed=0)
+    assert env.config.num_robots == 1
+    assert env.belief() is env.parallel.belief("robot_0")
+    assert env.events == ()
