@@ -434,10 +434,11 @@ class FastSlam:
     def _resample(self, weights: FloatArray) -> None:
         """Draw the particles anew in proportion to their weights; all that a particle holds is copied with it."""
         ancestors = RESAMPLING[self.options.resampling](weights, self._rng)
-        self._poses = self._poses[:, ancestors]
-        self._start_poses = self._start_poses[:, ancestors]
-        self._pose_means = self._pose_means[:, ancestors]
-        self._pose_covariances = self._pose_covariances[:, ancestors]
+        # `take` keeps arrays contiguous, where a slice with indices would not: kernels are compiled once.
+        self._poses = np.take(self._poses, ancestors, axis=1)
+        self._start_poses = np.take(self._start_poses, ancestors, axis=1)
+        self._pose_means = np.take(self._pose_means, ancestors, axis=1)
+        self._pose_covariances = np.take(self._pose_covariances, ancestors, axis=1)
         self._path_log_weights = self._path_log_weights[ancestors]
         self._log_weights = np.full(len(ancestors), -np.log(len(ancestors)))
         self._landmarks = np.take(self._landmarks, ancestors, axis=2)

@@ -85,11 +85,12 @@ def merge_filters(
     )
     moved = {"_poses": b._poses, "_start_poses": b._start_poses, "_pose_means": b._pose_means}
     for name, poses_b in moved.items():
-        setattr(joint, name, np.concatenate([getattr(a, name)[:, from_a], compose(motion, poses_b[:, from_b])]))
+        poses_a = np.take(getattr(a, name), from_a, axis=1)
+        setattr(joint, name, np.concatenate([poses_a, compose(motion, poses_b[:, from_b])]))
     turn = np.zeros((count, 3, 3))
     turn[:, :2, :2], turn[:, 2, 2] = rotation(motion[:, 2]), 1.0
     spread_b = turn @ b._pose_covariances[:, from_b] @ turn.transpose(0, 2, 1)
-    joint._pose_covariances = np.concatenate([a._pose_covariances[:, from_a], spread_b])
+    joint._pose_covariances = np.concatenate([np.take(a._pose_covariances, from_a, axis=1), spread_b])
     joint._path_log_weights = a._path_log_weights[from_a] + b._path_log_weights[from_b] + evidence
     joint._log_weights = np.full(count, -math.log(count))
 
