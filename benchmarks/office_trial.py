@@ -89,7 +89,8 @@ def describe(trial: Mapping[str, Any]) -> str:
 
 
 def main(
-    seeds: Annotated[int, typer.Option(help="How many, from 0 on.")] = 20,
+    seeds: Annotated[int, typer.Option(help="How many.")] = 20,
+    first_seed: Annotated[int, typer.Option(help="The first of them.")] = 0,
     world: Annotated[str, typer.Option(help="A family name or a path.")] = "office",
     robots: Annotated[int, typer.Option(help="How many.")] = 3,
     action_type: Annotated[str, typer.Option(help="continuous, discrete or goal.")] = "continuous",
@@ -99,11 +100,12 @@ def main(
 ) -> None:
     """Run the trial and print it."""
     check_int("seeds", seeds, 1, "Run at least one episode.")
+    check_int("first_seed", first_seed, 0, "Seeds are not negative.")
     if json_file is not None:
         check_writable(json_file, "json")
     configs = [
         RunConfig(world=world, robots=robots, action_type=action_type, max_cycles=max_cycles, seed=seed)
-        for seed in range(seeds)
+        for seed in range(first_seed, first_seed + seeds)
     ]
     console = Console(highlight=False, soft_wrap=True)
     trials = []
