@@ -1,0 +1,255 @@
+"""The compact log of a run: nothing is lost, nothing finished is copied or written, and copies go their own way."""
+
+import copy
+import pickle
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from same_bits import assert_same
+
+from slam_backend.log_arrays import EXACT, ODOMETRY, STOOD
+from slam_backend.run_log import MEASUREMENTS, ROWS, RobotLog
+
+Step = dict[str, Any]
+
+
+def random_steps(count: int, seed: int, most: int = 40, optional: float = 0.3) -> list[Step]:
+    """Return steps as arguments of `append`: every kind of motion, frames of any size, columns that come and go."""
+    rng = np.random.default_rng(seed)
+    steps: list[Step] = []
+    index = 0
+    for _ in range(count):
+        n = int(rng.integers(0, most)) if rng.random() < 0.8 else 0
+        step: Step = {"step": index, "points": rng.normal(size=(n, 3)), "ids": rng.integers(-1, 50, n)}
+        if rng.random() < 0.7:
+            step["odometry"] = rng.normal(size=3)
+        if rng.random() < 0.2:
+            step["pose"] = rng.normal(size=3)
+        if rng.random() < optional:
+            step["covariances"] = rng.normal(size=(n, 6))
+        if rng.random() < optional:
+            step["descriptor_rows"] = rng.integers(-1, 99, n)
+        steps.append(step)
+        index += int(rng.integers(1, 4))
+    return steps
+
+
+def log_of(steps: list[Step]) -> RobotLog:
+    """Return a log of these steps."""
+    log = RobotLog()
+    for step in steps:
+        log.append(**step)
+    return log
+
+
+@pytest.mark.parametrize(("count", "most", "optional"), [(0, 5, 0.0), (1, 5, 1.0), (700, 5, 0.0), (300, 90, 0.02)])
+def test_what_is_logged_comes_back(count: int, most: int, optional: float) -> None:
+    """The loop over a log yields the very steps that were appended, over chunks and empty frames, in order."""
+    steps = random_steps(count, 3, most, optional)
+    log = log_of(steps)
+    assert (len(log), log.num_measurements) == (count, sum(len(step["ids"]) for step in steps))
+    for row, step in zip(log, steps, strict=True):
+        assert row.step == step["step"]
+        if "pose" in step:
+            kind, motion = EXACT, step["pose"]
+        else:
+            kind, motion = (ODOMETRY, step["odometry"]) if "odometry" in step else (STOOD, np.zeros(3))
+        assert row.kind == kind
+        np.testing.assert_array_equal(row.motion, motion)
+        np.testing.assert_array_equal(row.points, step["points"])
+        np.testing.assert_array_equal(row.ids, step["ids"])
+        assert (row.covariances is None) == ("covariances" not in step) or not len(row.ids)
+        if "covariances" in step and row.covariances is not None:
+            np.testing.assert_array_equal(row.covariances, step["covariances"])
+        expected_rows = step.get("descriptor_rows", np.full(len(row.ids), -1))
+        np.testing.assert_array_equal(np.full(len(row.ids), -1) if row.descriptor_rows is None else row.descriptor_rows,
+                                      expected_rows)  # fmt: skip
+
+
+@pytest.mark.parametrize("optional", [0.0, 0.01])
+def test_flat_arrays_hold_the_same_as_the_loop(optional: float) -> None:
+    """Row t of the arrays is step t of the loop; columns that never came are None, else filled up with NaN and -1."""
+    log = log_of(random_steps(600, 5, 30, optional))
+    arrays = log.arrays()
+    assert len(arrays) == 600
+    assert (arrays.covariances is None, arrays.descriptor_rows is None) == (optional == 0.0,) * 2
+    for t, row in enumerate(log):
+        again = arrays.row(t)
+        for name, one, other in zip(row._fields, row, again, strict=True):
+            if name != "descriptor_rows":
+                assert_same(one, other, name)
+    if arrays.covariances is not None:
+        by_measurement = np.repeat(arrays.given, np.diff(arrays.starts))
+        np.testing.assert_array_equal(np.isnan(arrays.covariances).all(axis=1), ~by_measurement)
+
+
+def test_the_end_of_a_run_alone() -> None:
+    """`arrays(since)` is the tail of `arrays()`, whatever the index: before, within, between steps and behind all."""
+    log = log_of(random_steps(600, 6, 30))
+    whole = log.arrays()
+    last, border = int(whole.steps[-1]), int(whole.steps[ROWS])
+    for since in [0, 1, last // 3, last // 2, last - 1, last, last + 1, border - 3, border - 2, border - 1, border]:
+        tail = log.arrays(since)
+        t = int(np.count_nonzero(whole.steps < since))
+        first = whole.starts[t]
+        np.testing.assert_array_equal(tail.steps, whole.steps[t:])
+        np.testing.assert_array_equal(tail.starts, whole.starts[t:] - first)
+        np.testing.assert_array_equal(tail.motions, whole.motions[t:])
+        np.testing.assert_array_equal(tail.ids, whole.ids[first:])
+        np.testing.assert_array_equal(tail.points, whole.points[first:])
+
+
+@given(seed=st.integers(0, 2**32 - 1), cut=st.integers(0, 60), most=st.sampled_from([3, 90, 400]))
+def test_a_restored_log_goes_on_bit_for_bit(seed: int, cut: int, most: int) -> None:
+    """From a snapshot, pickled or not, and from any kind of copy, the same steps give the same bytes."""
+    steps = random_steps(60, seed, most)
+    log = log_of(steps[:cut])
+    state = log.get_state()
+    restored = RobotLog()
+    restored.append(3, odometry=np.ones(3))
+    restored.set_state(pickle.loads(pickle.dumps(state)))
+    others = [restored, log.copy(), copy.copy(log), copy.deepcopy(log), pickle.loads(pickle.dumps(log))]
+    for step in steps[cut:]:
+        log.append(**step)
+        for other in others:
+            other.append(**step)
+    for other in others:
+        assert_same(other.get_state(), log.get_state())
+        assert other.nbytes == log.nbytes
+    log.set_state(state)
+    assert_same(log.get_state(), log_of(steps[:cut]).get_state())
+
+
+def test_finished_chunks_are_shared_and_cannot_be_written() -> None:
+    """Snapshots and copies hold the very chunks of the log, and nobody can write them, after a pickle neither."""
+    log = log_of(random_steps(900, 8))
+    chunks = log.get_state()["chunks"]
+    assert len(chunks) > 3
+    twin = log.copy()
+    for one, other in zip(chunks, twin.get_state()["chunks"], strict=True):
+        assert one is other
+    assert copy.deepcopy(log.get_state())["chunks"][0] is chunks[0]
+    for state in (log.get_state(), pickle.loads(pickle.dumps(log.get_state()))):
+        for part in (*state["chunks"], state["unfinished"]):
+            for name in ("steps", "kinds", "motions", "given", "starts", "points", "ids"):
+                with pytest.raises(ValueError, match="read-only"):
+                    getattr(part, name)[:1] = 0
+    for array in (log.arrays().points, log.arrays(1500).ids, next(iter(log)).motion):
+        with pytest.raises(ValueError, match="read-only"):
+            array[:1] = 0
+
+
+def test_what_is_appended_is_copied() -> None:
+    """The caller may use its buffers again, and a log that goes on leaves its snapshots alone."""
+    points, ids, motion = np.ones((2, 3)), np.array([4, 5]), np.ones(3)
+    log = RobotLog()
+    log.append(0, odometry=motion, points=points, ids=ids)
+    state, arrays = log.get_state(), log.arrays()
+    points[:], ids[:], motion[:] = 9.0, 9, 9.0
+    log.append(1, odometry=motion, points=points, ids=ids)
+    for held in (state["unfinished"], arrays):
+        assert (len(held), held.points.max(), held.ids.max(), held.motions.max()) == (1, 1.0, 5, 1.0)
+
+
+@pytest.mark.parametrize("others", ["reject", "keep"])
+def test_renamed_is_a_dictionary_applied_to_each_id(others: Any) -> None:
+    """Each id becomes what a plain dictionary says; the rest is shared, and the log itself keeps its names."""
+    steps = random_steps(500, 9)
+    log = log_of(steps)
+    before = log.arrays()
+    rng = np.random.default_rng(1)
+    old = rng.permutation(50)[:30]
+    new = rng.integers(-1, 1000, 30)
+    names = dict(zip(old.tolist(), new.tolist(), strict=True))
+    renamed = log.renamed(old, new, others)
+    expected = [names.get(i, i if others == "keep" else -1) for i in before.ids.tolist()]
+    np.testing.assert_array_equal(renamed.arrays().ids, expected)
+    np.testing.assert_array_equal(renamed.arrays().points, before.points)
+    assert renamed.get_state()["chunks"][0].points is log.get_state()["chunks"][0].points
+    assert_same(log.get_state(), log_of(steps).get_state())
+    log.append(10_000, odometry=np.zeros(3))
+    renamed.append(10_000, odometry=np.ones(3))
+    assert log.arrays().motions[-1].tolist() != renamed.arrays().motions[-1].tolist()
+
+
+def test_renaming_to_nothing_rejects_all() -> None:
+    """Without any name every measurement is rejected, and with `others="keep"` nothing changes."""
+    log = log_of(random_steps(5, 2))
+    assert log.num_measurements > 0
+    assert set(log.renamed([], []).arrays().ids.tolist()) == {-1}
+    assert_same(log.renamed([], [], "keep").get_state(), log.get_state())
+
+
+@pytest.mark.parametrize("before", [0, 1, ROWS - 1, ROWS])
+def test_a_frame_larger_than_a_chunk(before: int) -> None:
+    """Frames of any size fit, first of all, after motion alone, and where a chunk is full; what follows as well."""
+    big = MEASUREMENTS + 7
+    steps: list[Step] = [{"step": t, "odometry": np.full(3, t)} for t in range(before)]
+    steps += [
+        {"step": before + j, "points": np.full((n, 3), float(j)), "ids": np.full(n, j)}
+        for j, n in enumerate([big, 2, big, 0, MEASUREMENTS, 1])
+    ]
+    log = log_of(steps)
+    assert [len(row.ids) for row in log][before:] == [big, 2, big, 0, MEASUREMENTS, 1]
+    for row, step in zip(log, steps, strict=True):
+        np.testing.assert_array_equal(row.points, step.get("points", np.empty((0, 3))))
+    assert_same(log.copy().get_state(), log.get_state())
+
+
+def test_memory_of_a_long_run() -> None:
+    """10,000 steps of 15 measurements take less than 6 MB, nine tenths of it numbers and not room to spare."""
+    points, ids, move = np.zeros((15, 3)), np.arange(15), np.zeros(3)
+    log = RobotLog()
+    for t in range(10_000):
+        log.append(t, odometry=move, points=points, ids=ids)
+    needed = 10_000 * (8 + 1 + 24 + 1 + 8) + 150_000 * (24 + 8)
+    assert needed <= log.nbytes < min(6e6, needed / 0.9)
+    assert log.arrays().nbytes == needed + 8
+
+
+GOOD: Step = {"step": 5, "points": np.zeros((2, 3)), "ids": np.array([1, 2])}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"step": 4}, r"step: expected an int > 4, got 4\. Log steps in order, each once\."),
+        ({"points": np.zeros((3, 3))}, r"points: expected an array of shape \(2, 3\), got shape \(3, 3\)"),
+        ({"points": np.zeros(3)}, r"points: expected an array of shape \(2, 3\), got shape \(3,\)"),
+        ({"odometry": np.zeros(2)}, r"odometry: expected an array of shape \(3,\), got shape \(2,\)"),
+        ({"pose": np.zeros(4)}, r"pose: expected an array of shape \(3,\), got shape \(4,\)"),
+        ({"covariances": np.zeros((2, 3))}, r"covariances: expected an array of shape \(2, 6\), got shape \(2, 3\)"),
+        ({"descriptor_rows": np.zeros(3)}, r"descriptor_rows: expected an array of shape \(2,\), got shape \(3,\)"),
+    ],
+)
+def test_a_refused_step_leaves_no_trace(change: Step, message: str) -> None:
+    """A step out of order or out of shape is refused by name, and the log is as before."""
+    log = log_of([{**GOOD, "step": 4}])
+    before = log.get_state()
+    with pytest.raises(ValueError, match="^" + message):
+        log.append(**(GOOD | change))
+    assert_same(log.get_state(), before)
+    log.append(**GOOD)
+    assert_same(log.get_state(), log_of([{**GOOD, "step": 4}, GOOD]).get_state())
+
+
+def test_bad_names_and_states_are_refused() -> None:
+    """`renamed` wants one new name for each old one, `set_state` what `get_state` gave, `arrays` an index."""
+    log = log_of(random_steps(3, 0))
+    for old, new, message in (
+        ([1, 2], [3], r"^new_ids: expected an array of shape \(2,\), got shape \(1,\)"),
+        ([1, 1], [3, 4], r"^old_ids: expected each id once, got \[1, 1\]"),
+        ([-1], [3], r"^old_ids: expected ids >= 0, got -1"),
+        ([1], [-2], r"^new_ids: expected ids >= -1, got -2"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            log.renamed(old, new)
+    with pytest.raises(ValueError, match=r"^others: expected one of 'reject', 'keep', got '?drop"):
+        log.renamed([1], [2], "drop")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"^state: expected a dict from RobotLog\.get_state, got no 'unfinished'"):
+        log.set_state({"chunks": ()})
+    with pytest.raises(ValueError, match=r"^since: expected an int >= 0, got -1"):
+        log.arrays(-1)
