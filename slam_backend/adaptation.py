@@ -80,7 +80,7 @@ def kld_bound(num_bins: int, error: float, quantile: float) -> float:
 def occupied_bins(
     poses: FloatArray, weights: FloatArray, bin_position: float, bin_heading: float, least_weight: float = 0.0
 ) -> int:
-    """Count the bins of a grid that hold particles; the mean pose is the centre of one, so that a tight cloud fills one.
+    """Count the bins of a grid that hold particles; the mean pose is the centre of one: a tight cloud fills just one.
 
     Args:
         poses: (M, 3) float64 [m, m, rad].
