@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from reference_frame import Frame, turn_about_vertical
 
 from slam_backend import _kernels
 from slam_backend.camera import ROBOT_FROM_CAMERA, StereoCamera
 from slam_backend.errors import FloatArray
 from slam_backend.geometry import transform_points
 from slam_backend.measurements import Measurements
+from slam_backend.plain.frame import Frame, turn_about_vertical
 
 CAMERA = StereoCamera(mount=(0.3, -0.2, 0.5))
 PARAMETERS = np.array([320.0, 0.12, 0.2, 0.1, *CAMERA.mount])

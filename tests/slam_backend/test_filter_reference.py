@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from reference_filter import ReferenceFastSlam
 
 from slam_backend.camera import StereoCamera
 from slam_backend.errors import FloatArray, IntArray
@@ -14,6 +13,7 @@ from slam_backend.filter_options import FilterOptions
 from slam_backend.geometry import compose, inverse, transform_points
 from slam_backend.measurements import Measurements
 from slam_backend.motion import OdometryModel
+from slam_backend.plain import PlainFastSlam
 from slam_backend.resampling import RESAMPLING
 
 CLOSE = {"rtol": 1e-9, "atol": 1e-9}
@@ -83,7 +83,7 @@ class SmallWorld:
         return Measurements(measured, descriptors, covariances), names
 
 
-def assert_same(slam: Recording, plain: ReferenceFastSlam, decisions: list[list[list[int]]], kept: Any) -> None:
+def assert_same(slam: Recording, plain: PlainFastSlam, decisions: list[list[list[int]]], kept: Any) -> None:
     """Compare every decision of the step and every number that the two filters hold."""
     for found, expected, keep in zip(slam.decisions, decisions, kept, strict=True):
         np.testing.assert_array_equal(found[keep].T, np.array(expected, dtype=np.int64).reshape(found[keep].T.shape))
@@ -124,7 +124,7 @@ def run_both(seed: int, steps: int, **choices: Any) -> dict[str, int]:
     )
     fields = {name: getattr(options, name) for name in options.__slots__}
     slam = Recording(num_robots, seed=seed, initial_poses=world.start_poses, **fields)
-    plain = ReferenceFastSlam(num_robots, options, seed, world.start_poses)
+    plain = PlainFastSlam(num_robots, options, seed, world.start_poses)
     counts = {"matched": 0, "new": 0, "rejected": 0, "resampled": 0}
     for _ in range(steps):
         odometry = [world.move(robot) for robot in range(num_robots)]
@@ -181,7 +181,7 @@ def test_a_named_landmark_behind_the_camera_or_a_motion_without_noise_is_no_spec
     for proposal in ("fastslam2", "fastslam1"):
         fields = {name: getattr(options, name) for name in options.__slots__} | {"proposal": proposal}
         slam = Recording(seed=3, **fields)
-        plain = ReferenceFastSlam(1, FilterOptions(**fields), 3)
+        plain = PlainFastSlam(1, FilterOptions(**fields), 3)
         for move, names in ((None, [4, 7]), ([0.5, 0.0, np.pi], [4, 7]), ([0.1, 0.0, 0.0], [9, -1])):
             odometry = [None if move is None else np.array(move)]
             slam.step(odometry, [frame], [names])

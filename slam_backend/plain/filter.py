@@ -10,12 +10,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from reference_frame import Frame, Landmark, Prior, turn_about_vertical
 
 from slam_backend.errors import FloatArray
 from slam_backend.filter_options import FilterOptions
 from slam_backend.geometry import compose, wrap_angle
 from slam_backend.measurements import Measurements
+from slam_backend.plain.frame import Frame, Landmark, Prior, turn_about_vertical
 from slam_backend.resampling import RESAMPLING
 
 REJECTED = -1
@@ -35,7 +35,7 @@ class Particle:
     landmarks: dict[int, Landmark] = field(default_factory=dict)
 
 
-class ReferenceFastSlam:
+class PlainFastSlam:
     """What `FastSlam` does.
 
     Args:
@@ -69,7 +69,7 @@ class ReferenceFastSlam:
     ) -> list[list[list[int]]]:
         """Do one step; return per robot, particle and used measurement the landmark to which it was given."""
         log_likelihoods = np.zeros(len(self.particles))
-        decisions = []
+        decisions: list[list[list[int]]] = []
         measured = False
         for robot, (move, seen) in enumerate(zip(odometry, measurements, strict=True)):  # Algorithm 1, l. 6-8
             names = None if identities is None else identities[robot]
@@ -264,7 +264,8 @@ class ReferenceFastSlam:
             if iteration < 2:
                 xi = xi - np.linalg.solve(information, gradient)
         log_likelihood -= 0.5 * (xi @ xi + np.linalg.slogdet(information)[1])
-        return Prior(prior.mean, prior.root, xi, np.linalg.inv(information)), float(log_likelihood)
+        spread = np.asarray(np.linalg.inv(information), dtype=np.float64)
+        return Prior(prior.mean, prior.root, xi, spread), float(log_likelihood)
 
     # ------------------------------------------------------------------ all particles
 

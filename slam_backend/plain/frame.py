@@ -1,4 +1,4 @@
-"""One robot's frame in the plain reference filter: predictions with explicit Jacobians, densities, landmark EKFs.
+"""One robot's frame in the plain filter: predictions with explicit Jacobians, densities, landmark EKFs.
 
 Measurements are compared in the space in which they are made, (u, v, disparity) for a stereo camera and the camera
 frame for points with given covariances; the compiled kernels map innovations to metres in the map frame. Densities
