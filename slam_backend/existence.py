@@ -1,0 +1,182 @@
+"""Whether a landmark exists: log-odds that grow when it is seen, and fall when it is expected in view and not seen.
+
+The idea of using what is not seen is that of Montemerlo and Thrun (2003), "Simultaneous Localization and Mapping with
+Unknown Data Association Using FastSLAM", IEEE Int. Conf. on Robotics and Automation: each landmark of each particle
+carries the log-odds of its existence, a binary Bayes filter with a constant for a sighting and one for a miss. Here the
+constants follow from a detection model: with P(seen | it exists and is expected in view) = d and P(something is taken
+for it | it does not exist) = f,
+
+    sighting: + log(d / f)          miss: + log((1 - d) / (1 - f)).
+
+Log-odds stop at a cap, so that a landmark that was seen a thousand times can still be found to be gone. The functions
+on scalars are plain arithmetic without branches: compiled into a filter's loop they vectorise over particles.
+"""
+
+from dataclasses import dataclass
+from math import exp, floor, log
+from typing import NamedTuple
+
+from slam_backend._jit import inlined
+from slam_backend.camera import StereoCamera
+from slam_backend.errors import bad_argument, check_float, check_int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ExistenceModel:
+    """How likely landmarks are seen, and when they are given up.
+
+    Attributes:
+        detection: d. Share of frames in which a right landmark that is expected in view is matched. What hides
+            landmarks and is not in the model (walls, other robots, measurements that are rejected) lowers it; too high
+            a value deletes good landmarks.
+        false_alarm: f. Share of frames in which something is matched to a landmark that does not exist.
+        prior: Probability that a landmark exists once it has been measured for the first time.
+        delete_below: A landmark less probable than this is deleted.
+        cap: Landmarks never become more probable than this.
+        margin_px: Landmarks nearer than this to the border of the image are not expected in view [px].
+        range_share: Nor are those farther than this share of the camera's largest range.
+        nearest: Nor are those whose depth is below this [m]: a stereo pair does not see them.
+        frame_limit: Largest number of measurements that the sensor reports in a frame; None: it reports all. Of E
+            landmarks expected in view, each is then seen with probability d min(1, limit / E).
+    """
+
+    detection: float = 0.8
+    false_alarm: float = 0.05
+    prior: float = 0.5
+    delete_below: float = 0.01
+    cap: float = 0.999
+    margin_px: float = 8.0
+    range_share: float = 0.9
+    nearest: float = 0.3
+    frame_limit: int | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("detection", "false_alarm", "prior", "delete_below", "cap"):
+            value = check_float(f"existence.{name}", getattr(self, name), "Give a probability.", above=0.0)
+            if value >= 1.0:
+                raise bad_argument(f"existence.{name}", "a number < 1", value, "Nothing is certain.")
+        ascending = (("false_alarm", "detection"), ("delete_below", "prior"), ("prior", "cap"))
+        for lower, upper in ascending:
+            if getattr(self, lower) >= getattr(self, upper):
+                expected = f"a number > {lower} ({getattr(self, lower):g})"
+                raise bad_argument(f"existence.{upper}", expected, getattr(self, upper), "Check which is which.")
+        check_float("existence.margin_px", self.margin_px, "Use 0 for the whole image.", at_least=0.0)
+        check_float("existence.range_share", self.range_share, "Use 1 for the whole range.", above=0.0, at_most=1.0)
+        check_float("existence.nearest", self.nearest, "Use 0 for all points ahead.", at_least=0.0)
+        if self.frame_limit is not None:
+            check_int("existence.frame_limit", self.frame_limit, 1, "Use None if the sensor reports all it sees.")
+
+    @property
+    def log_odds_prior(self) -> float:
+        """Log-odds of a new landmark."""
+        return _log_odds(self.prior)
+
+    @property
+    def log_odds_floor(self) -> float:
+        """Below these log-odds a landmark is deleted."""
+        return _log_odds(self.delete_below)
+
+    @property
+    def log_odds_cap(self) -> float:
+        """Log-odds stop here."""
+        return _log_odds(self.cap)
+
+    def increments(self, expected: int = 1) -> tuple[float, float]:
+        """Return what a sighting and a miss add to the log-odds, in a frame with `expected` landmarks in view.
+
+        A landmark that is seen gets the first, whether it was expected or not: where it was not, a sighting says more,
+        not less. One that is expected and not seen gets the second; any other keeps its log-odds.
+
+        >>> sighting, miss = ExistenceModel(detection=0.9, false_alarm=0.1).increments()
+        >>> round(sighting, 3), round(miss, 3)          # log 9 and -log 9
+        (2.197, -2.197)
+        """
+        seen = self.detection
+        if self.frame_limit is not None and expected > self.frame_limit:
+            # Seen less often than a false one would be, a landmark tells nothing any more.
+            seen = max(seen * self.frame_limit / expected, self.false_alarm)
+        return log(seen / self.false_alarm), log((1.0 - seen) / (1.0 - self.false_alarm))
+
+    def misses_to_delete(self, log_odds: float) -> int:
+        """Return after how many misses in a row, and no sooner, a landmark of these log-odds is deleted."""
+        return max(0, floor((log_odds - self.log_odds_floor) / -self.increments()[1]) + 1)
+
+    def deletion_bound(self, looks: int) -> float:
+        """Return a bound on the probability that a right landmark, expected in view so many times, is ever deleted.
+
+        A landmark that exists and is seen with probability `detection` has log-odds l with E exp(-l) constant; by
+        Ville's inequality they ever fall by h with probability at most exp(-h). A landmark starts at its prior, and
+        once more whenever it leaves the cap, at most `looks` times:
+
+            exp(floor - prior) + looks exp(floor - cap).
+        """
+        from_prior = exp(self.log_odds_floor - self.log_odds_prior)
+        return min(1.0, from_prior + looks * exp(self.log_odds_floor - self.log_odds_cap))
+
+    def view(self, camera: StereoCamera) -> "View":
+        """Return where landmarks are expected to be seen by a camera.
+
+        Raises:
+            ValueError: If the margin leaves nothing of the image, or the range ends before `nearest`.
+        """
+        side, rise = 0.5 * camera.width - self.margin_px, 0.5 * camera.height - self.margin_px
+        if min(side, rise) <= 0.0:
+            expected = f"a number < {0.5 * min(camera.width, camera.height):g}, half of the image"
+            raise bad_argument("existence.margin_px", expected, self.margin_px, "Leave some of the image.")
+        reach = self.range_share * camera.max_range
+        if reach <= self.nearest:
+            cure = "Leave some of the range."
+            raise bad_argument("existence.nearest", f"a number < {reach:g}, the range", self.nearest, cure)
+        return View(self.nearest, side / camera.focal_px, rise / camera.focal_px, reach * reach)
+
+
+class View(NamedTuple):
+    """Where landmarks are expected to be seen: bounds relative to a camera, for compiled loops.
+
+    Attributes:
+        nearest: Least depth [m].
+        side: Largest |lateral| / depth [-].
+        rise: Largest |vertical| / depth [-].
+        reach_squared: Largest squared distance [m^2].
+    """
+
+    nearest: float
+    side: float
+    rise: float
+    reach_squared: float
+
+
+def _log_odds(probability: float) -> float:
+    return log(probability / (1.0 - probability))
+
+
+@inlined
+def in_view(
+    depth: float, lateral: float, vertical: float, nearest: float, side: float, rise: float, reach_squared: float
+) -> bool:
+    """Tell whether a predicted point is expected in view: inside the image less its margin, and near enough.
+
+    Args:
+        depth, lateral, vertical: The point relative to the camera centre [m], robot axes (ahead, left, up).
+        nearest, side, rise, reach_squared: A `View`, one by one: scalars stay in registers over a loop.
+    """
+    return (
+        (depth > nearest)
+        & (abs(lateral) <= side * depth)
+        & (abs(vertical) <= rise * depth)
+        & (depth * depth + lateral * lateral + vertical * vertical <= reach_squared)
+    )
+
+
+@inlined
+def updated_log_odds(log_odds: float, seen: bool, expected: bool, sighting: float, miss: float, cap: float) -> float:
+    """Return a landmark's log-odds after a frame: Bayes' rule in logarithms, up to the cap.
+
+    Args:
+        log_odds: Before the frame.
+        seen: Whether it was matched.
+        expected: Whether it was expected in view.
+        sighting, miss: From `ExistenceModel.increments`.
+        cap: `ExistenceModel.log_odds_cap`.
+    """
+    return min(cap, log_odds + seen * sighting + (expected & (not seen)) * miss)
