@@ -89,7 +89,7 @@ class Office:
         """
         check_float("length", length, "Give metres.", above=0.0)
         check_float("step", step, "Give metres between poses.", above=0.0)
-        wanted = np.arange(int(length / step + 1e-9) + 1) * step
+        wanted: FloatArray = np.arange(int(length / step + 1e-9) + 1, dtype=np.float64) * step
         heading = _directions(self.crossings, node)
         ahead = heading[rng.integers(len(heading))]
         x, y = self.crossings[0][node[0]], self.crossings[1][node[1]]
