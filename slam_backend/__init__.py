@@ -6,6 +6,7 @@
 from slam_backend.alignment import Alignment, AlignmentOptions, align_maps
 from slam_backend.attempts import AttemptOptions
 from slam_backend.camera import StereoCamera
+from slam_backend.compilation import log_compilation
 from slam_backend.filter import FastSlam
 from slam_backend.filter_options import FilterOptions
 from slam_backend.fusion import fuse_landmarks, fuse_maps
@@ -15,6 +16,7 @@ from slam_backend.motion import OdometryModel
 from slam_backend.reports import MergeEvent, PoseEstimate, Renaming, StepReport, TeamReport
 from slam_backend.team import TeamSlam
 from slam_backend.trajectory import Trajectory
+from slam_backend.warming import warm_up
 
 __all__ = [
     "Alignment",
@@ -36,4 +38,7 @@ __all__ = [
     "align_maps",
     "fuse_landmarks",
     "fuse_maps",
+    "warm_up",
 ]
+
+log_compilation()

@@ -5,6 +5,8 @@ here and not left to BLAS, whose threads stall for milliseconds when another pro
 depends on the machine.
 """
 
+from typing import TypeVar
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,6 +14,7 @@ from slam_backend._jit import jit
 from slam_backend.errors import BoolArray, FloatArray, IntArray
 
 Float32Array = NDArray[np.float32]
+Scalar = TypeVar("Scalar", bound=np.generic)
 
 BLOCK = 256  # columns whose products are held at once: with 64 numbers each they fit a core's own cache
 
@@ -116,7 +119,7 @@ def mutual_nearest(a: Float32Array, b: Float32Array, gate: float) -> IntArray:
     """
     if not len(a) or not len(b):
         return np.empty((0, 2), np.int64)
-    nearest_b, squares, nearest_a = _nearest(a, np.ascontiguousarray(b.T))
+    nearest_b, squares, nearest_a = _nearest(_fresh(a), _fresh(b.T))
     rows = np.flatnonzero((nearest_a[nearest_b] == np.arange(len(a))) & (squares <= gate * gate))
     return np.column_stack([rows, nearest_b[rows]])
 
@@ -142,4 +145,9 @@ def unlike_other_places(
     Returns:
         (k,) mask of the matches that pass. Without any competitor a match passes.
     """
-    return _unlike(descriptors, partners, np.ascontiguousarray(others.T), positions, same_place, ratio)
+    return _unlike(_fresh(descriptors), _fresh(partners), _fresh(others.T), _fresh(positions), same_place, ratio)
+
+
+def _fresh(array: NDArray[Scalar]) -> NDArray[Scalar]:
+    """Return a copy of one kind of memory, because numba compiles a kernel again for each other kind."""
+    return np.array(array, order="C")

@@ -9,6 +9,8 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
+from training.compiling import prepare
+
 if TYPE_CHECKING:  # what computes is imported when the command runs, so that --help answers at once
     from slam_backend.readers.mrclam import MrclamLog
     from training.replay_mrclam import Replay, ReplayConfig
@@ -68,6 +70,7 @@ def replay_mrclam(
     chosen = ReplayConfig.from_mapping({"path": str(default_path()), **values} if "path" not in values else values)
     log = load_mrclam(chosen.path, chosen.robots, chosen.duration)
     folder = RunFolder.create(out, COMMAND, chosen.to_mapping(), chosen.seed)
+    prepare()
     console = Console()
     result = _replay_live(console, log, chosen, replay)
     paths = [score_path(result, robot, own.truth) for robot, own in enumerate(log.robots)]

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
+from training.compiling import prepare
+
 if TYPE_CHECKING:  # what computes is imported when the command runs, so that --help answers at once
     from training.episode import EpisodeRecord
     from training.run_config import RunConfig
@@ -63,7 +65,7 @@ def run(
     chosen = RunConfig.from_mapping(values | {name: value for name, value in given.items() if value is not None})
     env = chosen.make_env()
     policies = chosen.make_policies(env)
-    env.reset(seed=chosen.seed)  # what is wrong with the world shows before there is a folder
+    prepare(lambda: _first_steps(env, policies, chosen.seed))  # a bad world shows before there is a folder
     folder = RunFolder.create(out, COMMAND, chosen.to_mapping(), chosen.seed)
     folder.write_text("environment.toml", env.config.replace(world=folder.config["world"]).to_toml())
     console = Console()
@@ -77,6 +79,14 @@ def run(
     if json is not None:
         write_whole(json, to_json(metrics), "json")
     console.print(f"Run folder: {folder.path}", soft_wrap=True, highlight=False)
+
+
+def _first_steps(env: Any, policies: Any, seed: int) -> None:
+    """Run the first two steps of the episode, which need all kernels but those of a merge."""
+    from training.episode import run_episode
+
+    steps = iter(range(2))
+    run_episode(env, policies, seed, should_stop=lambda: next(steps, None) is None)
 
 
 def _run_live(console: Console, env: Any, policies: Any, config: "RunConfig", video: Path | None) -> "EpisodeRecord":

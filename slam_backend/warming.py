@@ -1,0 +1,49 @@
+"""All kernels of the backend are compiled, or loaded from the cache, before anything waits for them."""
+
+from typing import Literal
+
+import numpy as np
+
+from slam_backend.attempts import AttemptOptions
+from slam_backend.compilation import watch_compilation
+from slam_backend.filter import FastSlam
+from slam_backend.measurements import Measurements
+from slam_backend.metrics.maps import map_error
+from slam_backend.team import TeamSlam
+
+PROPOSALS: tuple[Literal["fastslam2", "fastslam1"], ...] = ("fastslam2", "fastslam1")
+STEPS = 4
+LANDMARKS = 12  # more than an alignment asks for
+
+
+def warm_up() -> float:
+    """Run tiny filters and a tiny team along all paths that end in a kernel.
+
+    Kernels are kept in numba's cache: beside the package if its folder can be written, else in the user's own cache
+    folder, or where the variable NUMBA_CACHE_DIR says. A new version of the package, of numba or another processor
+    begins anew.
+
+    Returns:
+        Seconds spent compiling; 0 if all kernels came from the cache.
+    """
+    with watch_compilation(lambda name: None) as watch:
+        angles = np.linspace(0.0, 2.0 * np.pi, LANDMARKS, endpoint=False)
+        points = np.column_stack([2.0 * np.cos(angles), np.sin(angles), np.linspace(4.0, 6.0, LANDMARKS)])
+        descriptors = np.eye(LANDMARKS, dtype=np.float32)
+        names = np.arange(LANDMARKS)
+        plain = Measurements(points, descriptors)
+        given = Measurements(points, descriptors, np.tile(1e-4 * np.eye(3), (LANDMARKS, 1, 1)))
+        move, still = np.array([0.0, 0.0, 0.01]), np.zeros(3)
+        for proposal in PROPOSALS:
+            for frame in (plain, given):
+                slam = FastSlam(2, num_particles=4, proposal=proposal, resample_threshold=1.0)
+                slam.step([None, None], [frame, None])
+                for _ in range(STEPS):
+                    slam.step([move, None], [frame, frame])
+                slam.step([None, None], [frame, frame], [names, names], [still, None])
+                slam.step([move, move], [None, None])
+        team = TeamSlam(2, num_particles=4, attempts=AttemptOptions(every=1))
+        for _ in range(STEPS):
+            team.step([None, None], [plain, plain])
+        map_error(team.map(0).means, names, points)
+    return watch.seconds
