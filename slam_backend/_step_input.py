@@ -9,6 +9,8 @@ from slam_backend.errors import FloatArray, IntArray, bad_argument, check_array
 from slam_backend.measurements import Measurements
 
 FARTHEST_MOVE = 1e4  # [m, rad]; no robot moves so far between two steps
+FARTHEST_POINT = 1e4  # [m]; no camera measures so far; at a million times this, covariances overflow
+FARTHEST_POSE = 1e6  # [m, rad]; no robot goes so far from its start
 
 
 def check_step(
@@ -57,6 +59,9 @@ def check_step(
         names.append(identity)
         cure = "Give (x, y, theta) in the robot's own start frame, or None."
         exact.append(None if pose is None else check_array(f"poses[{robot}]", pose, (3,), cure))
+        if exact[-1] is not None and np.abs(exact[-1]).max() > FARTHEST_POSE:
+            cure = "Check the units: metres and radians from the robot's start."
+            raise bad_argument(f"poses[{robot}]", f"numbers within +-{FARTHEST_POSE:g}", pose, cure)
     return moves, list(measurements), names, exact
 
 
@@ -69,6 +74,11 @@ def _check_frame(robot: int, frame: Measurements, size: int) -> int:
             f"shape {frame.descriptors.shape}",
             "Use one kind of descriptor throughout a run.",
         )
+    if np.vdot(frame.points, frame.points) > FARTHEST_POINT**2:  # seldom; then perhaps only because they are many
+        farthest = float(np.abs(frame.points).max())
+        if farthest > FARTHEST_POINT:
+            cure = "Check the units, metres, and drop points without disparity."
+            raise bad_argument(f"measurements[{robot}].points", f"numbers within +-{FARTHEST_POINT:g}", farthest, cure)
     nearest = float(frame.points[:, 2].min())
     if frame.covariances is None and nearest < _kernels.MIN_DEPTH:
         raise bad_argument(

@@ -8,6 +8,10 @@ from numpy.typing import NDArray
 
 from slam_backend.errors import FloatArray, bad_argument, check_array
 
+LARGEST_DESCRIPTOR = 1e6  # of one component; squares of distances then stay far from the end of float32
+LEAST_VARIANCE, LARGEST_VARIANCE = 1e-18, 1e12  # [m^2]; determinants then stay far from the end of float64
+LARGEST_CONDITION = 1e8  # about 1 / sqrt(machine epsilon): with more, updates in float64 lose positive definiteness
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Measurements:
@@ -20,7 +24,8 @@ class Measurements:
             predicted point. Given: used as is.
 
     Raises:
-        ValueError: If a shape is wrong, a number is not finite, or a covariance is not positive definite.
+        ValueError: If a shape is wrong, a number is not finite or a descriptor too large, or a covariance is not
+            positive definite, or so flat or small that arithmetic cannot keep it so.
     """
 
     points: FloatArray
@@ -33,21 +38,15 @@ class Measurements:
         descriptors: Any = check_array(
             "descriptors", self.descriptors, (len(points), None), cure, dtype=np.float32
         )
+        if descriptors.size and np.abs(descriptors).max() > LARGEST_DESCRIPTOR:
+            largest = float(np.abs(descriptors).max())
+            expected = f"numbers within +-{LARGEST_DESCRIPTOR:g}"
+            raise bad_argument("descriptors", expected, largest, "Scale them, best to unit length.")
         object.__setattr__(self, "points", points)
         object.__setattr__(self, "descriptors", descriptors)
         if self.covariances is not None:
             covariances: Any = check_array("covariances", self.covariances, (len(points), 3, 3), cure)
-            if not np.allclose(covariances, covariances.transpose(0, 2, 1), rtol=1e-6, atol=1e-12):
-                raise bad_argument(
-                    "covariances", "symmetric matrices", "a different transpose", "Symmetrise them first."
-                )
-            if len(points) and np.linalg.eigvalsh(covariances).min() <= 0.0:
-                raise bad_argument(
-                    "covariances",
-                    "positive definite matrices",
-                    "a smallest eigenvalue <= 0",
-                    "Give every direction some noise, or pass None to use the camera model.",
-                )
+            _check_covariances(covariances)
             object.__setattr__(self, "covariances", covariances)
         for array in (self.points, self.descriptors, self.covariances):
             if array is not None:
@@ -70,3 +69,29 @@ class Measurements:
     def empty(cls, descriptor_size: int = 64) -> "Measurements":
         """Return a frame in which nothing was seen."""
         return cls(np.empty((0, 3)), np.empty((0, descriptor_size), dtype=np.float32))
+
+
+def _check_covariances(covariances: FloatArray) -> None:
+    """Raise unless (n, 3, 3) are symmetric and positive definite with room for rounding."""
+    if not len(covariances):
+        return
+    scale = np.abs(covariances).max(axis=(1, 2), keepdims=True)
+    if (np.abs(covariances - covariances.transpose(0, 2, 1)) > 1e-6 * scale).any():
+        raise bad_argument("covariances", "symmetric matrices", "a different transpose", "Symmetrise them first.")
+    eigenvalues = np.linalg.eigvalsh(covariances)
+    least, largest = eigenvalues[:, 0], eigenvalues[:, 2]
+    if least.min() <= 0.0:
+        raise bad_argument(
+            "covariances",
+            "positive definite matrices",
+            "a smallest eigenvalue <= 0",
+            "Give every direction some noise, or pass None to use the camera model.",
+        )
+    if least.min() < LEAST_VARIANCE or largest.max() > LARGEST_VARIANCE:
+        got = float(least.min() if least.min() < LEAST_VARIANCE else largest.max())
+        expected = f"eigenvalues from {LEAST_VARIANCE:g} to {LARGEST_VARIANCE:g} m^2"
+        raise bad_argument("covariances", expected, got, "Check the units: metres squared.")
+    if (largest > LARGEST_CONDITION * least).any():
+        got = float((largest / least).max())
+        cure = "Raise the least variance: float64 cannot keep so flat a covariance positive definite."
+        raise bad_argument("covariances", f"ratios of eigenvalues up to {LARGEST_CONDITION:g}", got, cure)

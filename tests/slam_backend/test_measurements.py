@@ -30,6 +30,7 @@ def test_nothing_seen_is_a_frame_too() -> None:
 
 INDEFINITE = np.array([[[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 1.0]]] * 2)
 ASYMMETRIC = np.array([[[1.0, 0.1, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]] * 2)
+FLAT = np.array([np.eye(3), np.diag([1.0, 1.0, 5e-9])])
 
 
 @pytest.mark.parametrize(
@@ -44,10 +45,28 @@ ASYMMETRIC = np.array([[[1.0, 0.1, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]] * 2)
         (POINTS, LOOKS, np.eye(3), r"covariances: expected an array of shape \(2, 3, 3\), got shape \(3, 3\)"),
         (POINTS, LOOKS, INDEFINITE, r"covariances: expected positive definite matrices, got a smallest eigenvalue"),
         (POINTS, LOOKS, ASYMMETRIC, r"covariances: expected symmetric matrices, got a different transpose"),
+        (POINTS, LOOKS, 1e-13 * ASYMMETRIC, r"covariances: expected symmetric matrices, got a different transpose"),
         (POINTS, LOOKS, np.zeros((2, 3, 3)), r"covariances: expected positive definite matrices"),
+        (POINTS, LOOKS, FLAT * [[1.0], [1.0], [0.0]], r"covariances: expected positive definite matrices"),
+        (POINTS, LOOKS, -FLAT, r"covariances: expected positive definite matrices"),
+        (POINTS, LOOKS, FLAT, r"covariances: expected ratios of eigenvalues up to 1e\+08, got 2\d+\.\d+\. Raise"),
+        (POINTS, LOOKS, [1e-30 * np.eye(3)] * 2, r"covariances: expected eigenvalues from 1e-18 .* got .*e-3[01]\."),
+        (POINTS, LOOKS, [1e30 * np.eye(3)] * 2, r"covariances: expected eigenvalues .* to 1e\+12 m\^2, got"),
+        (POINTS, LOOKS, [np.nan * np.eye(3)] * 2, r"covariances: expected finite numbers, got NaN"),
+        (POINTS, 1e30 * LOOKS, None, r"descriptors: expected numbers within \+-1e\+06, got 1.*e\+30\. Scale them"),
     ],
 )
 def test_frames_that_make_no_sense_are_refused(points: Any, descriptors: Any, covariances: Any, message: str) -> None:
     """The error names the argument, what it should be and what it was."""
     with pytest.raises(ValueError, match=message):
         Measurements(points, descriptors, covariances)
+
+
+def test_covariances_within_the_limits_are_taken_as_they_are() -> None:
+    """A micrometre beside a centimetre in any direction is no reason for an error, nor is a frame without points."""
+    root = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
+    covariance = root @ np.diag([2e-12, 1e-4, 3e-7]) @ root.T
+    covariance = 0.5 * (covariance + covariance.T)
+    frame = Measurements(POINTS, LOOKS, [covariance] * 2)
+    np.testing.assert_array_equal(frame.covariances, [covariance] * 2)
+    assert len(Measurements(np.empty((0, 3)), np.empty((0, 5)), np.empty((0, 3, 3)))) == 0
