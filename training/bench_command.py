@@ -7,6 +7,8 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from training.compiling import prepare
+
 if TYPE_CHECKING:  # what computes is imported when the command runs, so that --help answers at once
     from training.bench_accuracy import AccuracyConfig
     from training.run_folder import RunFolder
@@ -68,6 +70,7 @@ def bench_accuracy(
     }
     chosen = AccuracyConfig.from_mapping(values | {name: value for name, value in given.items() if value is not None})
     folder = open_folder(out, chosen)
+    prepare()
     console = Console()
     rows = _run_live(console, folder, chosen, processes)
     lines, goals = plain(summarise(rows)), plain(check_goals(rows))

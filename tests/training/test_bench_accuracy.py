@@ -1,0 +1,275 @@
+"""The accuracy bench: what it scores, how it sums up, and that nothing finished is lost."""
+
+import io
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from slam_backend.geometry import compose, transform_points
+from training import accuracy_trials, cli
+from training.accuracy_summary import FIGURES, GOALS, check_goals, describe, interval, summarise
+from training.accuracy_tables import markdown, print_tables
+from training.accuracy_trials import FALSE_POINT, METHODS, Answer, Trial, play, score
+from training.bench_accuracy import TRIALS_FILE, AccuracyConfig, finished_trials, open_folder, run_trials
+from training.figures_accuracy import draw_accuracy
+from training.run_folder import plain
+from training.stereo_runs import RunSpec, StereoRun, simulate_run
+
+SMALL = AccuracyConfig(robots=(2,), lengths=(4.0,), particles=(5, 9), seeds=2, seed=31)
+
+
+@pytest.fixture(scope="module")
+def run() -> StereoRun:
+    """Two robots for 4 m."""
+    return simulate_run(RunSpec(robots=2, length=4.0), seed=3)
+
+
+@pytest.fixture(scope="module")
+def rows() -> list[dict[str, Any]]:
+    """All trials of a small bench."""
+    return [plain(play(trial)) for trial in SMALL.trials()]
+
+
+def test_the_truth_scores_zero(run: StereoRun) -> None:
+    """The true paths and landmarks have no error, full recall and precision, and no NEES."""
+    measured = run.measured_landmarks()
+    everywhere = np.tile(0.01 * np.eye(3), (*run.true_paths.shape[:2], 1, 1))
+    sure = np.ones(len(measured), dtype=bool)
+    row = score(run, Answer(run.true_paths.copy(), everywhere, run.landmarks[measured], measured, sure))
+    errors = "pose_rms_m", "pose_aligned_rms_m", "heading_rms_deg", "map_rmse_m", "map_aligned_rmse_m", "nees_mean"
+    for name in errors:
+        assert row[name] == pytest.approx(0.0, abs=1e-9), name
+    assert row["map_recall"] == row["map_precision"] == row["confirmed_precision"] == 1.0
+
+
+def test_a_moved_answer_is_wrong_by_the_motion_and_right_once_aligned(run: StereoRun) -> None:
+    """A rigid motion of path and map shows in the raw figures, and NEES, but not in the aligned ones."""
+    motion = np.array([0.3, -0.4, 0.02])
+    paths = compose(motion, run.true_paths)
+    measured = run.measured_landmarks()
+    means = transform_points(motion, run.landmarks[measured])
+    covariances = np.tile(np.diag([0.04, 0.09, 1e-4]), (*run.true_paths.shape[:2], 1, 1))
+    row = score(run, Answer(paths, covariances, means, measured, np.ones(len(measured), dtype=bool)))
+    offsets = (paths - run.true_paths)[..., :2].reshape(-1, 2)
+    assert row["pose_rms_m"] == pytest.approx(np.sqrt((offsets**2).sum(axis=1).mean()))
+    assert row["heading_rms_deg"] == pytest.approx(np.degrees(0.02))
+    assert row["map_rmse_m"] > 0.1
+    assert row["pose_aligned_rms_m"] == pytest.approx(0.0, abs=1e-9)
+    assert row["map_aligned_rmse_m"] == pytest.approx(0.0, abs=1e-9)
+    squares = (paths - run.true_paths)[:, 1:, :2] ** 2 / [0.04, 0.09]
+    assert row["nees_mean"] == pytest.approx(squares.sum(axis=2).mean() + 4.0, rel=1e-3)
+    assert row["anees"] == pytest.approx(row["nees_mean"] / 3.0)
+
+
+def test_maps_are_scored_by_the_landmarks_behind_them(run: StereoRun) -> None:
+    """Duplicates and false landmarks cost precision, missing ones recall; those seen once count as not confirmed."""
+    measured = run.measured_landmarks()
+    true = run.landmarks[measured]
+    half = len(measured) // 2
+    means = np.vstack([true[:half], true[:2] + 0.5, [[5.0, 5.0, 1.0]]])
+    claims = np.concatenate([measured[:half], measured[:2], [FALSE_POINT]])
+    confirmed = np.arange(len(means)) < half
+    row = score(run, Answer(run.true_paths.copy(), None, means, claims, confirmed))
+    assert row["map_recall"] == pytest.approx(half / len(measured))
+    assert row["map_precision"] == pytest.approx(half / (half + 3))
+    assert row["confirmed_precision"] == 1.0
+    assert row["map_rmse_m"] == pytest.approx(0.0, abs=1e-12)
+    assert np.isnan(row["nees_mean"])
+
+
+def test_methods_come_in_their_order(rows: list[dict[str, Any]]) -> None:
+    """Batch ML is nearest to the truth, dead reckoning farthest; all figures that a method can have are there."""
+    mean = {
+        method: np.mean([row["pose_rms_m"] for row in rows if row["method"] == method]) for method in METHODS
+    }
+    assert mean["batch_ml"] <= mean["ideal_online"] < mean["fastslam2"] < mean["dead_reckoning"]
+    for row in rows:
+        assert row["particles"] == 0 or all(row[figure] is not None for figure in FIGURES), row
+        if row["method"] in ("batch_ml", "ideal_online"):
+            assert row["map_recall"] == row["map_precision"] == 1.0
+            assert 0.0 < row["anees"] < 10.0
+        if row["method"] == "fastslam2":
+            assert row["wrong_match_share"] == 0.0  # names are known
+            assert 0.2 < row["ess_share"] <= 1.0
+
+
+def test_trials_repeat(rows: list[dict[str, Any]]) -> None:
+    """The same trial gives the same figures, time apart, whatever ran before it."""
+    accuracy_trials._run_of.cache_clear()
+    for row in (rows[-1], rows[1]):
+        again = plain(play(Trial(**{name: row[name] for name in Trial.__dataclass_fields__})))
+        for name, value in again.items():
+            assert name in ("seconds", "step_ms") or row[name] == value, name
+
+
+def test_unknown_association_is_scored_with_its_errors() -> None:
+    """False points become landmarks, which precision counts; some measurements are held back; few matches are wrong."""
+    trial = Trial(
+        preset="coarse", association="unknown", robots=1, length=12.0, method="fastslam2", particles=20, seed=30
+    )
+    row = play(trial)
+    assert row["map_precision"] < 1.0
+    assert 0.0 <= row["wrong_match_share"] < 0.2
+    assert row["held_back_share"] > 0.0
+
+
+def test_summary_and_intervals(rows: list[dict[str, Any]]) -> None:
+    """One line per condition, method and M; the mean is that of the rows and lies in its interval."""
+    lines = summarise(rows)
+    assert [(line["method"], line["particles"]) for line in lines] == [
+        ("dead_reckoning", 0), ("batch_ml", 0), ("ideal_online", 0),
+        ("fastslam1", 5), ("fastslam1", 9), ("fastslam2", 5), ("fastslam2", 9),
+    ]  # fmt: skip
+    line = lines[-1]
+    values = [row["map_rmse_m"] for row in rows if row["method"] == "fastslam2" and row["particles"] == 9]
+    assert line["seeds"] == len(values) == 2
+    assert line["map_rmse_m"]["mean"] == pytest.approx(np.mean(values))
+    assert line["map_rmse_m"]["worst"] == max(values)
+    assert line["map_rmse_m"]["mean_low"] <= np.mean(values) <= line["map_rmse_m"]["mean_high"]
+    assert lines[0]["anees"] is None
+    assert describe(np.array([2.5])) == {
+        "worst": 2.5, "mean": 2.5, "mean_low": None, "mean_high": None, "median": 2.5, "median_low": None,
+        "median_high": None,
+    }  # fmt: skip
+
+
+def test_intervals_cover_what_they_should() -> None:
+    """Of 300 intervals of the mean of 16 normal values about 95 % hold the truth: 86 to 98 % with false alarm 1e-3.
+
+    The percentile bootstrap of 16 values is known to cover some 92 %.
+    """
+    rng = np.random.default_rng(8)
+    held = 0
+    for values in rng.normal(size=(300, 16)):
+        low, high = interval((values,), np.mean)
+        assert low is not None
+        assert high is not None
+        held += low < 0.0 < high
+    assert 0.86 * 300 < held < 0.98 * 300
+
+
+def test_goals_are_held_against_the_trials_they_are_about() -> None:
+    """A goal needs its own condition; a ratio pairs the seeds that both have; met means at most the limit."""
+    own = {"preset": "good", "association": "known", "robots": 1, "length": 100.0, "particles": 100}
+    own["method"] = "fastslam2"
+    rows = [own | {"seed": seed, "pose_rms_m": value, "map_rmse_m": 0.2} for seed, value in ((0, 0.06), (1, 0.10))]
+    rows += [rows[0] | {"method": "fastslam1", "pose_rms_m": 0.15}, rows[0] | {"robots": 3, "pose_rms_m": 9.0}]
+    found = {goal["goal"]: goal for goal in check_goals(rows)}
+    pose = found["good stereo, known: pose, mean [m]"]
+    assert pose["reached"] == pytest.approx(0.08)
+    assert pose["met"]
+    assert pose["seeds"] == 2
+    assert not found["good stereo, known: map, mean [m]"]["met"]
+    ratio = found["good stereo, known: pose over fastslam1's"]
+    assert ratio["reached"] == pytest.approx(0.4)
+    assert ratio["seeds"] == 1
+    assert not any("unknown" in name or "coarse" in name for name in found)
+    assert len({goal.name for goal in GOALS}) == len(GOALS)
+
+
+def test_what_is_finished_is_kept(tmp_path: Path, rows: list[dict[str, Any]]) -> None:
+    """Stopped after three trials and begun again, a bench plays the rest only; a line cut off is played again."""
+    folder = open_folder(tmp_path / "bench", SMALL)
+    done: list[dict[str, Any]] = []
+    run_trials(folder, SMALL.trials(), 1, lambda: len(done) >= 3, done.append)
+    assert len(done) == 3
+    file = folder.path / TRIALS_FILE
+    file.write_text(file.read_text()[:-20])
+    again = open_folder(tmp_path / "bench", SMALL)
+    kept = finished_trials(again)
+    assert list(kept) == SMALL.trials()[:2]
+    rest: list[dict[str, Any]] = []
+    run_trials(again, [trial for trial in SMALL.trials() if trial not in kept], 1, lambda: False, rest.append)
+    assert len(rest) == len(rows) - 2
+    assert list(finished_trials(again)) == SMALL.trials()
+    for line, row in zip(file.read_text().splitlines(), rows, strict=True):
+        assert json.loads(line)["pose_rms_m"] == row["pose_rms_m"]
+
+
+def test_a_folder_belongs_to_one_bench(tmp_path: Path) -> None:
+    """Another choice of options is refused in the folder of a bench."""
+    open_folder(tmp_path / "bench", SMALL)
+    with pytest.raises(ValueError, match="out: expected a folder of this very bench, got a folder of one with other"):
+        open_folder(tmp_path / "bench", replace(SMALL, seeds=3))
+
+
+@pytest.mark.slow
+def test_processes_change_nothing(tmp_path: Path, rows: list[dict[str, Any]]) -> None:
+    """Two processes give the figures of one."""
+    few = [trial for trial in SMALL.trials() if trial.method in ("batch_ml", "fastslam2")]
+    done: list[dict[str, Any]] = []
+    run_trials(open_folder(tmp_path / "bench", SMALL), few, 2, lambda: False, done.append)
+    expected = {(row["seed"], row["method"], row["particles"]): row["pose_rms_m"] for row in rows}
+    assert len(done) == len(few)
+    for row in done:
+        assert row["pose_rms_m"] == expected[row["seed"], row["method"], row["particles"]]
+
+
+def test_tables_and_figure(tmp_path: Path, rows: list[dict[str, Any]]) -> None:
+    """Tables name each method with its error, on 80 columns and as Markdown; the figure is a PNG file."""
+    lines = plain(summarise(rows))
+    console = Console(width=80, record=True, file=io.StringIO())
+    print_tables(console, lines, [])
+    text = console.export_text()
+    assert "good stereo, known association, K = 2, 4 m, 2 seeds: paths" in text
+    for line in lines:
+        assert f"{line['pose_rms_m']['mean']:.3f}" in text
+    assert "| fastslam2, 9 |" in markdown(lines, [])
+    draw_accuracy(tmp_path / "accuracy.png", lines)
+    assert (tmp_path / "accuracy.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_command_from_end_to_end(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """The command prints its tables, writes JSON, Markdown and figure, and goes on where it is called again."""
+    out = tmp_path / "bench"
+    arguments = ["vslam", "bench", "accuracy", "--seeds", "1", "--first-seed", "40", "--length", "3,5", "--methods"]
+    arguments += ["dead_reckoning,fastslam2", "--particles", "7", "--out", str(out), "--json", str(out / "copy.json")]
+    monkeypatch.setattr(sys, "argv", arguments)
+    for _ in range(2):
+        with pytest.raises(SystemExit) as end:
+            cli.main()
+        assert not end.value.code
+    assert "fastslam2, 7" in capsys.readouterr().out
+    content = json.loads((out / "copy.json").read_text())
+    assert [line["length"] for line in content["summary"]] == [3.0, 3.0, 5.0, 5.0]
+    assert len(content["trials"]) == len((out / TRIALS_FILE).read_text().splitlines()) == 4
+    assert (out / "tables.md").read_text().startswith("### Good stereo, known association, K = 1, 3 m")
+    assert (out / "accuracy.png").is_file()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--preset", "best"), "preset: expected one of 'good', 'coarse', 'paper', got 'best'."),
+        (("--association", "some"), "association: expected one of 'known', 'unknown', got 'some'."),
+        (("--methods", "ekf"), "method: expected one of 'dead_reckoning', 'batch_ml', 'ideal_online', 'fastslam1',"),
+        (("--particles", "ten"), "particles: expected numbers with commas between, got 'ten'. Write them like 10,100."),
+        (("--particles", "0"), "particles: expected an int >= 1, got 0."),
+        (("--particles", "9,9"), "particles: expected at least one value, each once, got [9, 9]."),
+        (("--robots", "0"), "robots: expected an int >= 1, got 0."),
+        (("--length", "0"), "length: expected a finite number >= 0.25, got 0.0."),
+        (("--seeds", "0"), "seeds: expected an int >= 1, got 0."),
+        (("--processes", "0"), "processes: expected an int >= 1, got 0."),
+        (("--json", "/nowhere/copy.json"), "json: expected a place that can be written, got no access."),
+        (("--config", "/nowhere"), "config: expected the config.toml of an earlier run, got no such file."),
+    ],
+)
+def test_bad_options_are_one_line_and_status_2(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], message: str
+) -> None:
+    """Argument, what was expected, what came and the cure on one line of stderr; no folder is made."""
+    monkeypatch.setattr(sys, "argv", ["vslam", "bench", "accuracy", *arguments])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    assert end.value.code == 2
+    shown = capsys.readouterr()
+    assert shown.err.startswith(f"error {message}")
+    assert shown.err.count("\n") == 1
