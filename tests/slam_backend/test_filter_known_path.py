@@ -1,0 +1,140 @@
+"""On a known path landmarks are independent EKFs; they stay exact and positive definite whatever the noise."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from linear_world import CAMERA, measure, turn
+from stereo_world import EXACT_MOTION, StereoWorld
+
+from slam_backend.camera import ROBOT_FROM_CAMERA
+from slam_backend.errors import FloatArray
+from slam_backend.filter import FastSlam
+from slam_backend.geometry import compose
+from slam_backend.measurements import Measurements
+
+PROPOSALS = pytest.mark.parametrize("proposal", ["fastslam2", "fastslam1"])
+
+
+class StereoEkf:
+    """An EKF of one landmark in (u, v, disparity), as textbooks have it: f, b, noise, and nothing shared with ours."""
+
+    def __init__(self, world: StereoWorld, pose: FloatArray, point: FloatArray) -> None:
+        self.world = world
+        self.noise = np.diag([world.camera.sigma_px, world.camera.sigma_px, world.camera.sigma_disparity_px]) ** 2
+        self.mean = turn(pose[2]) @ world.camera.robot_from_camera(point) + [pose[0], pose[1], 0.0]
+        inverse = np.linalg.inv(self.predict(pose)[1])
+        self.covariance = inverse @ self.noise @ inverse.T
+
+    def predict(self, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return (u, v, d) and its derivative by the landmark."""
+        f, b = self.world.camera.focal_px, self.world.camera.baseline
+        to_camera = ROBOT_FROM_CAMERA.T @ turn(pose[2]).T
+        x, y, z = to_camera @ (self.mean - [pose[0], pose[1], 0.0]) - ROBOT_FROM_CAMERA.T @ self.world.camera.mount
+        by_point = np.array([[f / z, 0.0, -f * x / z**2], [0.0, f / z, -f * y / z**2], [0.0, 0.0, -f * b / z**2]])
+        return np.array([f * x / z, f * y / z, f * b / z]), by_point @ to_camera
+
+    def update(self, pose: FloatArray, point: FloatArray) -> None:
+        """Eqs. 5-10."""
+        f, b = self.world.camera.focal_px, self.world.camera.baseline
+        measured = np.array([f * point[0], f * point[1], f * b]) / point[2]
+        predicted, g = self.predict(pose)
+        gain = self.covariance @ g.T @ np.linalg.inv(g @ self.covariance @ g.T + self.noise)
+        self.mean = self.mean + gain @ (measured - predicted)
+        self.covariance = (np.eye(3) - gain @ g) @ self.covariance
+
+
+def test_stereo_on_a_known_path_makes_it_independent_ekfs() -> None:
+    """Two robots, 17 landmarks, exact poses: means to 1e-9 m and covariances to 1e-9 of their size are the EKFs'."""
+    world = StereoWorld(np.random.default_rng(21))
+    slam = FastSlam(2, 3, world.camera, proposal="fastslam1")
+    filters: dict[int, StereoEkf] = {}
+    poses = np.array([[0.0, 0.0, 0.0], [0.4, -0.3, 2.0]])
+    for _ in range(40):
+        poses = compose(poses, [[0.25, 0.02, 0.3], [0.1, 0.0, -0.2]])
+        names = [world.visible(pose) for pose in poses]
+        frames = [world.measure(pose, some) for pose, some in zip(poses, names, strict=True)]
+        slam.step([None, None], frames, identities=names, poses=list(poses))
+        for pose, some, frame in zip(poses, names, frames, strict=True):
+            for name, point in zip(some.tolist(), frame.points, strict=True):
+                if name in filters:
+                    filters[name].update(pose, point)
+                else:
+                    filters[name] = StereoEkf(world, pose, point)
+    result = slam.map()
+    assert len(result) == len(filters) == 17
+    for mean, covariance, look in zip(result.means, result.covariances, result.descriptors, strict=True):
+        ekf = filters[int(np.argmax(world.descriptors @ look))]
+        np.testing.assert_allclose(mean, ekf.mean, atol=1e-9)
+        np.testing.assert_allclose(covariance, ekf.covariance, atol=1e-9 * ekf.covariance.max())
+
+
+def extreme_variances(kind: str, step: int, rng: np.random.Generator) -> FloatArray:
+    """Return the variances [m^2] of one measurement along three axes, from 1e-12 to 1e4."""
+    if kind.endswith("needles"):
+        return np.array([1.0, 1.1e-8, 1.1e-8])
+    if kind.endswith("pancakes"):
+        return np.array([1.0, 1.0, 1.1e-8])
+    if kind == "alternating":
+        return np.full(3, 1e4 if step % 2 else 1e-12)
+    return np.asarray(10.0 ** (rng.uniform(-8.0, 0.0, 3) - 4.0 * rng.random()))
+
+
+@PROPOSALS
+@pytest.mark.parametrize("kind", ["needles", "pancakes", "steady needles", "steady pancakes", "alternating", "wild"])
+def test_covariances_stay_positive_definite_whatever_the_noise(proposal: Any, kind: str) -> None:
+    """Through 2,000 updates with measurements that are sharp in some directions and useless in others.
+
+    The error in the end is not beyond its covariance either (chi-square, false alarm 1e-6), and the weights are finite.
+    "Steady" measurements all look along the same axes, the others along axes turned at random.
+    """
+    rng = np.random.default_rng(4)
+    landmark = np.array([3.0, 0.5, 0.2])
+    slam = FastSlam(1, 2, CAMERA, proposal=proposal, resample_threshold=0.0)
+    for step in range(2000):
+        pose = rng.uniform([-1.0, -1.0, -3.0], [1.0, 1.0, 3.0])
+        axes = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        if kind.startswith("steady"):
+            pose[2], axes = 0.7, np.linalg.qr(np.arange(9.0).reshape(3, 3) + np.eye(3))[0]
+        variances = extreme_variances(kind, step, rng)
+        noise = axes @ np.diag(variances) @ axes.T
+        exact = CAMERA.camera_from_robot(turn(pose[2]).T @ (landmark - [pose[0], pose[1], 0.0]))
+        point = exact + axes @ (np.sqrt(variances) * rng.standard_normal(3))
+        slam.step(
+            [None], [Measurements([point], np.eye(1, 3), [0.5 * (noise + noise.T)])], identities=[[0]], poses=[pose]
+        )
+        if step % 10 == 0 or step > 1900:
+            covariance = slam.map().covariances[0]
+            np.testing.assert_array_equal(covariance, covariance.T)
+            np.linalg.cholesky(covariance)  # raises where it is not positive definite
+    result = slam.map()
+    assert len(result) == 1
+    assert np.isfinite(slam.weights).all()
+    error = result.means[0] - landmark
+    assert error @ np.linalg.solve(result.covariances[0], error) < 30.7  # chi^2_3 at 1 - 1e-6
+
+
+@PROPOSALS
+@pytest.mark.parametrize("num_robots", [1, 2])
+@pytest.mark.parametrize("sigma", [1e-6, 0.1])
+def test_no_noise_no_error_with_given_covariances(proposal: Any, num_robots: int, sigma: float) -> None:
+    """Exact odometry and exact points give exact poses and an exact map, however large the noise is said to be."""
+    rng = np.random.default_rng(1)
+    landmarks = rng.uniform([-5.0, -5.0, -1.0], [5.0, 5.0, 1.0], (7, 3))
+    starts = np.array([[0.0, 0.0, 0.0], [0.4, -0.3, 2.0]])[:num_robots]
+    slam = FastSlam(num_robots, 5, CAMERA, EXACT_MOTION, proposal, initial_poses=starts)
+    poses = starts.copy()
+    for _ in range(40):
+        poses = compose(poses, [0.25, 0.02, 0.3])
+        covariances = [measure(rng, pose, landmarks, sigma)[0].covariances for pose in poses]
+        points = [
+            CAMERA.camera_from_robot((landmarks - [pose[0], pose[1], 0.0]) @ turn(pose[2])) for pose in poses
+        ]
+        frames = [Measurements(some, np.eye(7), noise) for some, noise in zip(points, covariances, strict=True)]
+        report = slam.step([[0.25, 0.02, 0.3]] * num_robots, frames, identities=[range(7)] * num_robots)
+        assert report.ess == pytest.approx(5.0)
+    result = slam.map()
+    np.testing.assert_allclose(result.means[np.argmax(result.descriptors, axis=0)], landmarks, atol=1e-9)
+    for robot in range(num_robots):
+        np.testing.assert_allclose(slam.pose(robot).mean, poses[robot], atol=1e-9)
+        assert np.abs(slam.pose(robot).covariance).max() < 1e-12
