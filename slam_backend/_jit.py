@@ -1,9 +1,12 @@
-"""The one way in which this project compiles a kernel: serial, cached on disk, without the interpreter lock."""
+"""The few ways in which this project compiles a kernel: serial, cached on disk, without the interpreter lock."""
 
 from collections.abc import Callable
-from typing import ParamSpec, TypeVar, cast
+from typing import Any, ParamSpec, TypeVar, cast
 
 import numba
+from llvmlite import ir
+from numba.core import types
+from numba.extending import intrinsic
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -22,3 +25,41 @@ def jit(function: Callable[P, T]) -> Callable[P, T]:
 def inlined(function: Callable[P, T]) -> Callable[P, T]:
     """Compile a small building block into each kernel that calls it: passing arrays costs more than its arithmetic."""
     return cast(Callable[P, T], numba.njit(cache=True, nogil=True, forceinline=True)(function))
+
+
+# Lane kernels run the same arithmetic over a fixed number of particles, so that the compiler turns it into vector
+# instructions. Two things it needs: a product and a sum may be fused into one instruction (`contract`; sums are not
+# reordered, so the same machine gives the same bytes), and a division by zero gives inf instead of an exception.
+_LANES: dict[str, Any] = {"cache": True, "nogil": True, "fastmath": {"contract"}, "error_model": "numpy"}
+
+
+def lanes(function: Callable[P, T]) -> Callable[P, T]:
+    """Compile a kernel whose loops over lanes are to become vector instructions."""
+    return cast(Callable[P, T], numba.njit(**_LANES)(function))
+
+
+def lanes_inlined(function: Callable[P, T]) -> Callable[P, T]:
+    """Compile the arithmetic of one lane into the loops that call it."""
+    return cast(Callable[P, T], numba.njit(forceinline=True, **_LANES)(function))
+
+
+def _float_bits(typing_context: Any, x: Any) -> Any:
+    """Return the 64 bits of a float64 as an int64 (inside kernels only)."""
+
+    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return builder.bitcast(args[0], ir.IntType(64))
+
+    return types.int64(types.float64), code
+
+
+def _bits_float(typing_context: Any, x: Any) -> Any:
+    """Return the float64 that an int64's bits stand for (inside kernels only)."""
+
+    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return builder.bitcast(args[0], ir.DoubleType())
+
+    return types.float64(types.int64), code
+
+
+float_bits: Callable[[float], int] = intrinsic(_float_bits)
+bits_float: Callable[[int], float] = intrinsic(_bits_float)

@@ -1,14 +1,24 @@
 """The compiled inner loops of the filter: one robot's frame, for all particles.
 
-Landmarks lie in `landmarks[slot, c, particle]` with c = (x, y, z, Sxx, Sxy, Sxz, Syy, Syz, Szz) in the map frame; a
-slot is one landmark, `present` tells which particles hold it. Everything is expressed in the map frame, where the
-derivative of a measured point with respect to the landmark is the identity (the robot only yaws).
+Particles are taken in blocks of `LANES`, and every loop over the lanes of a block is plain arithmetic on rows of one
+flat workspace, which the compiler turns into vector instructions; decisions become masks. A row is addressed as
+`work[ROW + i]`, lane i, with ROW a multiple of LANES known at compile time.
+
+Landmarks lie in `values[row, block, c, lane]` (flattened) with c = (x, y, z, Sxx, Sxy, Sxz, Syy, Syz, Szz) in the map
+frame, and `counts[row, particle]` says how often the particle saw it (0: it does not hold it). Resampling does not move
+them: see `_particle_maps.py`, which also says what `row_of`, `map_of` and `maps` are. Everything is expressed in the
+map frame, where the derivative of a measured point with respect to the landmark is the identity (the robot only yaws).
 
 The measurement model (Eqs. 5-7). A landmark mu lies at e = mu - p from the camera centre p. A point v measured in the
 camera, turned into map axes, gives the innovation r = k (R v - e) with k = Z_predicted / Z_measured. This is the EKF in
 (u, v, disparity): the innovation and its covariance are those of the image coordinates, mapped to metres at the
 predicted point, and the density of the image coordinates is that of r times Z_predicted^4 (times a constant of the
 camera). Where the caller gives covariances, k = 1 and there is no such factor.
+
+The pose. x = x0 + C xi with xi ~ N(0, I) before the frame: nothing is inverted, so a motion without noise needs no
+special case. With A = (dr/dx) C and S = Sigma + R, a match adds J = A^T S^-1 A to the information of xi and
+g = A^T S^-1 r to the gradient; and where xi has the information L, the squared Mahalanobis distance with the pose
+uncertain is r^T S^-1 r - g^T (L + J)^-1 g (Woodbury), its log-determinant log|S| + log|L + J| - log|L|.
 """
 
 import math
@@ -16,64 +26,51 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend._jit import inlined, jit
-from slam_backend.errors import BoolArray, FloatArray, IntArray
+from slam_backend._jit import bits_float, float_bits, jit, lanes, lanes_inlined
+from slam_backend.errors import FloatArray, Int32Array, IntArray
 
+LANES = 32
 REJECTED = -1
 MIN_DEPTH = 0.05  # [m]; nothing is predicted nearer to the camera plane than this
-MIN_CONTRADICTIONS = 3  # three points fix a pose with one to spare
+MIN_CONTRADICTIONS = 3.0  # three points fix a pose with one to spare
+WIDE_HEADING = 0.03  # [rad]; where the heading is less sure, one step of Gauss-Newton is not enough
+ZERO_PIVOT = 1e-12  # relative to the variance: below it a direction is taken to be exact
 LOG_2PI = math.log(2.0 * math.pi)
+HALF_PI_HIGH = 1.5707963267341256  # pi / 2 in two parts: the first has 33 bits, so that small multiples are exact
+HALF_PI_LOW = 6.077100506506192e-11
+ROUND = 6755399441055744.0  # 1.5 * 2^52: adding and subtracting it rounds to the nearest integer
+LN2 = math.log(2.0)
+
+# Rows of the workspace.
+X, Y, T, COS, SIN = (LANES * k for k in range(5))  # the pose at which innovations are taken
+X0, Y0, T0 = (LANES * k for k in range(5, 8))  # the predicted pose
+C00, C10, C11, C20, C21, C22 = (LANES * k for k in range(8, 14))  # lower factor of its covariance
+XI0, XI1, XI2 = (LANES * k for k in range(14, 17))
+L00, L01, L02, L11, L12, L22 = (LANES * k for k in range(17, 23))  # information of xi
+R0, R1, R2 = (LANES * k for k in range(23, 26))  # innovation
+N00, N01, N02, N11, N12, N22, DEPTH = (LANES * k for k in range(26, 33))  # sensor noise in map axes, predicted depth
+J00, J01, J02, J11, J12, J22, G0, G1, G2 = (LANES * k for k in range(33, 42))  # sums over matches
+SUM_D, MATCHED, DET, DET_EXP, DEPTHS, DEPTHS_EXP = (LANES * k for k in range(42, 48))  # of the likelihood
+CLUTTER = LANES * 48  # log-likelihood of the measurements that are not matched
+BEST, SECOND, CHOSEN, DEAD, LOG_BEST = (LANES * k for k in range(49, 54))  # of one measurement
+LOST, SURE, CONTRADICT, WIDE = (LANES * k for k in range(54, 58))
+SPREAD00, SPREAD01, SPREAD02, SPREAD11, SPREAD12, SPREAD22 = (LANES * k for k in range(58, 64))
+TAKEN, LOG_DET_L = LANES * 64, LANES * 65
+WORK_ROWS = 66
+
+# Rows of one candidate's record.
+QJ00, QJ01, QJ02, QJ11, QJ12, QJ22, QG0, QG1, QG2 = (LANES * k for k in range(9))
+Q_SQUARE, Q_DET, Q_DET_POSE, Q_DEPTH, Q_METRES2, Q_D, Q_FIRST_D, Q_HELD = (LANES * k for k in range(9, 17))
+CANDIDATE_ROWS = 17
+
+TILE = 9 * LANES
+SHIFT = LANES.bit_length() - 1  # particle m is lane m & (LANES - 1) of block m >> SHIFT
 
 
-@inlined
-def _innovation(
-    x: float, y: float, c: float, s: float, lx: float, ly: float, lz: float,
-    points: FloatArray, noises: FloatArray, n: int, given: bool, camera: FloatArray,
-) -> tuple[float, float, float, float, float, float, float, float, float, float]:
-    """Return r (3), its sensor covariance R in map axes (6, upper triangle by rows), and the predicted depth.
-
-    The robot is at (x, y) with heading (c, s) = (cos theta, sin theta).
-    `points[n]` is the measured point relative to the camera centre in robot axes (x ahead = depth); `noises[n]` its
-    covariance (6) in robot axes, used if `given`; `camera` = (focal, baseline, sigma_px, sigma_disparity, mount (3)).
-
-    Rows are passed as array and index throughout, because a slice costs more than the arithmetic.
-    """
-    ex = lx - x - (c * camera[4] - s * camera[5])
-    ey = ly - y - (s * camera[4] + c * camera[5])
-    ez = lz - camera[6]
-    depth = c * ex + s * ey
-    mx = c * points[n, 0] - s * points[n, 1]
-    my = s * points[n, 0] + c * points[n, 1]
-    if given:
-        a = noises[n, 0]
-        b = noises[n, 1]
-        d = noises[n, 3]
-        return (
-            mx - ex, my - ey, points[n, 2] - ez,
-            c * c * a - 2.0 * c * s * b + s * s * d,
-            c * s * (a - d) + (c * c - s * s) * b,
-            c * noises[n, 2] - s * noises[n, 4],
-            s * s * a + 2.0 * c * s * b + c * c * d,
-            s * noises[n, 2] + c * noises[n, 4],
-            noises[n, 5],
-            depth,
-        )
-    k = depth / points[n, 0]
-    pixel = (camera[2] * depth / camera[0]) ** 2
-    disparity = (camera[3] * depth / (camera[0] * camera[1])) ** 2
-    return (
-        k * (mx - ex), k * (my - ey), k * (points[n, 2] - ez),
-        pixel * s * s + disparity * ex * ex,
-        -pixel * c * s + disparity * ex * ey,
-        disparity * ex * ez,
-        pixel * c * c + disparity * ey * ey,
-        disparity * ey * ez,
-        pixel + disparity * ez * ez,
-        depth,
-    )
+# ---------------------------------------------------------------------------------------------------- one lane
 
 
-@inlined
+@lanes_inlined
 def _invert(
     a: float, b: float, c: float, d: float, e: float, f: float
 ) -> tuple[float, float, float, float, float, float, float]:
@@ -86,554 +83,1530 @@ def _invert(
     return p * g, q * g, r * g, (a * f - c * c) * g, (b * c - a * e) * g, (a * d - b * b) * g, det
 
 
-@inlined
+@lanes_inlined
 def _form(
-    i: tuple[float, float, float, float, float, float, float], x: float, y: float, z: float
+    i00: float, i01: float, i02: float, i11: float, i12: float, i22: float, x: float, y: float, z: float
 ) -> float:
-    """Return the quadratic form of (x, y, z) under a packed inverse."""
-    return (
-        i[0] * x * x + i[3] * y * y + i[5] * z * z
-        + 2.0 * (i[1] * x * y + i[2] * x * z + i[4] * y * z)
-    )
+    """Return the quadratic form of (x, y, z)."""
+    return i00 * x * x + i11 * y * y + i22 * z * z + 2.0 * (i01 * x * y + i02 * x * z + i12 * y * z)
 
 
-@inlined
-def _whitened(
-    lx: float, ly: float, x: float, y: float, factor: FloatArray
-) -> tuple[float, float, float, float, float, float]:
-    """Return the two non-zero rows of H C: how r moves with the whitened pose error xi, pose = x0 + C xi."""
-    hx = -(ly - y)
-    hy = lx - x
-    return (
-        factor[0, 0] + hx * factor[2, 0], factor[0, 1] + hx * factor[2, 1], factor[0, 2] + hx * factor[2, 2],
-        factor[1, 0] + hy * factor[2, 0], factor[1, 1] + hy * factor[2, 1], factor[1, 2] + hy * factor[2, 2],
-    )
+@lanes_inlined
+def _sine_cosine(angle: float) -> tuple[float, float]:
+    """Return sine and cosine to the last bits but one, for angles up to some thousand turns, without a branch.
 
-
-@jit
-def _gate(
-    pose: FloatArray, local: FloatArray, q: int, points: FloatArray, noises: FloatArray, n: int, given: bool,
-    camera: FloatArray, factor: FloatArray, spread: FloatArray,
-) -> tuple[float, float, float]:
-    """Return the squared Mahalanobis distance D and log|S|, pose uncertainty C L^-1 C^T included, and |r| [m].
-
-    `local[q]` is the landmark (9), `factor` is C (3, 3), `spread` is L^-1 (3, 3). D is infinite where the landmark is
-    predicted behind the camera. Unless `given`, S is that of the image coordinates (up to a constant of the camera):
-    landmarks at different depths are compared in the space in which the measurement was made.
+    Reduction to [-pi/4, pi/4] and Taylor's series there.
     """
-    rx, ry, rz, s0, s1, s2, s3, s4, s5, depth = _innovation(
-        pose[0], pose[1], pose[3], pose[4], local[q, 0], local[q, 1], local[q, 2], points, noises, n, given, camera
-    )
-    if not given and depth < MIN_DEPTH:
-        return np.inf, 0.0, np.inf
-    a0, a1, a2, b0, b1, b2 = _whitened(local[q, 0], local[q, 1], pose[0], pose[1], factor)
-    u0 = spread[0, 0] * a0 + spread[0, 1] * a1 + spread[0, 2] * a2
-    u1 = spread[1, 0] * a0 + spread[1, 1] * a1 + spread[1, 2] * a2
-    u2 = spread[2, 0] * a0 + spread[2, 1] * a1 + spread[2, 2] * a2
-    w0 = spread[0, 0] * b0 + spread[0, 1] * b1 + spread[0, 2] * b2
-    w1 = spread[1, 0] * b0 + spread[1, 1] * b1 + spread[1, 2] * b2
-    w2 = spread[2, 0] * b0 + spread[2, 1] * b1 + spread[2, 2] * b2
-    inverse = _invert(
-        local[q, 3] + s0 + a0 * u0 + a1 * u1 + a2 * u2,
-        local[q, 4] + s1 + a0 * w0 + a1 * w1 + a2 * w2,
-        local[q, 5] + s2,
-        local[q, 6] + s3 + b0 * w0 + b1 * w1 + b2 * w2,
-        local[q, 7] + s4,
-        local[q, 8] + s5,
-    )  # Eq. 7, plus what the pose adds
-    log_det = math.log(inverse[6] if given else inverse[6] / depth**8)
-    return _form(inverse, rx, ry, rz), log_det, math.sqrt(rx * rx + ry * ry + rz * rz)
+    quarter = (angle * (2.0 / math.pi) + ROUND) - ROUND
+    x = (angle - quarter * HALF_PI_HIGH) - quarter * HALF_PI_LOW
+    z = x * x
+    s = -1.0 / 1307674368000.0
+    s = s * z + 1.0 / 6227020800.0
+    s = s * z - 1.0 / 39916800.0
+    s = s * z + 1.0 / 362880.0
+    s = s * z - 1.0 / 5040.0
+    s = s * z + 1.0 / 120.0
+    s = s * z - 1.0 / 6.0
+    s = x + x * z * s
+    c = 1.0 / 20922789888000.0
+    c = c * z - 1.0 / 87178291200.0
+    c = c * z + 1.0 / 479001600.0
+    c = c * z - 1.0 / 3628800.0
+    c = c * z + 1.0 / 40320.0
+    c = c * z - 1.0 / 720.0
+    c = c * z + 1.0 / 24.0
+    c = c * z - 0.5
+    c = 1.0 + z * c
+    turn = quarter - 4.0 * math.floor(0.25 * quarter)  # 0, 1, 2 or 3
+    odd = turn == 1.0 or turn == 3.0
+    sine = c if odd else s
+    cosine = s if odd else c
+    sine = -sine if turn >= 2.0 else sine
+    cosine = -cosine if turn == 1.0 or turn == 2.0 else cosine
+    return sine, cosine
 
 
-@inlined
-def _accumulate(
-    pose: FloatArray, local: FloatArray, q: int, points: FloatArray, noises: FloatArray, n: int, given: bool,
-    camera: FloatArray, factor: FloatArray, robust: float, information: FloatArray, gradient: FloatArray,
-) -> float:
-    """Add one match to the Gauss-Newton system of xi, and return its log-likelihood given the pose.
+@lanes_inlined
+def _log(x: float) -> float:
+    """Return the natural logarithm of a positive normal number, without a branch: x = 2^e m, and atanh's series."""
+    bits = float_bits(x)
+    exponent = float((bits >> 52) - 1023)
+    m = bits_float((bits & 0x000FFFFFFFFFFFFF) | 0x3FF0000000000000)
+    big = m > 1.4142135623730951
+    m = 0.5 * m if big else m
+    exponent = exponent + 1.0 if big else exponent
+    f = (m - 1.0) / (m + 1.0)
+    z = f * f
+    s = 1.0 / 21.0
+    s = s * z + 1.0 / 19.0
+    s = s * z + 1.0 / 17.0
+    s = s * z + 1.0 / 15.0
+    s = s * z + 1.0 / 13.0
+    s = s * z + 1.0 / 11.0
+    s = s * z + 1.0 / 9.0
+    s = s * z + 1.0 / 7.0
+    s = s * z + 0.2
+    s = s * z + 1.0 / 3.0
+    return exponent * LN2 + 2.0 * (f + f * z * s)
 
-    `robust` > 0 down-weights the match by 1 / (1 + D / robust) (Cauchy); 0 does not.
+
+@lanes_inlined
+def _split(x: float) -> tuple[float, float]:
+    """Return mantissa in [1, 2) and exponent of a positive normal number: products of many never overflow."""
+    bits = float_bits(x)
+    return bits_float((bits & 0x000FFFFFFFFFFFFF) | 0x3FF0000000000000), float((bits >> 52) - 1023)
+
+
+@lanes_inlined
+def _wrap(angle: float) -> float:
+    """Return the angle in [-pi, pi)."""
+    return angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
+
+
+# ------------------------------------------------------------------------------------- all lanes of one block
+
+
+@lanes
+def _innovate(
+    work: FloatArray, tile: FloatArray, points: FloatArray, noises: FloatArray, n: int, given: bool, camera: FloatArray
+) -> None:
+    """Write r (3), its sensor covariance in map axes (6) and the predicted depth, at the pose rows X .. SIN.
+
+    `points[n]` is the measured point relative to the camera centre in robot axes (x ahead = depth); `noises[n]` its
+    covariance (6) in robot axes, used if `given`, and the depth is then 1: it plays no part. `camera` = (focal,
+    baseline, sigma_px, sigma_disparity, mount (3)).
     """
-    rx, ry, rz, s0, s1, s2, s3, s4, s5, depth = _innovation(
-        pose[0], pose[1], pose[3], pose[4], local[q, 0], local[q, 1], local[q, 2], points, noises, n, given, camera
-    )
-    if not given and depth < MIN_DEPTH:
-        return 0.0
-    i = _invert(
-        local[q, 3] + s0, local[q, 4] + s1, local[q, 5] + s2, local[q, 6] + s3, local[q, 7] + s4, local[q, 8] + s5
-    )  # Eq. 7
-    distance = _form(i, rx, ry, rz)
-    weight = 1.0 / (1.0 + distance / robust) if robust > 0.0 else 1.0
-    a0, a1, a2, b0, b1, b2 = _whitened(local[q, 0], local[q, 1], pose[0], pose[1], factor)
-    gx = weight * (i[0] * rx + i[1] * ry + i[2] * rz)
-    gy = weight * (i[1] * rx + i[3] * ry + i[4] * rz)
-    gradient[0] += a0 * gx + b0 * gy
-    gradient[1] += a1 * gx + b1 * gy
-    gradient[2] += a2 * gx + b2 * gy
-    xx, xy, yy = weight * i[0], weight * i[1], weight * i[3]
-    u0, u1, u2 = xx * a0 + xy * b0, xx * a1 + xy * b1, xx * a2 + xy * b2
-    v0, v1, v2 = xy * a0 + yy * b0, xy * a1 + yy * b1, xy * a2 + yy * b2
-    information[0] += a0 * u0 + b0 * v0
-    information[1] += a0 * u1 + b0 * v1
-    information[2] += a0 * u2 + b0 * v2
-    information[3] += a1 * u1 + b1 * v1
-    information[4] += a1 * u2 + b1 * v2
-    information[5] += a2 * u2 + b2 * v2
-    log_scale = 0.0 if given else 4.0 * math.log(depth)
-    return -0.5 * (distance + 3.0 * LOG_2PI + math.log(i[6])) + log_scale  # Eq. 11, in logarithms
+    v0, v1, v2 = points[n, 0], points[n, 1], points[n, 2]
+    m0, m1, m2 = camera[4], camera[5], camera[6]
+    if given:
+        a, b, d, e, f, g = noises[n, 0], noises[n, 1], noises[n, 2], noises[n, 3], noises[n, 4], noises[n, 5]
+        for i in range(LANES):
+            c, s = work[COS + i], work[SIN + i]
+            work[R0 + i] = c * (v0 + m0) - s * (v1 + m1) + work[X + i] - tile[i]
+            work[R1 + i] = s * (v0 + m0) + c * (v1 + m1) + work[Y + i] - tile[LANES + i]
+            work[R2 + i] = v2 + m2 - tile[2 * LANES + i]
+            work[N00 + i] = c * c * a - 2.0 * c * s * b + s * s * e
+            work[N01 + i] = c * s * (a - e) + (c * c - s * s) * b
+            work[N02 + i] = c * d - s * f
+            work[N11 + i] = s * s * a + 2.0 * c * s * b + c * c * e
+            work[N12 + i] = s * d + c * f
+            work[N22 + i] = g
+            work[DEPTH + i] = 1.0
+    else:
+        pixel = (camera[2] / camera[0]) ** 2
+        disparity = (camera[3] / (camera[0] * camera[1])) ** 2
+        per_depth = 1.0 / v0
+        for i in range(LANES):
+            c, s = work[COS + i], work[SIN + i]
+            ex = tile[i] - work[X + i] - (c * m0 - s * m1)
+            ey = tile[LANES + i] - work[Y + i] - (s * m0 + c * m1)
+            ez = tile[2 * LANES + i] - m2
+            depth = c * ex + s * ey
+            k = depth * per_depth
+            work[R0 + i] = k * (c * v0 - s * v1 - ex)
+            work[R1 + i] = k * (s * v0 + c * v1 - ey)
+            work[R2 + i] = k * (v2 - ez)
+            across, along = pixel * depth * depth, disparity * depth * depth
+            work[N00 + i] = across * s * s + along * ex * ex
+            work[N01 + i] = along * ex * ey - across * c * s
+            work[N02 + i] = along * ex * ez
+            work[N11 + i] = across * c * c + along * ey * ey
+            work[N12 + i] = along * ey * ez
+            work[N22 + i] = across + along * ez * ez
+            work[DEPTH + i] = depth
 
 
-@inlined
-def _place(start: FloatArray, factor: FloatArray, xi: FloatArray, pose: FloatArray) -> None:
-    """Write pose = start + C xi as (x, y, theta, cos theta, sin theta)."""
-    for j in range(3):
-        pose[j] = start[j] + factor[j, 0] * xi[0] + factor[j, 1] * xi[1] + factor[j, 2] * xi[2]
-    pose[3] = math.cos(pose[2])
-    pose[4] = math.sin(pose[2])
+@lanes
+def _evaluate(work: FloatArray, tile: FloatArray, record: FloatArray) -> None:
+    """Write what a match would add to the system of xi, and its gate, from the innovation in `work`."""
+    for i in range(LANES):
+        rx, ry, rz = work[R0 + i], work[R1 + i], work[R2 + i]
+        depth = work[DEPTH + i]
+        i00, i01, i02, i11, i12, i22, det = _invert(
+            tile[3 * LANES + i] + work[N00 + i], tile[4 * LANES + i] + work[N01 + i],
+            tile[5 * LANES + i] + work[N02 + i], tile[6 * LANES + i] + work[N11 + i],
+            tile[7 * LANES + i] + work[N12 + i], tile[8 * LANES + i] + work[N22 + i],
+        )  # Eq. 7
+        hx, hy = work[Y + i] - tile[LANES + i], tile[i] - work[X + i]
+        a0, a1, a2 = work[C00 + i] + hx * work[C20 + i], hx * work[C21 + i], hx * work[C22 + i]
+        b0, b1, b2 = work[C10 + i] + hy * work[C20 + i], work[C11 + i] + hy * work[C21 + i], hy * work[C22 + i]
+        sx = i00 * rx + i01 * ry + i02 * rz
+        sy = i01 * rx + i11 * ry + i12 * rz
+        square = sx * rx + sy * ry + (i02 * rx + i12 * ry + i22 * rz) * rz
+        g0, g1, g2 = a0 * sx + b0 * sy, a1 * sx + b1 * sy, a2 * sx + b2 * sy
+        u0, u1, u2 = i00 * a0 + i01 * b0, i00 * a1 + i01 * b1, i00 * a2 + i01 * b2
+        w0, w1, w2 = i01 * a0 + i11 * b0, i01 * a1 + i11 * b1, i01 * a2 + i11 * b2
+        j00, j01, j02 = a0 * u0 + b0 * w0, a0 * u1 + b0 * w1, a0 * u2 + b0 * w2
+        j11, j12, j22 = a1 * u1 + b1 * w1, a1 * u2 + b1 * w2, a2 * u2 + b2 * w2
+        p00, p01, p02, p11, p12, p22, det_pose = _invert(
+            work[L00 + i] + j00, work[L01 + i] + j01, work[L02 + i] + j02,
+            work[L11 + i] + j11, work[L12 + i] + j12, work[L22 + i] + j22,
+        )
+        distance = square - _form(p00, p01, p02, p11, p12, p22, g0, g1, g2)
+        record[QJ00 + i], record[QJ01 + i], record[QJ02 + i] = j00, j01, j02
+        record[QJ11 + i], record[QJ12 + i], record[QJ22 + i] = j11, j12, j22
+        record[QG0 + i], record[QG1 + i], record[QG2 + i] = g0, g1, g2
+        record[Q_SQUARE + i] = square
+        record[Q_DET + i] = det
+        record[Q_DET_POSE + i] = det_pose
+        record[Q_DEPTH + i] = depth
+        record[Q_METRES2 + i] = rx * rx + ry * ry + rz * rz
+        record[Q_D + i] = distance if depth >= MIN_DEPTH else np.inf
 
 
-@jit
-def _refine(
-    start: FloatArray, factor: FloatArray, matches: IntArray, local: FloatArray, points: FloatArray, noises: FloatArray,
-    given: bool, camera: FloatArray, robust: float, xi: FloatArray, pose: FloatArray, spread: FloatArray,
-    information: FloatArray, gradient: FloatArray,
-) -> float:
-    """Gauss-Newton, twice from the given xi, on |xi|^2 + sum r^T S^-1 r; leave xi, pose, spread = L^-1 at the mode.
+@lanes
+def _gate_and_update(
+    work: FloatArray, tile: FloatArray, record: FloatArray, admit: FloatArray, gate: float
+) -> int:
+    """At a known pose: gate, and where admitted and inside the gate, weigh and update the landmark (Eqs. 5-11).
 
-    `information` (6) and `gradient` (3) are working space.
+    `admit` (LANES) is 1 where the lane may match; it becomes 1 where it did. The squared distance is left in `record`.
 
     Returns:
-        log p(measurements, xi at the mode) - log p(xi | measurements) there: the predictive log-likelihood of the frame
-        by Laplace's formula, -1/2 |xi|^2 - 1/2 log|L| + sum log N(r; 0, S).
+        How many lanes matched.
     """
-    log_likelihood = 0.0
-    for iteration in range(3):
-        _place(start, factor, xi, pose)
-        log_likelihood = 0.0
-        information[:] = 0.0
-        information[0] = information[3] = information[5] = 1.0
-        for j in range(3):
-            gradient[j] = xi[j]
-        for n in range(len(matches)):
-            if matches[n] >= 0:
-                log_likelihood += _accumulate(
-                    pose, local, matches[n], points, noises, n, given, camera, factor, robust, information, gradient
-                )
-        i = _invert(
-            information[0], information[1], information[2], information[3], information[4], information[5]
+    count = 0
+    for i in range(LANES):
+        p00, p01, p02 = tile[3 * LANES + i], tile[4 * LANES + i], tile[5 * LANES + i]
+        p11, p12, p22 = tile[6 * LANES + i], tile[7 * LANES + i], tile[8 * LANES + i]
+        n00, n01, n02, n11, n12, n22 = (
+            work[N00 + i], work[N01 + i], work[N02 + i], work[N11 + i], work[N12 + i], work[N22 + i]
         )
-        if iteration < 2:
-            xi[0] -= i[0] * gradient[0] + i[1] * gradient[1] + i[2] * gradient[2]
-            xi[1] -= i[1] * gradient[0] + i[3] * gradient[1] + i[4] * gradient[2]
-            xi[2] -= i[2] * gradient[0] + i[4] * gradient[1] + i[5] * gradient[2]
-        else:
-            spread[0, 0], spread[0, 1], spread[0, 2] = i[0], i[1], i[2]
-            spread[1, 0], spread[1, 1], spread[1, 2] = i[1], i[3], i[4]
-            spread[2, 0], spread[2, 1], spread[2, 2] = i[2], i[4], i[5]
-            log_likelihood -= 0.5 * (xi[0] ** 2 + xi[1] ** 2 + xi[2] ** 2 + math.log(i[6]))
-    return log_likelihood
+        rx, ry, rz, depth = work[R0 + i], work[R1 + i], work[R2 + i], work[DEPTH + i]
+        i00, i01, i02, i11, i12, i22, det = _invert(
+            p00 + n00, p01 + n01, p02 + n02, p11 + n11, p12 + n12, p22 + n22
+        )  # Eq. 7
+        distance = _form(i00, i01, i02, i11, i12, i22, rx, ry, rz)
+        match = admit[i] > 0.0 and distance <= gate and depth >= MIN_DEPTH
+        k00, k01, k02 = p00 * i00 + p01 * i01 + p02 * i02, p00 * i01 + p01 * i11 + p02 * i12, (
+            p00 * i02 + p01 * i12 + p02 * i22
+        )  # Eq. 8
+        k10, k11, k12 = p01 * i00 + p11 * i01 + p12 * i02, p01 * i01 + p11 * i11 + p12 * i12, (
+            p01 * i02 + p11 * i12 + p12 * i22
+        )
+        k20, k21, k22 = p02 * i00 + p12 * i01 + p22 * i02, p02 * i01 + p12 * i11 + p22 * i12, (
+            p02 * i02 + p12 * i12 + p22 * i22
+        )
+        tile[i] += k00 * rx + k01 * ry + k02 * rz if match else 0.0  # Eq. 9
+        tile[LANES + i] += k10 * rx + k11 * ry + k12 * rz if match else 0.0
+        tile[2 * LANES + i] += k20 * rx + k21 * ry + k22 * rz if match else 0.0
+        # Eq. 10, (I - K) Sigma, written as K R: no difference of nearly equal numbers, and made symmetric.
+        q00 = k00 * n00 + k01 * n01 + k02 * n02
+        q01 = 0.5 * (k00 * n01 + k01 * n11 + k02 * n12 + k10 * n00 + k11 * n01 + k12 * n02)
+        q02 = 0.5 * (k00 * n02 + k01 * n12 + k02 * n22 + k20 * n00 + k21 * n01 + k22 * n02)
+        q11 = k10 * n01 + k11 * n11 + k12 * n12
+        q12 = 0.5 * (k10 * n02 + k11 * n12 + k12 * n22 + k20 * n01 + k21 * n11 + k22 * n12)
+        q22 = k20 * n02 + k21 * n12 + k22 * n22
+        tile[3 * LANES + i] = q00 if match else p00
+        tile[4 * LANES + i] = q01 if match else p01
+        tile[5 * LANES + i] = q02 if match else p02
+        tile[6 * LANES + i] = q11 if match else p11
+        tile[7 * LANES + i] = q12 if match else p12
+        tile[8 * LANES + i] = q22 if match else p22
+        record[Q_D + i] = distance
+        record[Q_DET + i] = det if match else 1.0
+        record[Q_DEPTH + i] = depth if match else 1.0
+        record[Q_SQUARE + i] = distance if match else 0.0
+        admit[i] = 1.0 if match else 0.0
+        count += 1 if match else 0
+    return count
 
 
-@jit
-def _update_landmark(
-    pose: FloatArray, local: FloatArray, q: int, points: FloatArray, noises: FloatArray, n: int, given: bool,
-    camera: FloatArray, iterations: int,
-) -> None:
-    """Update the landmark `local[q]` in place by the (iterated) EKF at a known pose (Eqs. 5-10, G = 1)."""
-    px, py, pz = local[q, 0], local[q, 1], local[q, 2]
-    p0, p1, p2, p3, p4, p5 = local[q, 3], local[q, 4], local[q, 5], local[q, 6], local[q, 7], local[q, 8]
-    x, y, z = px, py, pz
-    for iteration in range(iterations):
-        rx, ry, rz, s0, s1, s2, s3, s4, s5, depth = _innovation(
-            pose[0], pose[1], pose[3], pose[4], x, y, z, points, noises, n, given, camera
-        )  # Eq. 5
-        if not given and depth < MIN_DEPTH:
-            return
-        i = _invert(p0 + s0, p1 + s1, p2 + s2, p3 + s3, p4 + s4, p5 + s5)  # Eq. 7
-        k00 = p0 * i[0] + p1 * i[1] + p2 * i[2]  # Eq. 8
-        k01 = p0 * i[1] + p1 * i[3] + p2 * i[4]
-        k02 = p0 * i[2] + p1 * i[4] + p2 * i[5]
-        k10 = p1 * i[0] + p3 * i[1] + p4 * i[2]
-        k11 = p1 * i[1] + p3 * i[3] + p4 * i[4]
-        k12 = p1 * i[2] + p3 * i[4] + p4 * i[5]
-        k20 = p2 * i[0] + p4 * i[1] + p5 * i[2]
-        k21 = p2 * i[1] + p4 * i[3] + p5 * i[4]
-        k22 = p2 * i[2] + p4 * i[4] + p5 * i[5]
-        rx += x - px
-        ry += y - py
-        rz += z - pz
-        x = px + k00 * rx + k01 * ry + k02 * rz  # Eq. 9
-        y = py + k10 * rx + k11 * ry + k12 * rz
-        z = pz + k20 * rx + k21 * ry + k22 * rz
-        if iteration == iterations - 1:
-            local[q, 0], local[q, 1], local[q, 2] = x, y, z
-            # Eq. 10 in Joseph's form, J P J^T + K R K^T with J = I - K: symmetric and positive whatever the rounding.
-            j00, j01, j02 = 1.0 - k00, -k01, -k02
-            j10, j11, j12 = -k10, 1.0 - k11, -k12
-            j20, j21, j22 = -k20, -k21, 1.0 - k22
-            a0, a1, a2 = j00 * p0 + j01 * p1 + j02 * p2, j00 * p1 + j01 * p3 + j02 * p4, j00 * p2 + j01 * p4 + j02 * p5
-            b0, b1, b2 = j10 * p0 + j11 * p1 + j12 * p2, j10 * p1 + j11 * p3 + j12 * p4, j10 * p2 + j11 * p4 + j12 * p5
-            c0, c1, c2 = j20 * p0 + j21 * p1 + j22 * p2, j20 * p1 + j21 * p3 + j22 * p4, j20 * p2 + j21 * p4 + j22 * p5
-            d0, d1, d2 = k00 * s0 + k01 * s1 + k02 * s2, k00 * s1 + k01 * s3 + k02 * s4, k00 * s2 + k01 * s4 + k02 * s5
-            e0, e1, e2 = k10 * s0 + k11 * s1 + k12 * s2, k10 * s1 + k11 * s3 + k12 * s4, k10 * s2 + k11 * s4 + k12 * s5
-            f0, f1, f2 = k20 * s0 + k21 * s1 + k22 * s2, k20 * s1 + k21 * s3 + k22 * s4, k20 * s2 + k21 * s4 + k22 * s5
-            local[q, 3] = a0 * j00 + a1 * j01 + a2 * j02 + d0 * k00 + d1 * k01 + d2 * k02
-            local[q, 4] = a0 * j10 + a1 * j11 + a2 * j12 + d0 * k10 + d1 * k11 + d2 * k12
-            local[q, 5] = a0 * j20 + a1 * j21 + a2 * j22 + d0 * k20 + d1 * k21 + d2 * k22
-            local[q, 6] = b0 * j10 + b1 * j11 + b2 * j12 + e0 * k10 + e1 * k11 + e2 * k12
-            local[q, 7] = b0 * j20 + b1 * j21 + b2 * j22 + e0 * k20 + e1 * k21 + e2 * k22
-            local[q, 8] = c0 * j20 + c1 * j21 + c2 * j22 + f0 * k20 + f1 * k21 + f2 * k22
+@lanes
+def _add_likelihood(work: FloatArray, record: FloatArray, mask: FloatArray) -> None:
+    """Add a match's part of the log-likelihood where `mask` is 1: r^T S^-1 r, |S| and the depth, as products."""
+    for i in range(LANES):
+        on = mask[i] > 0.0
+        work[SUM_D + i] += record[Q_SQUARE + i] if on else 0.0
+        work[MATCHED + i] += 1.0 if on else 0.0
+        mantissa, exponent = _split(work[DET + i] * (record[Q_DET + i] if on else 1.0))
+        work[DET + i] = mantissa
+        work[DET_EXP + i] += exponent
+        mantissa, exponent = _split(work[DEPTHS + i] * (record[Q_DEPTH + i] if on else 1.0))
+        work[DEPTHS + i] = mantissa
+        work[DEPTHS_EXP + i] += exponent
 
 
-@jit
-def _new_landmark(
-    pose: FloatArray, local: FloatArray, q: int, points: FloatArray, noises: FloatArray, n: int, given: bool,
-    camera: FloatArray,
-) -> None:
-    """Write mean and covariance of a landmark first seen from a known pose (Algorithm 1, l. 30-31 corrected)."""
-    c = pose[3]
-    s = pose[4]
-    local[q, 0] = pose[0] + c * (camera[4] + points[n, 0]) - s * (camera[5] + points[n, 1])
-    local[q, 1] = pose[1] + s * (camera[4] + points[n, 0]) + c * (camera[5] + points[n, 1])
-    local[q, 2] = camera[6] + points[n, 2]
-    _, _, _, local[q, 3], local[q, 4], local[q, 5], local[q, 6], local[q, 7], local[q, 8], _ = _innovation(
-        pose[0], pose[1], c, s, local[q, 0], local[q, 1], local[q, 2], points, noises, n, given, camera
-    )  # l. 31 *: G^-1 R G^-T
+@lanes
+def _clear_likelihood(work: FloatArray) -> None:
+    for i in range(LANES):
+        work[SUM_D + i] = 0.0
+        work[MATCHED + i] = 0.0
+        work[DET + i] = 1.0
+        work[DET_EXP + i] = 0.0
+        work[DEPTHS + i] = 1.0
+        work[DEPTHS_EXP + i] = 0.0
+        work[CLUTTER + i] = 0.0
 
 
-@inlined
-def _load(landmarks: FloatArray, slot: int, m: int, local: FloatArray, q: int) -> None:
-    for c in range(9):
-        local[q, c] = landmarks[slot, c, m]
+@lanes_inlined
+def _log_likelihood(work: FloatArray, i: int) -> float:
+    """Return a lane's sum over matches of log N(r; 0, S) + 4 log depth (Eq. 11), and that of the unmatched."""
+    log_det = _log(work[DET + i]) + LN2 * work[DET_EXP + i]
+    log_depth = _log(work[DEPTHS + i]) + LN2 * work[DEPTHS_EXP + i]
+    matched: float = work[SUM_D + i] + 3.0 * LOG_2PI * work[MATCHED + i] + log_det
+    unmatched: float = work[CLUTTER + i]
+    return -0.5 * matched + 4.0 * log_depth + unmatched
 
 
-@inlined
-def _store(landmarks: FloatArray, slot: int, m: int, local: FloatArray, q: int) -> None:
-    for c in range(9):
-        landmarks[slot, c, m] = local[q, c]
+@lanes
+def _sum_matches(work: FloatArray, record: FloatArray, weights: FloatArray) -> None:
+    """Add a candidate's share of the Gauss-Newton system, times `weights` (LANES); where that is 0 it may be NaN."""
+    for i in range(LANES):
+        w = weights[i]
+        on = w > 0.0
+        work[J00 + i] += w * record[QJ00 + i] if on else 0.0
+        work[J01 + i] += w * record[QJ01 + i] if on else 0.0
+        work[J02 + i] += w * record[QJ02 + i] if on else 0.0
+        work[J11 + i] += w * record[QJ11 + i] if on else 0.0
+        work[J12 + i] += w * record[QJ12 + i] if on else 0.0
+        work[J22 + i] += w * record[QJ22 + i] if on else 0.0
+        work[G0 + i] += w * record[QG0 + i] if on else 0.0
+        work[G1 + i] += w * record[QG1 + i] if on else 0.0
+        work[G2 + i] += w * record[QG2 + i] if on else 0.0
 
 
-@jit
-def sort_candidates(
-    rows: IntArray, slots: IntArray, measured: NDArray[np.float32], stored: NDArray[np.float32], gate: float,
-    num_measurements: int,
-) -> tuple[IntArray, IntArray, FloatArray]:
-    """Turn (measurement, slot) pairs into lists per measurement, nearest descriptor first.
+@lanes
+def _clear_sums(work: FloatArray) -> None:
+    """Start the system of xi from its prior N(0, I)."""
+    for i in range(LANES):
+        work[J00 + i] = 1.0
+        work[J01 + i] = 0.0
+        work[J02 + i] = 0.0
+        work[J11 + i] = 1.0
+        work[J12 + i] = 0.0
+        work[J22 + i] = 1.0
+        work[G0 + i] = work[XI0 + i]
+        work[G1 + i] = work[XI1 + i]
+        work[G2 + i] = work[XI2 + i]
+
+
+@lanes
+def _robust_weights(
+    record: FloatArray, chosen: FloatArray, q: float, gate: float, weights: FloatArray
+) -> int:
+    """Write Cauchy's weights 1 / (1 + D / gate) where the lane chose candidate q, else 0; return how many chose it."""
+    count = 0
+    for i in range(len(chosen)):
+        on = chosen[i] == q
+        weights[i] = 1.0 / (1.0 + record[Q_D + i] / gate) if on else 0.0
+        count += 1 if on else 0
+    return count
+
+
+@lanes
+def _step_pose(work: FloatArray, only_wide: bool) -> None:
+    """Take one step of Gauss-Newton from the sums: xi <- xi - J^-1 G, and the information L <- J."""
+    for i in range(LANES):
+        go = work[WIDE + i] > 0.0 or not only_wide
+        i00, i01, i02, i11, i12, i22, _ = _invert(
+            work[J00 + i], work[J01 + i], work[J02 + i], work[J11 + i], work[J12 + i], work[J22 + i]
+        )
+        g0, g1, g2 = work[G0 + i], work[G1 + i], work[G2 + i]
+        work[XI0 + i] -= i00 * g0 + i01 * g1 + i02 * g2 if go else 0.0
+        work[XI1 + i] -= i01 * g0 + i11 * g1 + i12 * g2 if go else 0.0
+        work[XI2 + i] -= i02 * g0 + i12 * g1 + i22 * g2 if go else 0.0
+        work[L00 + i] = work[J00 + i] if go else work[L00 + i]
+        work[L01 + i] = work[J01 + i] if go else work[L01 + i]
+        work[L02 + i] = work[J02 + i] if go else work[L02 + i]
+        work[L11 + i] = work[J11 + i] if go else work[L11 + i]
+        work[L12 + i] = work[J12 + i] if go else work[L12 + i]
+        work[L22 + i] = work[J22 + i] if go else work[L22 + i]
+
+
+@lanes
+def _place(work: FloatArray) -> None:
+    """Write the pose rows X .. SIN of x0 + C xi."""
+    for i in range(LANES):
+        xi0, xi1, xi2 = work[XI0 + i], work[XI1 + i], work[XI2 + i]
+        theta = work[T0 + i] + work[C20 + i] * xi0 + work[C21 + i] * xi1 + work[C22 + i] * xi2
+        work[X + i] = work[X0 + i] + work[C00 + i] * xi0
+        work[Y + i] = work[Y0 + i] + work[C10 + i] * xi0 + work[C11 + i] * xi1
+        work[T + i] = theta
+        work[SIN + i], work[COS + i] = _sine_cosine(theta)
+
+
+@lanes
+def _predict(work: FloatArray, mean: FloatArray, covariance: FloatArray, move: FloatArray, sigmas: FloatArray) -> None:
+    """Write the predicted pose x0 and the lower factor C of its covariance F P F^T + T diag(sigmas^2) T^T (Eq. 4).
 
     Args:
-        rows: (p,) int64. Measurement of each pair, ascending.
-        slots: (p,) int64. Landmark slot of each pair, ascending within a measurement.
+        mean: (3 LANES,) the pose before the motion: rows x, y, theta.
+        covariance: (6 LANES,) its covariance, upper triangle by rows.
+        move: (3,) u, previous robot frame.
+        sigmas: (3,) standard deviations of u.
+    """
+    dx, dy, turn = move[0], move[1], move[2]
+    v0, v1, v2 = sigmas[0] ** 2, sigmas[1] ** 2, sigmas[2] ** 2
+    for i in range(LANES):
+        s, c = _sine_cosine(mean[2 * LANES + i])
+        ox, oy = c * dx - s * dy, s * dx + c * dy
+        work[X0 + i] = mean[i] + ox
+        work[Y0 + i] = mean[LANES + i] + oy
+        work[T0 + i] = mean[2 * LANES + i] + turn
+        p00, p01, p02 = covariance[i], covariance[LANES + i], covariance[2 * LANES + i]
+        p11, p12, p22 = covariance[3 * LANES + i], covariance[4 * LANES + i], covariance[5 * LANES + i]
+        # F = [[1, 0, -oy], [0, 1, ox], [0, 0, 1]]
+        q00 = p00 - 2.0 * oy * p02 + oy * oy * p22 + c * c * v0 + s * s * v1
+        q01 = p01 + ox * p02 - oy * p12 - ox * oy * p22 + c * s * (v0 - v1)
+        q02 = p02 - oy * p22
+        q11 = p11 + 2.0 * ox * p12 + ox * ox * p22 + s * s * v0 + c * c * v1
+        q12 = p12 + ox * p22
+        q22 = p22 + v2
+        work[N00 + i], work[N01 + i], work[N02 + i] = q00, q01, q02
+        work[N11 + i], work[N12 + i], work[N22 + i] = q11, q12, q22
+        work[WIDE + i] = 1.0 if q22 > WIDE_HEADING**2 else 0.0
+    for i in range(LANES):
+        _factorise(work, i)
+
+
+@lanes_inlined
+def _factorise(work: FloatArray, i: int) -> None:
+    """Write the lower Cholesky factor C of the covariance in rows N00 .. N22; a vanishing pivot gives a zero column."""
+    q00, q11, q22 = work[N00 + i], work[N11 + i], work[N22 + i]
+    c00 = math.sqrt(q00 if q00 > 0.0 else 0.0)
+    inverse = 1.0 / c00 if q00 > 0.0 else 0.0
+    c10, c20 = work[N01 + i] * inverse, work[N02 + i] * inverse
+    rest = q11 - c10 * c10
+    rest = rest if rest > ZERO_PIVOT * q11 else 0.0
+    c11 = math.sqrt(rest)
+    inverse = 1.0 / c11 if rest > 0.0 else 0.0
+    c21 = (work[N12 + i] - c20 * c10) * inverse
+    work[C00 + i], work[C10 + i], work[C11 + i] = c00, c10, c11
+    work[C20 + i], work[C21 + i] = c20, c21
+    rest = q22 - c20 * c20 - c21 * c21
+    work[C22 + i] = math.sqrt(rest if rest > ZERO_PIVOT * q22 else 0.0)
+
+
+@lanes
+def _judge_alone(work: FloatArray, record: FloatArray, gate: float) -> None:
+    """Count the verdict on the predicted pose of a measurement with one candidate."""
+    for i in range(LANES):
+        sure = record[Q_HELD + i] > 0.0
+        work[SURE + i] += 1.0 if sure else 0.0
+        work[CONTRADICT + i] += 1.0 if sure and not record[Q_D + i] <= gate else 0.0
+
+
+@lanes
+def _match_alone(record: FloatArray, match: FloatArray, q: float, named: bool, gate: float, weights: FloatArray) -> int:
+    """Pass A for a measurement with one candidate: write its match and robust weight; return how many matched."""
+    count = 0
+    for i in range(len(match)):
+        distance = record[Q_D + i]
+        ok = record[Q_HELD + i] > 0.0 and (distance <= gate or (named and distance < np.inf))
+        match[i] = q if ok else -1.0
+        weights[i] = 1.0 / (1.0 + distance / gate) if ok else 0.0
+        count += 1 if ok else 0
+    return count
+
+
+@lanes
+def _decide_alone(
+    work: FloatArray, record: FloatArray, match: FloatArray, q: float, named: bool, taken: bool,
+    gate: float, dead_zone: float, dead_radius: float, log_clutter: float, mask: FloatArray,
+) -> int:
+    """Pass B for a measurement with one candidate: match, reject or start; return how many matched.
+
+    `taken` tells whether row TAKEN says where an earlier measurement has taken the landmark.
+    """
+    count = 0
+    radius2 = dead_radius * dead_radius
+    for i in range(len(match)):
+        distance = record[Q_D + i]
+        front = record[Q_HELD + i] > 0.0 and distance < np.inf
+        distance = gate if named and distance > gate else distance
+        near = front and (distance <= dead_zone or record[Q_METRES2 + i] <= radius2)
+        ok = front and distance <= gate and not (taken and work[TAKEN + i] > 0.0)
+        match[i] = q if ok else (-1.0 if near else -2.0)
+        work[CLUTTER + i] += 0.0 if ok else log_clutter
+        mask[i] = 1.0 if ok else 0.0
+        count += 1 if ok else 0
+    return count
+
+
+@lanes
+def _begin_choice(work: FloatArray) -> None:
+    for i in range(LANES):
+        work[BEST + i] = np.inf
+        work[SECOND + i] = np.inf
+        work[CHOSEN + i] = -1.0
+        work[DEAD + i] = 0.0
+        work[LOG_BEST + i] = 0.0
+
+
+@lanes
+def _consider(work: FloatArray, record: FloatArray, q: float, look: float, named: bool, gate: float) -> None:
+    """Let candidate q compete for the measurement in pass A; `look` is what its descriptor costs."""
+    for i in range(LANES):
+        distance = record[Q_D + i]
+        ok = record[Q_HELD + i] > 0.0 and (distance <= gate or (named and distance < np.inf))
+        depth = record[Q_DEPTH + i]
+        log_det = _log(record[Q_DET + i]) - 8.0 * _log(depth if ok else 1.0) + _log(record[Q_DET_POSE + i])
+        cost = distance + log_det - work[LOG_DET_L + i] + look if ok else np.inf
+        best, second = work[BEST + i], work[SECOND + i]
+        better = cost < best
+        work[SECOND + i] = best if better else (cost if cost < second else second)
+        work[BEST + i] = cost if better else best
+        work[CHOSEN + i] = q if better else work[CHOSEN + i]
+
+
+@lanes
+def _end_choice(work: FloatArray, chosen: FloatArray, ambiguity: float) -> None:
+    """Write the tentative match of each lane: the best candidate, if no other comes near."""
+    for i in range(len(chosen)):
+        second = work[SECOND + i]
+        clear = second == np.inf or second - work[BEST + i] >= ambiguity
+        chosen[i] = work[CHOSEN + i] if clear else -1.0
+
+
+@lanes
+def _drop_taken(chosen: FloatArray, q: float, earlier: FloatArray, p: float) -> None:
+    """Unmatch lanes in which an earlier measurement took, as its candidate p, the landmark that is candidate q here."""
+    for i in range(len(chosen)):
+        chosen[i] = -1.0 if chosen[i] == q and earlier[i] == p else chosen[i]
+
+
+@lanes
+def _mark_taken(work: FloatArray, earlier: FloatArray, p: float) -> None:
+    for i in range(len(earlier)):
+        work[TAKEN + i] = 1.0 if earlier[i] == p else work[TAKEN + i]
+
+
+@lanes
+def _clear_taken(work: FloatArray) -> None:
+    for i in range(LANES):
+        work[TAKEN + i] = 0.0
+
+
+@lanes
+def _consider_again(
+    work: FloatArray, record: FloatArray, q: float, look: float, named: bool,
+    gate: float, dead_zone: float, dead_radius: float,
+) -> None:
+    """Let candidate q compete for the measurement in pass B, unless row TAKEN says that its landmark is taken."""
+    radius2 = dead_radius * dead_radius
+    for i in range(LANES):
+        distance = record[Q_D + i]
+        front = record[Q_HELD + i] > 0.0 and distance < np.inf
+        distance = gate if named and distance > gate else distance
+        near = front and (distance <= dead_zone or record[Q_METRES2 + i] <= radius2)
+        ok = front and distance <= gate and work[TAKEN + i] == 0.0
+        work[DEAD + i] = 1.0 if near else work[DEAD + i]
+        depth = record[Q_DEPTH + i]
+        log_det = _log(record[Q_DET + i]) - 8.0 * _log(depth if ok else 1.0) + _log(record[Q_DET_POSE + i])
+        log_det -= work[LOG_DET_L + i]
+        cost = distance + log_det + look if ok else np.inf
+        best, second = work[BEST + i], work[SECOND + i]
+        better = cost < best
+        work[SECOND + i] = best if better else (cost if cost < second else second)
+        work[BEST + i] = cost if better else best
+        work[CHOSEN + i] = q if better else work[CHOSEN + i]
+        work[LOG_BEST + i] = -0.5 * (distance + log_det + 3.0 * LOG_2PI) if better else work[LOG_BEST + i]
+
+
+@lanes
+def _decide(work: FloatArray, match: FloatArray, ambiguity: float, log_clutter: float) -> None:
+    """Write the candidate matched, -1 for rejected or -2 for new, and the log-likelihood of what is not matched."""
+    for i in range(LANES):
+        chosen, best, second = work[CHOSEN + i], work[BEST + i], work[SECOND + i]
+        matched = chosen >= 0.0
+        held_back = matched and second < np.inf and second - best < ambiguity
+        dead = work[DEAD + i] > 0.0
+        match[i] = (-1.0 if held_back else chosen) if matched else (-1.0 if dead else -2.0)
+        work[CLUTTER + i] += (work[LOG_BEST + i] if held_back else 0.0) if matched else log_clutter
+
+
+@lanes
+def _mask_of(match: FloatArray, code: float, mask: FloatArray) -> int:
+    """Write 1 where `match` equals `code`, else 0; return how many."""
+    count = 0
+    for i in range(len(match)):
+        on = match[i] == code
+        mask[i] = 1.0 if on else 0.0
+        count += 1 if on else 0
+    return count
+
+
+@lanes
+def _count_contradictions(work: FloatArray, gate: float) -> None:
+    """Count one measurement's verdict on the predicted pose, from its first look-alikes (see `_look_alikes`)."""
+    for i in range(LANES):
+        sure = work[CHOSEN + i] > 0.0
+        work[SURE + i] += 1.0 if sure else 0.0
+        work[CONTRADICT + i] += 1.0 if sure and not work[BEST + i] <= gate else 0.0
+
+
+@lanes
+def _look_alikes(work: FloatArray, record: FloatArray, look: float, ambiguity: float) -> None:
+    """Fold candidate after candidate: BEST = D of the first one held, SECOND = its look, CHOSEN = 1 while it is alone.
+
+    Candidates come by ascending look; a second one held whose look is within `ambiguity` makes the verdict unsure.
+    """
+    for i in range(LANES):
+        held = record[Q_HELD + i] > 0.0
+        first = held and work[SECOND + i] == np.inf
+        close = held and not first and work[DEAD + i] == 0.0
+        work[CHOSEN + i] = 1.0 if first else (
+            0.0 if close and look - work[SECOND + i] < ambiguity else work[CHOSEN + i]
+        )
+        work[DEAD + i] = 1.0 if close else work[DEAD + i]
+        work[BEST + i] = record[Q_D + i] if first else work[BEST + i]
+        work[SECOND + i] = look if first else work[SECOND + i]
+
+
+@lanes
+def _widen_lost(work: FloatArray, recovery: FloatArray) -> int:
+    """Give lanes whose pose most matches contradict the factor diag(recovery); return how many lanes those are."""
+    count = 0
+    for i in range(LANES):
+        lost = work[CONTRADICT + i] >= MIN_CONTRADICTIONS and 2.0 * work[CONTRADICT + i] > work[SURE + i]
+        work[LOST + i] = 1.0 if lost else 0.0
+        work[WIDE + i] = 1.0 if lost else work[WIDE + i]
+        work[C00 + i] = recovery[0] if lost else work[C00 + i]
+        work[C10 + i] = 0.0 if lost else work[C10 + i]
+        work[C11 + i] = recovery[1] if lost else work[C11 + i]
+        work[C20 + i] = 0.0 if lost else work[C20 + i]
+        work[C21 + i] = 0.0 if lost else work[C21 + i]
+        work[C22 + i] = recovery[2] if lost else work[C22 + i]
+        count += 1 if lost else 0
+    return count
+
+
+@lanes
+def _begin_pose(work: FloatArray) -> None:
+    """Start from xi = 0 with information I, at the predicted pose."""
+    for i in range(LANES):
+        work[XI0 + i] = 0.0
+        work[XI1 + i] = 0.0
+        work[XI2 + i] = 0.0
+        work[L00 + i] = 1.0
+        work[L01 + i] = 0.0
+        work[L02 + i] = 0.0
+        work[L11 + i] = 1.0
+        work[L12 + i] = 0.0
+        work[L22 + i] = 1.0
+        work[LOG_DET_L + i] = 0.0
+        work[SURE + i] = 0.0
+        work[CONTRADICT + i] = 0.0
+        work[LOST + i] = 0.0
+
+
+@lanes
+def _log_information(work: FloatArray) -> None:
+    for i in range(LANES):
+        work[LOG_DET_L + i] = _log(
+            work[L00 + i] * (work[L11 + i] * work[L22 + i] - work[L12 + i] * work[L12 + i])
+            - work[L01 + i] * (work[L01 + i] * work[L22 + i] - work[L12 + i] * work[L02 + i])
+            + work[L02 + i] * (work[L01 + i] * work[L12 + i] - work[L11 + i] * work[L02 + i])
+        )
+
+
+@lanes
+def _posterior(work: FloatArray, normals: FloatArray, log_likelihood: FloatArray, out: FloatArray) -> None:
+    """Weigh by the predictive likelihood and sample the pose, from the sums of pass B (Laplace's formula).
+
+    Args:
+        normals: (3 LANES,) standard normal draws.
+        log_likelihood: (LANES,) is added to.
+        out: (12 LANES,), written: mean x^ (3), covariance P^ (6), sample (3), theta of the sample wrapped.
+    """
+    for i in range(LANES):
+        i00, i01, i02, i11, i12, i22, det = _invert(
+            work[J00 + i], work[J01 + i], work[J02 + i], work[J11 + i], work[J12 + i], work[J22 + i]
+        )
+        g0, g1, g2 = work[G0 + i], work[G1 + i], work[G2 + i]
+        xi0, xi1, xi2 = work[XI0 + i], work[XI1 + i], work[XI2 + i]
+        gain = _form(i00, i01, i02, i11, i12, i22, g0, g1, g2)
+        log_likelihood[i] += _log_likelihood(work, i) - 0.5 * (
+            xi0 * xi0 + xi1 * xi1 + xi2 * xi2 - gain + _log(det)
+        )
+        xi0 -= i00 * g0 + i01 * g1 + i02 * g2
+        xi1 -= i01 * g0 + i11 * g1 + i12 * g2
+        xi2 -= i02 * g0 + i12 * g1 + i22 * g2
+        c00, c10, c11 = work[C00 + i], work[C10 + i], work[C11 + i]
+        c20, c21, c22 = work[C20 + i], work[C21 + i], work[C22 + i]
+        out[i] = work[X0 + i] + c00 * xi0
+        out[LANES + i] = work[Y0 + i] + c10 * xi0 + c11 * xi1
+        out[2 * LANES + i] = work[T0 + i] + c20 * xi0 + c21 * xi1 + c22 * xi2
+        # P^ = C J^-1 C^T
+        h10, h11 = c10 * i00 + c11 * i01, c10 * i01 + c11 * i11
+        h20, h21, h22 = (
+            c20 * i00 + c21 * i01 + c22 * i02, c20 * i01 + c21 * i11 + c22 * i12, c20 * i02 + c21 * i12 + c22 * i22
+        )
+        out[3 * LANES + i] = c00 * c00 * i00
+        out[4 * LANES + i] = c00 * h10
+        out[5 * LANES + i] = c00 * h20
+        out[6 * LANES + i] = h10 * c10 + h11 * c11
+        out[7 * LANES + i] = h20 * c10 + h21 * c11
+        out[8 * LANES + i] = h20 * c20 + h21 * c21 + h22 * c22
+        n0, n1, n2 = normals[i], normals[LANES + i], normals[2 * LANES + i]
+        l00 = math.sqrt(i00)
+        l10, l20 = i01 / l00, i02 / l00
+        l11 = math.sqrt(i11 - l10 * l10)
+        l21 = (i12 - l20 * l10) / l11
+        l22 = math.sqrt(i22 - l20 * l20 - l21 * l21)
+        xi0 += l00 * n0
+        xi1 += l10 * n0 + l11 * n1
+        xi2 += l20 * n0 + l21 * n1 + l22 * n2
+        theta = work[T0 + i] + c20 * xi0 + c21 * xi1 + c22 * xi2
+        work[X + i] = work[X0 + i] + c00 * xi0
+        work[Y + i] = work[Y0 + i] + c10 * xi0 + c11 * xi1
+        work[SIN + i], work[COS + i] = _sine_cosine(theta)
+        out[9 * LANES + i] = work[X + i]
+        out[10 * LANES + i] = work[Y + i]
+        out[11 * LANES + i] = _wrap(theta)
+
+
+@lanes
+def _new_landmark(
+    work: FloatArray, tile: FloatArray, points: FloatArray, noises: FloatArray, n: int, given: bool, camera: FloatArray,
+    mask: FloatArray, seen: Int32Array,
+) -> None:
+    """Write mean and covariance of a landmark first seen from a known pose (Algorithm 1, l. 30-31 corrected).
+
+    All lanes of the block are written; `seen` becomes 1 where `mask` is, and 0 elsewhere: those do not hold it.
+    """
+    ahead, left, up = camera[4] + points[n, 0], camera[5] + points[n, 1], camera[6] + points[n, 2]
+    for i in range(LANES):
+        c, s = work[COS + i], work[SIN + i]
+        tile[i] = work[X + i] + c * ahead - s * left
+        tile[LANES + i] = work[Y + i] + s * ahead + c * left
+        tile[2 * LANES + i] = up
+    _innovate(work, tile, points, noises, n, given, camera)
+    for i in range(LANES):  # l. 31 *: G^-1 R G^-T
+        tile[3 * LANES + i] = work[N00 + i]
+        tile[4 * LANES + i] = work[N01 + i]
+        tile[5 * LANES + i] = work[N02 + i]
+        tile[6 * LANES + i] = work[N11 + i]
+        tile[7 * LANES + i] = work[N12 + i]
+        tile[8 * LANES + i] = work[N22 + i]
+    for i in range(len(seen)):
+        seen[i] = np.int32(1) if mask[i] > 0.0 else np.int32(0)
+
+
+# ------------------------------------------------------------------------------------------ where landmarks lie
+
+
+@lanes
+def refresh(
+    slots: IntArray, values: FloatArray, counts: Int32Array, row_of: IntArray, map_of: IntArray, maps: Int32Array,
+    users: IntArray, free_rows: IntArray, tops: IntArray,
+) -> None:
+    """Bring landmarks up to date: copy each particle's values from where its ancestor left them to its own place.
+
+    One free row is needed: the row that a landmark leaves is taken by the next, while it is still in the cache.
+    """
+    padded = counts.shape[1]
+    for k in range(len(slots)):
+        slot = slots[k]
+        e = map_of[slot]
+        if e == 0:
+            continue
+        row = row_of[slot]
+        tops[0] -= 1
+        target = free_rows[tops[0]]
+        whole = values[row * 9 * padded : (row + 1) * 9 * padded]
+        own = maps[e]
+        for block in range(padded // LANES):
+            first = block * LANES
+            out = values[target * 9 * padded + block * TILE : target * 9 * padded + (block + 1) * TILE]
+            stay = 0
+            for i in range(LANES):
+                stay += 1 if own[first + i] == first + i else 0
+            if stay == LANES:
+                source = whole[block * TILE : (block + 1) * TILE]
+                for j in range(TILE):
+                    out[j] = source[j]
+                for i in range(LANES):
+                    counts[target, first + i] = counts[row, first + i]
+            else:
+                for i in range(LANES):
+                    m = np.int64(own[first + i])
+                    at = (m >> SHIFT) * TILE + (m & (LANES - 1))
+                    out[i] = whole[at]
+                    out[LANES + i] = whole[at + LANES]
+                    out[2 * LANES + i] = whole[at + 2 * LANES]
+                    out[3 * LANES + i] = whole[at + 3 * LANES]
+                    out[4 * LANES + i] = whole[at + 4 * LANES]
+                    out[5 * LANES + i] = whole[at + 5 * LANES]
+                    out[6 * LANES + i] = whole[at + 6 * LANES]
+                    out[7 * LANES + i] = whole[at + 7 * LANES]
+                    out[8 * LANES + i] = whole[at + 8 * LANES]
+                    counts[target, first + i] = counts[row, m]
+        free_rows[tops[0]] = row
+        tops[0] += 1
+        row_of[slot] = target
+        users[e] -= 1
+        map_of[slot] = 0
+
+
+@lanes_inlined
+def _tile(values: FloatArray, padded: int, row: int, block: int) -> FloatArray:
+    """Return a block of a landmark that is up to date: a view."""
+    start = row * 9 * padded + block * TILE
+    return values[start : start + TILE]
+
+
+@lanes
+def _mark_held(record: FloatArray, seen: Int32Array) -> None:
+    for i in range(len(seen)):
+        record[Q_HELD + i] = 1.0 if seen[i] > 0 else 0.0
+
+
+@jit
+def _open_slot(
+    b: int, new_slots: IntArray, new_rows: IntArray, row_of: IntArray, map_of: IntArray, counts: Int32Array,
+    free_rows: IntArray, free_slots: IntArray, tops: IntArray,
+) -> None:
+    """Give measurement b a free slot and row for the landmark that it starts in some particles."""
+    tops[0] -= 1
+    tops[1] -= 1
+    new_rows[b] = free_rows[tops[0]]
+    new_slots[b] = free_slots[tops[1]]
+    counts[new_rows[b], :] = 0
+    row_of[new_slots[b]] = new_rows[b]
+    map_of[new_slots[b]] = 0
+
+
+# ------------------------------------------------------------------------------------------------- candidates
+
+
+@jit
+def find_candidates(
+    products: NDArray[np.float32], measured: NDArray[np.float32], stored: NDArray[np.float32],
+    half_norms: NDArray[np.float32], ids: IntArray, names: IntArray, identities: IntArray, named: bool, gate: float,
+) -> tuple[IntArray, IntArray, FloatArray, IntArray, IntArray, IntArray]:
+    """List for each measurement the landmarks that may have caused it, nearest descriptor first.
+
+    Args:
+        products: (B, n) scalar products of measured and stored descriptors: what makes the search one matrix product
+            for all particles. Distances near the gate are computed anew, so that its rounding decides nothing.
         measured: (B, d) descriptors of the frame.
-        stored: (slots, d) descriptors of the landmarks.
+        stored: (n, d) descriptors of the landmarks.
+        half_norms: (n,) half of their squared lengths; infinite where the slot is free.
+        ids: (n,) stable names of the landmarks, -1 = free; equal distances are ordered by them.
+        names: (B,) the caller's names of the measurements, if `named`.
+        identities: (n,) the caller's names of the landmarks.
+        named: Whether names decide instead of descriptors.
         gate: Largest admitted squared distance E0.
-        num_measurements: B.
 
     Returns:
-        starts (B + 1,), slots (q,) and squared distances E (q,); equal distances keep the order of the slots.
+        starts (B + 1,) of each measurement's candidates; per candidate its slot, squared distance E, measurement, and
+        the previous candidate with the same slot (-1: none); and all these slots, each once.
     """
-    starts = np.zeros(num_measurements + 1, dtype=np.int64)
-    out_slots = np.empty(len(rows), dtype=np.int64)
-    out_e = np.empty(len(rows), dtype=np.float64)
-    q = 0
-    p = 0
-    for b in range(num_measurements):
-        starts[b] = q
-        while p < len(rows) and rows[p] == b:
+    num, n = measured.shape[0], len(ids)  # products are looked at where there are measurements and no names
+    starts = np.zeros(num + 1, dtype=np.int64)
+    size = 4 * num + 16
+    slots = np.empty(size, dtype=np.int64)
+    squares = np.empty(size)
+    total = 0
+    for b in range(num):
+        starts[b] = total
+        threshold = np.inf
+        if not named:
+            norm = 0.0
+            for j in range(measured.shape[1]):
+                norm += float(measured[b, j]) * float(measured[b, j])
+            threshold = 0.5 * (norm - gate * 1.001 - 1e-3)
+        for slot in range(n):
+            if named:
+                if identities[slot] != names[b] or ids[slot] < 0:
+                    continue
+            elif products[b, slot] - half_norms[slot] < threshold:
+                continue
             e = 0.0
             for j in range(measured.shape[1]):
-                difference = float(measured[b, j]) - float(stored[slots[p], j])
+                difference = float(measured[b, j]) - float(stored[slot, j])
                 e += difference * difference
-            if e <= gate:
-                at = q
-                while at > starts[b] and out_e[at - 1] > e:
-                    out_e[at] = out_e[at - 1]
-                    out_slots[at] = out_slots[at - 1]
-                    at -= 1
-                out_e[at] = e
-                out_slots[at] = slots[p]
-                q += 1
-            p += 1
-    starts[num_measurements] = q
-    return starts, out_slots[:q], out_e[:q]
+            if e > gate and not named:
+                continue
+            if total == size:
+                size *= 2
+                slots = np.append(slots, np.empty(size - total, dtype=np.int64))
+                squares = np.append(squares, np.empty(size - total))
+            at = total
+            while at > starts[b] and (
+                squares[at - 1] > e or (squares[at - 1] == e and ids[slots[at - 1]] > ids[slot])
+            ):
+                squares[at] = squares[at - 1]
+                slots[at] = slots[at - 1]
+                at -= 1
+            squares[at] = e
+            slots[at] = slot
+            total += 1
+    starts[num] = total
+    owners = np.empty(total, dtype=np.int64)
+    same = np.full(total, REJECTED, dtype=np.int64)
+    unique = np.empty(total, dtype=np.int64)
+    last = np.full(n, REJECTED, dtype=np.int64)
+    count = 0
+    for b in range(num):
+        for q in range(starts[b], starts[b + 1]):
+            owners[q] = b
+            slot = slots[q]
+            same[q] = last[slot]
+            if last[slot] == REJECTED:
+                unique[count] = slot
+                count += 1
+            last[slot] = q
+    return starts, slots[:total], squares[:total], owners, same, unique[:count]
 
 
-@jit
+# --------------------------------------------------------------------------------------------------- proposals
+
+
+@lanes
 def update_fastslam1(
-    poses: FloatArray, landmarks: FloatArray, present: BoolArray, counts: IntArray, points: FloatArray,
-    noises: FloatArray, given: bool, camera: FloatArray, starts: IntArray, slots: IntArray, known: BoolArray,
-    new_slots: IntArray, position_gate: float, log_p0: float, one_to_one: bool,
-    associations: IntArray, distances: FloatArray, log_weights: FloatArray,
+    poses: FloatArray, moved: bool, odometry: FloatArray, sigmas: FloatArray, normals: FloatArray,
+    values: FloatArray, counts: Int32Array, row_of: IntArray, map_of: IntArray, maps: Int32Array, users: IntArray,
+    free_rows: IntArray, free_slots: IntArray, tops: IntArray,
+    points: FloatArray, noises: FloatArray, given: bool, camera: FloatArray,
+    starts: IntArray, slots: IntArray, owners: IntArray, same: IntArray, unique: IntArray,
+    named: bool, position_gate: float, log_p0: float, one_to_one: bool,
+    work: FloatArray, records: FloatArray,
+    found: Int32Array, distances: FloatArray, new_slots: IntArray, log_likelihood: FloatArray,
 ) -> None:
-    """Integrate one robot's frame as in Algorithm 1 (corrected), at poses that are already sampled.
+    """Sample one robot's motion and integrate its frame as in Algorithm 1 (corrected).
 
     Args:
-        poses: (M, 3), sampled from the motion model. Read only.
-        landmarks: (slots, 9, M). Updated in place, as are `present` (slots, M) and `counts` (slots, M).
+        poses: (3, P) rows x, y, theta of the particles, padded to P; replaced by the sampled ones if `moved`.
+        odometry: (3,) u, previous robot frame.
+        sigmas: (3,) standard deviations of u.
+        normals: (M, 3) standard normal draws.
+        values, counts, row_of, map_of, maps, users, free_rows, free_slots, tops: The store, see `ParticleMaps`.
         points: (B, 3) measured points relative to the camera centre, robot axes.
         noises: (B, 6) their covariances in robot axes if `given`.
         given: Whether the covariances come with the measurements.
         camera: (7,) focal, baseline, sigma_px, sigma_disparity, mount.
-        starts, slots: Candidates per measurement, nearest descriptor first.
-        known: (B,) whether the candidate is the landmark by the caller's word, gates aside.
-        new_slots: (B,) a free slot for each measurement.
+        starts, slots, owners, same, unique: Candidates, see `find_candidates`.
+        named: Whether the candidate is the landmark by the caller's word, gates aside.
         position_gate: D0.
         log_p0: Log-density of a measurement that starts a new landmark.
         one_to_one: Whether a landmark is matched at most once in a frame.
-        associations: (B, M), written: the slot, new ones included.
-        distances: (B, M), written: D of matches, NaN otherwise.
-        log_weights: (M,), the frame's log-likelihood is added.
+        work, records: Working space.
+        found: (B, P), written: the slot, new ones included.
+        distances: (B, P), written: D of matches, NaN otherwise.
+        new_slots: (B,), written: the slot of the landmark that a measurement started in some particle, else -1.
+        log_likelihood: (P,), the frame's is added.
     """
-    num_particles = poses.shape[0]
+    num_particles, padded = normals.shape[0], poses.shape[1]
     num = points.shape[0]
-    local = np.empty((1, 9))
-    zero = np.zeros((3, 3))
-    information = np.zeros(6)
-    gradient = np.zeros(3)
-    pose = np.empty(5)
-    for m in range(num_particles):
-        pose[:3] = poses[m]
-        pose[3] = math.cos(pose[2])
-        pose[4] = math.sin(pose[2])
+    refresh(unique, values, counts, row_of, map_of, maps, users, free_rows, tops)
+    new_rows = np.empty(num, dtype=np.int64)
+    match = np.empty((num, LANES))
+    mask = np.empty(LANES)
+    gate = np.inf if named else position_gate
+    for b in range(num):
+        new_slots[b] = REJECTED
+    for block in range(padded // LANES):
+        first = block * LANES
+        real = min(LANES, num_particles - first)
+        if moved:
+            _sample_motion(work, poses, first, real, odometry, sigmas, normals)
+        _enter_pose(work, poses, first)
+        _clear_likelihood(work)
         for b in range(num):
-            match = REJECTED
-            for q in range(starts[b], starts[b + 1]):
-                slot = slots[q]
-                if not present[slot, m]:
-                    continue
-                if one_to_one:
-                    taken = False
-                    for earlier in range(b):
-                        if associations[earlier, m] == slot:
-                            taken = True
-                    if taken:
-                        continue
-                _load(landmarks, slot, m, local, 0)
-                distance, _, _ = _gate(pose, local, 0, points, noises, b, given, camera, zero, zero)
-                if distance <= position_gate or (known[b] and distance < np.inf):
-                    match = slot  # l. 23-24: the nearest descriptor inside the gate
-                    distances[b, m] = distance
-                    break
-            if match == REJECTED:
-                slot = new_slots[b]
-                _new_landmark(pose, local, 0, points, noises, b, given, camera)
-                log_weights[m] += log_p0 + (0.0 if given else 4.0 * math.log(points[b, 0]))  # l. 32
-                present[slot, m] = True
-                counts[slot, m] = 1
-                distances[b, m] = np.nan
-            else:
-                slot = match
-                log_weights[m] += _accumulate(
-                    pose, local, 0, points, noises, b, given, camera, zero, 0.0, information, gradient
-                )  # l. 39, before the update
-                _update_landmark(pose, local, 0, points, noises, b, given, camera, 1)
-                counts[slot, m] += 1
-            _store(landmarks, slot, m, local, 0)
-            associations[b, m] = slot
+            chosen = match[b]
+            for i in range(LANES):
+                chosen[i] = -2.0 if i < real else -1.0
+            for q in range(starts[b], starts[b + 1]):  # l. 15-24: the nearest descriptor inside the gate
+                row = row_of[slots[q]]
+                tile, record, seen = _tile(values, padded, row, block), records[q], counts[row, first : first + LANES]
+                _admit(chosen, seen, mask)
+                p = same[q] if one_to_one else REJECTED
+                while p >= 0:
+                    _bar_taken(match[owners[p]], float(p), mask)
+                    p = same[p]
+                _innovate(work, tile, points, noises, b, given, camera)
+                if _gate_and_update(work, tile, record, mask, gate) > 0:  # l. 33-37
+                    _add_likelihood(work, record, mask)  # l. 39, from before the update
+                    _record_matches(chosen, seen, float(q), mask)
+            log_clutter = log_p0 + (0.0 if given else 4.0 * math.log(points[b, 0]))
+            if _mask_of(chosen, -2.0, mask) > 0:  # l. 28-32
+                if new_slots[b] == REJECTED:
+                    _open_slot(b, new_slots, new_rows, row_of, map_of, counts, free_rows, free_slots, tops)
+                _new_landmark(
+                    work, _tile(values, padded, new_rows[b], block), points, noises, b, given, camera, mask,
+                    counts[new_rows[b], first : first + LANES],
+                )
+                for i in range(LANES):
+                    work[CLUTTER + i] += log_clutter if mask[i] > 0.0 else 0.0
+            _write_found(
+                found[b, first : first + LANES], distances[b, first : first + LANES], chosen, starts[b], starts[b + 1],
+                slots, records, False, new_slots[b],
+            )
+        for i in range(LANES):
+            log_likelihood[first + i] += _log_likelihood(work, i)
 
 
-@jit
-def _is_lost(
-    start: FloatArray, local: FloatArray, held: BoolArray, points: FloatArray, noises: FloatArray, given: bool,
-    camera: FloatArray, factor: FloatArray, identity: FloatArray, starts: IntArray, costs: FloatArray,
-    position_gate: float, ambiguity: float,
-) -> bool:
-    """Tell whether at least three, and most, of the measurements with one look-alike contradict the predicted pose."""
-    sure = 0
-    contradict = 0
-    for b in range(points.shape[0]):
-        first, second = REJECTED, REJECTED
-        for q in range(starts[b], starts[b + 1]):
-            if held[q] and first == REJECTED:
-                first = q
-            elif held[q] and second == REJECTED:
-                second = q
-        if first == REJECTED or (second != REJECTED and costs[second] - costs[first] < ambiguity):
-            continue
-        distance, _, _ = _gate(start, local, first, points, noises, b, given, camera, factor, identity)
-        sure += 1
-        if distance > position_gate:
-            contradict += 1
-    return contradict >= MIN_CONTRADICTIONS and 2 * contradict > sure
+@lanes
+def _admit(chosen: FloatArray, seen: Int32Array, mask: FloatArray) -> None:
+    """Write 1 where the measurement is still without a match and the particle holds the candidate."""
+    for i in range(len(chosen)):
+        mask[i] = 1.0 if chosen[i] == -2.0 and seen[i] > 0 else 0.0
 
 
-@jit
+@lanes
+def _bar_taken(earlier: FloatArray, p: float, mask: FloatArray) -> None:
+    for i in range(len(earlier)):
+        mask[i] = 0.0 if earlier[i] == p else mask[i]
+
+
+@lanes
+def _record_matches(chosen: FloatArray, seen: Int32Array, q: float, mask: FloatArray) -> None:
+    for i in range(len(chosen)):
+        on = mask[i] > 0.0
+        chosen[i] = q if on else chosen[i]
+        seen[i] += np.int32(1) if on else np.int32(0)
+
+
+@lanes
+def _count_matches(seen: Int32Array, mask: FloatArray) -> None:
+    for i in range(len(seen)):
+        seen[i] += np.int32(1) if mask[i] > 0.0 else np.int32(0)
+
+
+@lanes
+def _write_found(
+    found: Int32Array, distances: FloatArray, chosen: FloatArray, low: int, high: int, slots: IntArray,
+    records: FloatArray, first_pass: bool, new_slot: int,
+) -> None:
+    """Write the slot (or -1) and the squared distance (or NaN) of one measurement, that of pass A if `first_pass`."""
+    if low == high:
+        for i in range(len(found)):
+            found[i] = new_slot if chosen[i] == -2.0 else REJECTED
+            distances[i] = np.nan
+        return
+    for q in range(low, high):
+        record, slot, code, begin = records[q], slots[q], float(q), q == low
+        for i in range(len(found)):
+            on = chosen[i] == code
+            distance = record[Q_FIRST_D + i] if first_pass else record[Q_D + i]
+            found[i] = slot if on else ((new_slot if chosen[i] == -2.0 else REJECTED) if begin else found[i])
+            distances[i] = distance if on else (np.nan if begin else distances[i])
+
+
+@lanes
+def _enter_pose(work: FloatArray, poses: FloatArray, first: int) -> None:
+    for i in range(LANES):
+        work[X + i] = poses[0, first + i]
+        work[Y + i] = poses[1, first + i]
+        work[T + i] = poses[2, first + i]
+    for i in range(LANES):
+        work[SIN + i], work[COS + i] = _sine_cosine(work[T + i])
+
+
+@lanes
+def _sample_motion(
+    work: FloatArray, poses: FloatArray, first: int, real: int, odometry: FloatArray, sigmas: FloatArray,
+    normals: FloatArray,
+) -> None:
+    """Replace poses by draws from p(x_t | x_{t-1}, u_t), each particle from its own past (Eq. 4)."""
+    _enter_pose(work, poses, first)
+    for i in range(real):
+        dx = odometry[0] + normals[first + i, 0] * sigmas[0]
+        dy = odometry[1] + normals[first + i, 1] * sigmas[1]
+        c, s = work[COS + i], work[SIN + i]
+        poses[0, first + i] += c * dx - s * dy
+        poses[1, first + i] += s * dx + c * dy
+        poses[2, first + i] = _wrap(work[T + i] + odometry[2] + normals[first + i, 2] * sigmas[2])
+
+
+@lanes
+def move_blind(
+    poses: FloatArray, means: FloatArray, covariances: FloatArray, blind: bool, odometry: FloatArray,
+    sigmas: FloatArray, normals: FloatArray, work: FloatArray,
+) -> None:
+    """Move a robot that sees nothing: each particle's N(x^, P^) is propagated, and its sample moves by itself.
+
+    Args:
+        poses: (3, P) the samples; replaced.
+        means, covariances: (3, P), (6, P) N(x^, P^), written; read if `blind`, else particles start from their samples.
+        odometry, sigmas, normals: As in `update_fastslam1`.
+        work: Working space.
+    """
+    num_particles = normals.shape[0]
+    mean = np.empty(3 * LANES)
+    covariance = np.empty(6 * LANES)
+    for block in range(poses.shape[1] // LANES):
+        first = block * LANES
+        real = min(LANES, num_particles - first)
+        _prior(poses, means, covariances, blind, first, mean, covariance)
+        _predict(work, mean, covariance, odometry, sigmas)
+        for i in range(LANES):
+            means[0, first + i], means[1, first + i], means[2, first + i] = work[X0 + i], work[Y0 + i], work[T0 + i]
+            covariances[0, first + i], covariances[1, first + i] = work[N00 + i], work[N01 + i]
+            covariances[2, first + i], covariances[3, first + i] = work[N02 + i], work[N11 + i]
+            covariances[4, first + i], covariances[5, first + i] = work[N12 + i], work[N22 + i]
+        _sample_motion(work, poses, first, real, odometry, sigmas, normals)
+
+
+@lanes
+def _prior(
+    poses: FloatArray, means: FloatArray, covariances: FloatArray, blind: bool, first: int, mean: FloatArray,
+    covariance: FloatArray,
+) -> None:
+    """Fetch a block's poses before the motion: N(x^, P^) where the robot is blind, else the samples, exact."""
+    for i in range(LANES):
+        for c in range(3):
+            mean[c * LANES + i] = means[c, first + i] if blind else poses[c, first + i]
+        for c in range(6):
+            covariance[c * LANES + i] = covariances[c, first + i] if blind else 0.0
+
+
+@lanes
 def update_fastslam2(
-    poses: FloatArray, odometry: FloatArray, sigmas: FloatArray, normals: FloatArray,
-    landmarks: FloatArray, present: BoolArray, counts: IntArray, points: FloatArray, noises: FloatArray, given: bool,
-    camera: FloatArray, starts: IntArray, slots: IntArray, costs: FloatArray, known: BoolArray, new_slots: IntArray,
-    position_gate: float, dead_zone: float, dead_radius: float, ambiguity: float, recovery: FloatArray, log_p0: float,
-    associations: IntArray, distances: FloatArray, log_weights: FloatArray,
-    pose_means: FloatArray, pose_covariances: FloatArray,
+    poses: FloatArray, means: FloatArray, covariances: FloatArray, blind: bool,
+    odometry: FloatArray, sigmas: FloatArray, normals: FloatArray,
+    values: FloatArray, counts: Int32Array, row_of: IntArray, map_of: IntArray, maps: Int32Array, users: IntArray,
+    free_rows: IntArray, free_slots: IntArray, tops: IntArray,
+    points: FloatArray, noises: FloatArray, given: bool, camera: FloatArray,
+    starts: IntArray, slots: IntArray, looks: FloatArray, owners: IntArray, same: IntArray,
+    unique: IntArray, named: bool, position_gate: float, dead_zone: float, dead_radius: float, ambiguity: float,
+    recovery: FloatArray, log_p0: float, one_to_one: bool,
+    work: FloatArray, records: FloatArray,
+    found: Int32Array, distances: FloatArray, new_slots: IntArray, log_likelihood: FloatArray,
 ) -> None:
     """Integrate one robot's motion and frame, the measurements shaping the sampled pose (FastSLAM 2.0, Laplace form).
 
-    The pose is x0 + C xi, x0 = x_{t-1} composed with u, C C^T the covariance of the motion, xi ~ N(0, I): nothing is
-    inverted, so a motion without noise needs no special case. Association takes two passes: unambiguous candidates
-    first refine the pose robustly, then all decisions are taken at the refined pose. A particle filter forgets how
-    wrong its pose may be; where most of the measurements with one look-alike in the map contradict the predicted pose,
-    its stated uncertainty is not believed, and a wide one takes its place.
+    Association takes two passes: unambiguous candidates first refine the pose robustly, then all decisions are taken at
+    the refined pose. A particle filter forgets how wrong its pose may be; where most of the measurements with one
+    look-alike in the map contradict the predicted pose, its stated uncertainty is not believed, and a wide one takes
+    its place. Written out, step by step, in `slam_backend.plain`.
 
     Args:
-        poses: (M, 3), poses before the motion; replaced by the sampled ones.
-        odometry: (3,) u, previous robot frame.
-        sigmas: (3,) standard deviations of u.
-        normals: (M, 3) standard normal draws.
-        costs: (q,) what each candidate's descriptor adds to its cost.
+        poses: (3, P), the samples before the motion; replaced by the sampled ones.
+        means, covariances: (3, P), (6, P), written: N(x^, P^) of each particle before sampling; read if `blind`.
+        blind: Whether the robot has not been sampled at a sighting since N(x^, P^) was propagated.
+        looks: (q,) what each candidate's descriptor adds to its cost.
         dead_zone: Between `position_gate` and this D a measurement is neither matched nor new.
         dead_radius: Nor is it new this near to a landmark that looks like it [m].
         ambiguity: A runner-up within this cost makes a measurement ambiguous: it is held back.
         recovery: (3,) standard deviations of the pose [m, m, rad] where most matches contradict it; zeros: never.
-        pose_means, pose_covariances: (M, 3), (M, 3, 3), written: N(x^, P^) of each particle before sampling.
-        landmarks, present, counts, points, noises, given, camera, starts, slots, known, new_slots, position_gate,
-        log_p0, associations, distances, log_weights: As in `update_fastslam1`; rejected measurements get -1.
+        The others are as in `update_fastslam1`; rejected measurements are found at -1.
     """
-    num_particles = poses.shape[0]
-    num = points.shape[0]
-    total = len(slots)
-    local = np.empty((total + 1, 9))  # the particle's own candidates, and room for a new landmark
-    held = np.empty(total, dtype=np.bool_)
-    tentative = np.empty(num, dtype=np.int64)
-    matches = np.empty(num, dtype=np.int64)
-    factor = np.zeros((3, 3))
-    identity = np.eye(3)
-    spread = np.empty((3, 3))
-    start = np.empty(5)
-    pose = np.empty(5)
-    xi = np.empty(3)
-    half = np.empty((3, 3))
-    information = np.empty(6)
-    gradient = np.empty(3)
-    for m in range(num_particles):
-        c = math.cos(poses[m, 2])
-        s = math.sin(poses[m, 2])
-        start[0] = poses[m, 0] + c * odometry[0] - s * odometry[1]
-        start[1] = poses[m, 1] + s * odometry[0] + c * odometry[1]
-        start[2] = poses[m, 2] + odometry[2]
-        start[3] = math.cos(start[2])
-        start[4] = math.sin(start[2])
-        factor[:] = 0.0
-        factor[0, 0], factor[0, 1] = c * sigmas[0], -s * sigmas[1]
-        factor[1, 0], factor[1, 1] = s * sigmas[0], c * sigmas[1]
-        factor[2, 2] = sigmas[2]
-        for q in range(total):
-            held[q] = present[slots[q], m]
-            if held[q]:
-                _load(landmarks, slots[q], m, local, q)
-
-        lost = recovery[0] > 0.0 and _is_lost(
-            start, local, held, points, noises, given, camera, factor, identity, starts, costs, position_gate, ambiguity
-        )
-        if lost:
-            factor[:] = 0.0
-            factor[0, 0], factor[1, 1], factor[2, 2] = recovery[0], recovery[1], recovery[2]
+    num_particles, padded = normals.shape[0], poses.shape[1]
+    num, total = points.shape[0], len(slots)
+    refresh(unique, values, counts, row_of, map_of, maps, users, free_rows, tops)
+    new_rows = np.empty(num, dtype=np.int64)
+    log_clutter = np.empty(num)
+    match = np.empty((num, LANES))
+    mask = np.empty(LANES)
+    mean, covariance, draws, out = np.empty(3 * LANES), np.empty(6 * LANES), np.zeros(3 * LANES), np.empty(12 * LANES)
+    for b in range(num):
+        new_slots[b] = REJECTED
+        log_clutter[b] = log_p0 + (0.0 if given else 4.0 * math.log(points[b, 0]))
+    for block in range(padded // LANES):
+        first = block * LANES
+        real = min(LANES, num_particles - first)
+        _prior(poses, means, covariances, blind, first, mean, covariance)
+        for i in range(real):
+            for c in range(3):
+                draws[c * LANES + i] = normals[first + i, c]
+        _predict(work, mean, covariance, odometry, sigmas)
+        _begin_pose(work)
+        _place(work)
+        _clear_likelihood(work)
 
         # Pass A: refine the pose with what is beyond doubt.
+        for q in range(total):
+            row = row_of[slots[q]]
+            tile = _tile(values, padded, row, block)
+            _mark_held(records[q], counts[row, first : first + LANES])
+            _innovate(work, tile, points, noises, owners[q], given, camera)
+            _evaluate(work, tile, records[q])
+        if recovery[0] > 0.0:
+            for b in range(num):
+                if starts[b + 1] - starts[b] == 1:
+                    _judge_alone(work, records[starts[b]], position_gate)
+                elif starts[b + 1] > starts[b]:
+                    _begin_choice(work)
+                    for q in range(starts[b], starts[b + 1]):
+                        _look_alikes(work, records[q], looks[q], ambiguity)
+                    _count_contradictions(work, position_gate)
+            if _widen_lost(work, recovery) > 0:
+                for q in range(total):
+                    tile = _tile(values, padded, row_of[slots[q]], block)
+                    _innovate(work, tile, points, noises, owners[q], given, camera)
+                    _evaluate(work, tile, records[q])
+        _clear_sums(work)
         for b in range(num):
-            best, runner_up, chosen = np.inf, np.inf, REJECTED
-            for q in range(starts[b], starts[b + 1]):
-                if not held[q]:
-                    continue
-                distance, log_det, _ = _gate(start, local, q, points, noises, b, given, camera, factor, identity)
-                if distance <= position_gate or (known[b] and distance < np.inf):
-                    cost = distance + log_det + costs[q]
-                    if cost < best:
-                        best, runner_up, chosen = cost, best, q
-                    elif cost < runner_up:
-                        runner_up = cost
-            tentative[b] = chosen if runner_up - best >= ambiguity or runner_up == np.inf else REJECTED
-            if tentative[b] >= 0:
-                for earlier in range(b):
-                    if tentative[earlier] >= 0 and slots[tentative[earlier]] == slots[chosen]:
-                        tentative[b] = REJECTED
-        xi[:] = 0.0
-        for _ in range(2 if lost else 1):  # a wide prior is a long way for two iterations
-            _refine(
-                start, factor, tentative, local, points, noises, given, camera, position_gate, xi, pose, spread,
-                information, gradient,
-            )
+            low, high = starts[b], starts[b + 1]
+            if high - low == 1 and (same[low] < 0 or not one_to_one):
+                if _match_alone(records[low], match[b], float(low), named, position_gate, mask) > 0:
+                    _sum_matches(work, records[low], mask)
+            else:
+                _begin_choice(work)
+                for q in range(low, high):
+                    _consider(work, records[q], float(q), looks[q], named, position_gate)
+                _end_choice(work, match[b], ambiguity)
+                for q in range(low, high):
+                    p = same[q] if one_to_one else REJECTED
+                    while p >= 0:
+                        _drop_taken(match[b], float(q), match[owners[p]], float(p))
+                        p = same[p]
+                    if _robust_weights(records[q], match[b], float(q), position_gate, mask) > 0:
+                        _sum_matches(work, records[q], mask)
+            for q in range(low, high):
+                _keep_distance(records[q])
+        _step_pose(work, False)
+        if _any_wide(work) > 0:  # a wide prior is a long way for one iteration
+            for _ in range(3):
+                _place(work)
+                _clear_sums(work)
+                for b in range(num):
+                    for q in range(starts[b], starts[b + 1]):
+                        if _mask_of(match[b], float(q), mask) > 0:
+                            tile = _tile(values, padded, row_of[slots[q]], block)
+                            _innovate(work, tile, points, noises, b, given, camera)
+                            _evaluate(work, tile, records[q])
+                            _robust_weights(records[q], match[b], float(q), position_gate, mask)
+                            _sum_matches(work, records[q], mask)
+                _step_pose(work, True)
+        _log_information(work)
+        _place(work)
 
         # Pass B: decide at the refined pose.
-        clutter = 0.0
+        for q in range(total):
+            tile = _tile(values, padded, row_of[slots[q]], block)
+            _innovate(work, tile, points, noises, owners[q], given, camera)
+            _evaluate(work, tile, records[q])
+        _clear_sums(work)
         for b in range(num):
-            best, runner_up, dead, chosen, log_best = np.inf, np.inf, False, REJECTED, 0.0
-            for q in range(starts[b], starts[b + 1]):
-                if not held[q]:
-                    continue
-                distance, log_det, metres = _gate(pose, local, q, points, noises, b, given, camera, factor, spread)
-                if known[b] and distance < np.inf:
-                    distance = min(distance, position_gate)
-                dead = dead or distance <= dead_zone or metres <= dead_radius
-                if distance > position_gate:
-                    continue
-                taken = False
-                for earlier in range(b):
-                    if matches[earlier] >= 0 and slots[matches[earlier]] == slots[q]:
-                        taken = True
+            low, high = starts[b], starts[b + 1]
+            if high - low == 1:
+                p = same[low] if one_to_one else REJECTED
+                taken = p >= 0
                 if taken:
-                    continue
-                cost = distance + log_det + costs[q]
-                if cost < best:
-                    best, runner_up, chosen = cost, best, q
-                    log_best = -0.5 * (distance + log_det + 3.0 * LOG_2PI)
-                elif cost < runner_up:
-                    runner_up = cost
-            matches[b] = REJECTED
-            log_clutter = log_p0 + (0.0 if given else 4.0 * math.log(points[b, 0]))
-            if chosen >= 0:
-                if runner_up - best < ambiguity:
-                    associations[b, m] = REJECTED  # held back; its likelihood is that of the better candidate
-                    clutter += log_best
-                else:
-                    matches[b] = chosen
-                    associations[b, m] = slots[chosen]
-            elif dead:
-                associations[b, m] = REJECTED
-                clutter += log_clutter
+                    _clear_taken(work)
+                while p >= 0:
+                    _mark_taken(work, match[owners[p]], float(p))
+                    p = same[p]
+                matched = _decide_alone(
+                    work, records[low], match[b], float(low), named, taken,
+                    position_gate, dead_zone, dead_radius, log_clutter[b], mask,
+                )
+                if matched > 0:
+                    _sum_matches(work, records[low], mask)
+                    _add_likelihood(work, records[low], mask)
             else:
-                associations[b, m] = new_slots[b]
-                clutter += log_clutter
-            distances[b, m] = np.nan
-            if matches[b] >= 0:
-                distances[b, m] = _gate(
-                    start, local, matches[b], points, noises, b, given, camera, factor, identity
-                )[0]
+                _begin_choice(work)
+                for q in range(low, high):
+                    _clear_taken(work)
+                    p = same[q] if one_to_one else REJECTED
+                    while p >= 0:
+                        _mark_taken(work, match[owners[p]], float(p))
+                        p = same[p]
+                    _consider_again(
+                        work, records[q], float(q), looks[q], named, position_gate, dead_zone, dead_radius
+                    )
+                _decide(work, match[b], ambiguity, log_clutter[b])
+                for q in range(low, high):
+                    if _mask_of(match[b], float(q), mask) > 0:
+                        _sum_matches(work, records[q], mask)
+                        _add_likelihood(work, records[q], mask)
+            for i in range(real, LANES):  # surplus lanes of the last block start no landmark
+                match[b, i] = -1.0
 
         # The pose: N(x^, P^) from all matches; weigh by the predictive likelihood; sample once.
-        log_weights[m] += clutter + _refine(
-            start, factor, matches, local, points, noises, given, camera, 0.0, xi, pose, spread, information, gradient
-        )
-        for i in range(3):
-            pose_means[m, i] = pose[i]
-            for j in range(3):
-                half[i, j] = factor[i, 0] * spread[0, j] + factor[i, 1] * spread[1, j] + factor[i, 2] * spread[2, j]
-        for i in range(3):
-            for j in range(3):
-                pose_covariances[m, i, j] = (
-                    half[i, 0] * factor[j, 0] + half[i, 1] * factor[j, 1] + half[i, 2] * factor[j, 2]
-                )
-        # Lower Cholesky factor of L^-1, in place of a library call on 3 x 3.
-        l00 = math.sqrt(spread[0, 0])
-        l10 = spread[1, 0] / l00
-        l20 = spread[2, 0] / l00
-        l11 = math.sqrt(spread[1, 1] - l10 * l10)
-        l21 = (spread[2, 1] - l20 * l10) / l11
-        l22 = math.sqrt(spread[2, 2] - l20 * l20 - l21 * l21)
-        xi[0] += l00 * normals[m, 0]
-        xi[1] += l10 * normals[m, 0] + l11 * normals[m, 1]
-        xi[2] += l20 * normals[m, 0] + l21 * normals[m, 1] + l22 * normals[m, 2]
-        _place(start, factor, xi, pose)
-        poses[m, 0], poses[m, 1] = pose[0], pose[1]
-        poses[m, 2] = (pose[2] + math.pi) % (2.0 * math.pi) - math.pi
+        _posterior(work, draws, log_likelihood[first : first + LANES], out)
+        for i in range(LANES):
+            for c in range(3):
+                means[c, first + i] = out[c * LANES + i]
+                poses[c, first + i] = out[(9 + c) * LANES + i]
+            for c in range(6):
+                covariances[c, first + i] = out[(3 + c) * LANES + i]
 
         # The landmarks, at the sampled pose.
         for b in range(num):
-            slot = associations[b, m]
-            if matches[b] >= 0:
-                _update_landmark(pose, local, matches[b], points, noises, b, given, camera, 2)
-                counts[slot, m] += 1
-                _store(landmarks, slot, m, local, matches[b])
-            elif slot >= 0:
-                _new_landmark(pose, local, total, points, noises, b, given, camera)
-                present[slot, m] = True
-                counts[slot, m] = 1
-                _store(landmarks, slot, m, local, total)
+            for q in range(starts[b], starts[b + 1]):
+                if _mask_of(match[b], float(q), mask) > 0:
+                    row = row_of[slots[q]]
+                    tile = _tile(values, padded, row, block)
+                    _count_matches(counts[row, first : first + LANES], mask)
+                    _innovate(work, tile, points, noises, b, given, camera)
+                    _gate_and_update(work, tile, records[q], mask, np.inf)
+            if _mask_of(match[b], -2.0, mask) > 0:
+                if new_slots[b] == REJECTED:
+                    _open_slot(b, new_slots, new_rows, row_of, map_of, counts, free_rows, free_slots, tops)
+                _new_landmark(
+                    work, _tile(values, padded, new_rows[b], block), points, noises, b, given, camera, mask,
+                    counts[new_rows[b], first : first + LANES],
+                )
+            _write_found(
+                found[b, first : first + LANES], distances[b, first : first + LANES], match[b], starts[b],
+                starts[b + 1], slots, records, True, new_slots[b],
+            )
+
+
+@lanes
+def _keep_distance(record: FloatArray) -> None:
+    """Keep the squared distance at the predicted pose: it is the NIS."""
+    for i in range(LANES):
+        record[Q_FIRST_D + i] = record[Q_D + i]
+
+
+@lanes
+def _any_wide(work: FloatArray) -> int:
+    count = 0
+    for i in range(LANES):
+        count += 1 if work[WIDE + i] > 0.0 else 0
+    return count
+
+
+# -------------------------------------------------------------------------------------- weights and estimates
+
+
+@jit
+def weigh(
+    log_likelihood: FloatArray, log_weights: FloatArray, path_log_weights: FloatArray, weights: FloatArray
+) -> float:
+    """Add a step's log-likelihood to the log-weights (M,) and normalise (Eqs. 3, 11, 12; Algorithm 1, l. 9).
+
+    Args:
+        log_likelihood: (P,), read up to M.
+        log_weights, path_log_weights: (M,), updated.
+        weights: (M,), written: they sum to 1.
+
+    Returns:
+        The effective sample size.
+    """
+    m = len(log_weights)
+    largest = -np.inf
+    for i in range(m):
+        path_log_weights[i] += log_likelihood[i]
+        log_weights[i] += log_likelihood[i]
+        largest = max(largest, log_weights[i])
+    total = 0.0
+    for i in range(m):
+        weights[i] = math.exp(log_weights[i] - largest)
+        total += weights[i]
+    shift = largest + math.log(total)
+    squares = 0.0
+    for i in range(m):
+        log_weights[i] -= shift
+        weights[i] /= total
+        squares += weights[i] * weights[i]
+    return 1.0 / squares
+
+
+@lanes
+def mixture(means: FloatArray, covariances: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return mean (3,) and covariance (3, 3) of a weighted mixture of Gaussian poses.
+
+    Args:
+        means: (3, P), headings averaged on the circle.
+        covariances: (6, P), upper triangles.
+        weights: (M,), summing to 1.
+    """
+    m = len(weights)
+    sums = np.zeros((4, LANES))
+    w = np.empty(LANES)
+    for first in range(0, m, LANES):
+        real = min(LANES, m - first)
+        for i in range(LANES):
+            w[i] = weights[first + i] if i < real else 0.0
+        for i in range(LANES):
+            sine, cosine = _sine_cosine(means[2, first + i])
+            sums[0, i] += w[i] * means[0, first + i]
+            sums[1, i] += w[i] * means[1, first + i]
+            sums[2, i] += w[i] * sine
+            sums[3, i] += w[i] * cosine
+    mean = np.array([sums[0].sum(), sums[1].sum(), math.atan2(sums[2].sum(), sums[3].sum())])
+    mean[2] = _wrap(mean[2])
+    spread = np.zeros((6, LANES))
+    for first in range(0, m, LANES):
+        real = min(LANES, m - first)
+        for i in range(LANES):
+            w[i] = weights[first + i] if i < real else 0.0
+        for i in range(LANES):
+            x, y = means[0, first + i] - mean[0], means[1, first + i] - mean[1]
+            t = _wrap(means[2, first + i] - mean[2])
+            spread[0, i] += w[i] * (x * x + covariances[0, first + i])
+            spread[1, i] += w[i] * (x * y + covariances[1, first + i])
+            spread[2, i] += w[i] * (x * t + covariances[2, first + i])
+            spread[3, i] += w[i] * (y * y + covariances[3, first + i])
+            spread[4, i] += w[i] * (y * t + covariances[4, first + i])
+            spread[5, i] += w[i] * (t * t + covariances[5, first + i])
+    covariance = np.empty((3, 3))
+    covariance[0, 0] = spread[0].sum()
+    covariance[0, 1] = covariance[1, 0] = spread[1].sum()
+    covariance[0, 2] = covariance[2, 0] = spread[2].sum()
+    covariance[1, 1] = spread[3].sum()
+    covariance[1, 2] = covariance[2, 1] = spread[4].sum()
+    covariance[2, 2] = spread[5].sum()
+    return mean, covariance
+
+
+@jit
+def name_new(
+    new_slots: IntArray, measured: NDArray[np.float32], names: IntArray, named: bool, ids: IntArray,
+    identities: IntArray, stored: NDArray[np.float32], half_norms: NDArray[np.float32], tops: IntArray,
+) -> None:
+    """Give the landmarks that a frame has started their lasting names `tops[2]`, ..., in the order of measurements.
+
+    Args:
+        new_slots: (B,) slot of the landmark that each measurement started, -1 = none.
+        measured: (B, d) descriptors; a landmark takes that of its first measurement.
+        names: (B,) the caller's names, if `named`.
+        ids, identities, stored, half_norms, tops: The store, see `ParticleMaps`.
+    """
+    for b in range(len(new_slots)):
+        slot = new_slots[b]
+        if slot < 0:
+            continue
+        ids[slot] = tops[2]
+        tops[2] += 1
+        identities[slot] = names[b] if named else -1
+        norm = 0.0
+        for j in range(measured.shape[1]):
+            stored[slot, j] = measured[b, j]
+            norm += float(measured[b, j]) * float(measured[b, j])
+        half_norms[slot] = 0.5 * norm
+
+
+@jit
+def summarise(
+    found: Int32Array, distances: FloatArray, new_slots: IntArray, keep: IntArray, size: int, best: int, ids: IntArray
+) -> tuple[IntArray, IntArray, int, int, int, float]:
+    """Tell what became of one robot's measurements.
+
+    Args:
+        found: (n, P) slots to which the particles gave the used measurements, -1 = rejected.
+        distances: (n, P) squared distances of matches.
+        new_slots: (n,) slots of the landmarks that were started, -1 = none.
+        keep: (n,) which of the caller's measurements were used.
+        size: How many the caller gave.
+        best: The most probable particle.
+        ids: (slots,) stable names.
+
+    Returns:
+        The id to which the most probable particle gave each measurement (size,), -1 = rejected; the id of the landmark
+        that it created in any particle (size,), -1 = none; how many the most probable particle started, matched and
+        rejected; and its sum of squared distances.
+    """
+    associations = np.full(size, REJECTED, dtype=np.int64)
+    created = np.full(size, REJECTED, dtype=np.int64)
+    num_new, num_matched, squares = 0, 0, 0.0
+    for b in range(len(keep)):
+        slot = found[b, best]
+        if new_slots[b] >= 0:
+            created[keep[b]] = ids[new_slots[b]]
+        if slot < 0:
+            continue
+        associations[keep[b]] = ids[slot]
+        if slot == new_slots[b]:
+            num_new += 1
+        else:
+            num_matched += 1
+            squares += distances[b, best]
+    return associations, created, num_new, num_matched, size - num_new - num_matched, squares
+
+
+# ------------------------------------------------------------------------------------------- lazy resampling
+
+
+@jit
+def settle(ancestors: IntArray, count: int) -> tuple[IntArray, IntArray]:
+    """Arrange resampled particles so that most stay in place.
+
+    A particle with at least one copy keeps its place; surplus copies fill the places of the dead, in ascending order.
+
+    Args:
+        ancestors: (count,) index of each new particle's parent, ascending.
+        count: M.
+
+    Returns:
+        The places that change and, for each, the particle that is copied into it.
+    """
+    copies = np.zeros(count, dtype=np.int64)
+    for i in range(count):
+        copies[ancestors[i]] += 1
+    targets = np.empty(count, dtype=np.int64)
+    sources = np.empty(count, dtype=np.int64)
+    moves, place = 0, 0
+    for parent in range(count):
+        for _ in range(copies[parent] - 1):
+            while copies[place] > 0:
+                place += 1
+            targets[moves] = place
+            sources[moves] = parent
+            moves += 1
+            place += 1
+    return targets[:moves], sources[:moves]
+
+
+@jit
+def copy_particles(
+    poses: FloatArray, starts: FloatArray, means: FloatArray, covariances: FloatArray, path_log_weights: FloatArray,
+    targets: IntArray, sources: IntArray,
+) -> None:
+    """Copy what particles hold beside their maps onto others, in place; no target is a source."""
+    for i in range(len(targets)):
+        target, source = targets[i], sources[i]
+        path_log_weights[target] = path_log_weights[source]
+        for robot in range(poses.shape[0]):
+            for c in range(3):
+                poses[robot, c, target] = poses[robot, c, source]
+                starts[robot, c, target] = starts[robot, c, source]
+                means[robot, c, target] = means[robot, c, source]
+            for c in range(6):
+                covariances[robot, c, target] = covariances[robot, c, source]
+
+
+@jit
+def release(
+    slot: int, ids: IntArray, row_of: IntArray, map_of: IntArray, users: IntArray, half_norms: NDArray[np.float32],
+    free_rows: IntArray, free_slots: IntArray, tops: IntArray,
+) -> None:
+    """Give back a slot that no particle holds."""
+    ids[slot] = -1
+    half_norms[slot] = np.inf
+    if map_of[slot] > 0:
+        users[map_of[slot]] -= 1
+        map_of[slot] = 0
+    free_rows[tops[0]] = row_of[slot]
+    free_slots[tops[1]] = slot
+    tops[0] += 1
+    tops[1] += 1
+
+
+@jit
+def compose_maps(
+    targets: IntArray, sources: IntArray, maps: Int32Array, users: IntArray, map_of: IntArray, ids: IntArray,
+    row_of: IntArray, counts: Int32Array, half_norms: NDArray[np.float32], free_rows: IntArray, free_slots: IntArray,
+    tops: IntArray, num_particles: int,
+) -> None:
+    """Let the landmarks of all particles follow a resampling without moving them, and free what no survivor holds.
+
+    Landmarks that were up to date get one new ancestor map, the others' maps are composed with it.
+    """
+    moved = len(targets) > 0
+    for e in range(1, len(users)):
+        if users[e] > 0:
+            for i in range(len(targets)):
+                maps[e, targets[i]] = maps[e, sources[i]]
+    fresh = 0
+    for slot in range(len(ids)):
+        if ids[slot] < 0:
+            continue
+        if moved and map_of[slot] == 0:
+            if fresh == 0:
+                fresh = 1
+                while users[fresh] > 0:
+                    fresh += 1
+                for m in range(maps.shape[1]):
+                    maps[fresh, m] = m
+                for i in range(len(targets)):
+                    maps[fresh, targets[i]] = sources[i]
+            map_of[slot] = fresh
+            users[fresh] += 1
+        e = map_of[slot]
+        row = row_of[slot]
+        alive = False
+        for m in range(num_particles):
+            if counts[row, maps[e, m] if e > 0 else m] > 0:
+                alive = True
+                break
+        if not alive:
+            release(slot, ids, row_of, map_of, users, half_norms, free_rows, free_slots, tops)

@@ -17,13 +17,15 @@ scaled by it (the Birge ratio): the joint filter starts with uncertainties that 
 
 import math
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from slam_backend._frame_buffers import UPPER
 from slam_backend.alignment import Alignment
 from slam_backend.errors import BoolArray, FloatArray, IntArray
-from slam_backend.filter import UNPACK, UPPER, FastSlam
+from slam_backend.filter import UNPACK, FastSlam
 from slam_backend.fusion import fuse_descriptors, fuse_landmarks
 from slam_backend.geometry import compose, inverse, rotation
 from slam_backend.resampling import systematic
@@ -62,12 +64,12 @@ def merge_filters(
         (id in b, id in the joint map) of all of b's landmarks.
     """
     count = max(a.num_particles, b.num_particles)
-    slots_a, slots_b = np.flatnonzero(a._ids >= 0), np.flatnonzero(b._ids >= 0)
-    shared_a, shared_b = _slots_of(a._ids, pairs[:, 0]), _slots_of(b._ids, pairs[:, 1])
+    dense_a, dense_b = _Dense.of(a), _Dense.of(b)
+    shared_a, shared_b = np.searchsorted(dense_a.ids, pairs[:, 0]), np.searchsorted(dense_b.ids, pairs[:, 1])
     from_a = systematic(a.weights, rng, CANDIDATES * count)
     from_b = rng.permutation(systematic(b.weights, rng, CANDIDATES * count))
     motions, informations, chi2, log_dets, shared = _align_pairs(
-        a._landmarks[shared_a], a._present[shared_a], b._landmarks[shared_b], b._present[shared_b],
+        dense_a.values[shared_a], dense_a.counts[shared_a] > 0, dense_b.values[shared_b], dense_b.counts[shared_b] > 0,
         from_a, from_b, alignment.transform,
     )
     scale = _contradiction(chi2, shared)
@@ -83,54 +85,73 @@ def merge_filters(
         replace(a.options, num_particles=count),
         np.random.default_rng(rng.integers(2**63, size=4)),
     )
-    moved = {"_poses": b._poses, "_start_poses": b._start_poses, "_pose_means": b._pose_means}
-    for name, poses_b in moved.items():
-        poses_a = np.take(getattr(a, name), from_a, axis=1)
-        setattr(joint, name, np.concatenate([poses_a, compose(motion, poses_b[:, from_b])]))
-    turn = np.zeros((count, 3, 3))
-    turn[:, :2, :2], turn[:, 2, 2] = rotation(motion[:, 2]), 1.0
-    spread_b = turn @ b._pose_covariances[:, from_b] @ turn.transpose(0, 2, 1)
-    joint._pose_covariances = np.concatenate([np.take(a._pose_covariances, from_a, axis=1), spread_b])
-    joint._path_log_weights = a._path_log_weights[from_a] + b._path_log_weights[from_b] + evidence
-    joint._log_weights = np.full(count, -math.log(count))
+    _join_poses(joint, a, from_a, b, from_b, motion)
+    joint._path_log_weights[:] = a._path_log_weights[from_a] + b._path_log_weights[from_b] + evidence
+    joint._blind[:] = np.concatenate([a._blind, b._blind])
 
-    landmarks_a = np.take(a._landmarks[slots_a], from_a, axis=2)
-    landmarks_b = np.take(b._landmarks[slots_b], from_b, axis=2)
-    present_a, present_b = a._present[slots_a][:, from_a], b._present[slots_b][:, from_b]
-    counts_a, counts_b = a._counts[slots_a][:, from_a], b._counts[slots_b][:, from_b]
-    landmarks_a[:, 3:] *= scale
-    landmarks_b[:, 3:] *= scale
-    _move_landmarks(landmarks_b, motion)
-    rows_a, rows_b = np.searchsorted(slots_a, shared_a), np.searchsorted(slots_b, shared_b)
-    descriptors = a._descriptors[slots_a].copy()
-    identities = a._identities[slots_a].copy()
-    if len(rows_a):
-        seen_a, seen_b = counts_a[rows_a].max(axis=1), counts_b[rows_b].max(axis=1)
-        descriptors[rows_a] = fuse_descriptors(
-            descriptors[rows_a], np.maximum(seen_a, 1), b._descriptors[shared_b], np.maximum(seen_b, 1)
+    values_a, counts_a = np.take(dense_a.values, from_a, axis=2), np.take(dense_a.counts, from_a, axis=1)
+    values_b, counts_b = np.take(dense_b.values, from_b, axis=2), np.take(dense_b.counts, from_b, axis=1)
+    values_a[:, 3:] *= scale
+    values_b[:, 3:] *= scale
+    _move_landmarks(values_b, motion)
+    descriptors, identities = dense_a.descriptors.copy(), dense_a.identities.copy()
+    if len(shared_a):
+        seen_a, seen_b = counts_a[shared_a].max(axis=1), counts_b[shared_b].max(axis=1)
+        descriptors[shared_a] = fuse_descriptors(
+            descriptors[shared_a], np.maximum(seen_a, 1), dense_b.descriptors[shared_b], np.maximum(seen_b, 1)
         )
-        identities[rows_a] = np.where(identities[rows_a] < 0, b._identities[shared_b], identities[rows_a])
-        _fuse_rows((landmarks_a, present_a, counts_a), rows_a, (landmarks_b, present_b, counts_b), rows_b)
-    own = np.setdiff1d(np.arange(len(slots_b)), rows_b)  # b's landmarks that a does not have
-    new_ids = a._next_id + np.arange(len(own))
-    joint._landmarks = np.concatenate([landmarks_a, landmarks_b[own]])
-    joint._present = np.concatenate([present_a, present_b[own]])
-    joint._counts = np.concatenate([counts_a, counts_b[own]])
-    joint._descriptors = _stack_descriptors(descriptors, b._descriptors[slots_b[own]])
-    joint._identities = np.concatenate([identities, b._identities[slots_b[own]]])
-    joint._ids = np.concatenate([a._ids[slots_a], new_ids])
-    joint._ids[~joint._present.any(axis=1)] = -1
-    joint._next_id = a._next_id + len(own)
+        names = identities[shared_a]
+        identities[shared_a] = np.where(names < 0, dense_b.identities[shared_b], names)
+        _fuse_rows((values_a, counts_a), shared_a, (values_b, counts_b), shared_b)
+    own = np.setdiff1d(np.arange(len(dense_b.ids)), shared_b)  # b's landmarks that a does not have
+    next_id = a._maps.next_id
+    new_ids = next_id + np.arange(len(own))
+    joint._maps.load(
+        np.concatenate([values_a, values_b[own]]),
+        np.concatenate([counts_a, counts_b[own]]),
+        _stack_descriptors(descriptors, dense_b.descriptors[own]),
+        np.concatenate([dense_a.ids, new_ids]),
+        np.concatenate([identities, dense_b.identities[own]]),
+        next_id + len(own),
+    )
     joint._steps = max(a._steps, b._steps)
-    joint._estimates = [joint._mixture(robot, joint.weights) for robot in range(joint.num_robots)]
-    renamed = np.concatenate([pairs[:, ::-1], np.column_stack([b._ids[slots_b[own]], new_ids])])
+    joint._estimates = [joint._mixture(robot) for robot in range(joint.num_robots)]
+    renamed = np.concatenate([pairs[:, ::-1], np.column_stack([dense_b.ids[own], new_ids])])
     return joint, renamed.astype(np.int64)
 
 
-def _slots_of(ids: IntArray, wanted: IntArray) -> IntArray:
-    """Return the slots that hold the landmarks `wanted`."""
-    order = np.argsort(ids)
-    return np.asarray(order[np.searchsorted(ids, wanted, sorter=order)])
+class _Dense(NamedTuple):
+    """A filter's landmarks by ascending id: values (n, 9, M), counts (n, M), and one row each of the others."""
+
+    ids: IntArray
+    values: FloatArray
+    counts: IntArray
+    descriptors: NDArray[np.float32]
+    identities: IntArray
+
+    @classmethod
+    def of(cls, slam: FastSlam) -> "_Dense":
+        maps = slam._maps
+        slots = maps.used_slots()
+        values, counts = maps.dense(slots)
+        return cls(maps.ids[slots], values, counts.astype(np.int64), maps.descriptors[slots], maps.identities[slots])
+
+
+def _join_poses(
+    joint: FastSlam, a: FastSlam, from_a: IntArray, b: FastSlam, from_b: IntArray, motion: FloatArray
+) -> None:
+    """Write the poses of both groups, those of b moved by each particle's `motion` (M, 3)."""
+    k, count = a.num_robots, len(motion)
+    for name in ("_poses", "_starts", "_means"):
+        target, of_a, of_b = getattr(joint, name), getattr(a, name), getattr(b, name)
+        target[:k, :, :count] = of_a[:, :, from_a]
+        target[k:, :, :count] = compose(motion, of_b[:, :, from_b].transpose(0, 2, 1)).transpose(0, 2, 1)
+    turn = np.zeros((count, 3, 3))
+    turn[:, :2, :2], turn[:, 2, 2] = rotation(motion[:, 2]), 1.0
+    spread_b = b._covariances[:, :, from_b].transpose(0, 2, 1)[..., UNPACK]
+    moved = turn @ spread_b @ turn.transpose(0, 2, 1)
+    joint._covariances[:k, :, :count] = a._covariances[:, :, from_a]
+    joint._covariances[k:, :, :count] = moved[..., *UPPER].transpose(0, 2, 1)
 
 
 def _stack_descriptors(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -190,25 +211,21 @@ def _move_landmarks(landmarks: FloatArray, motion: FloatArray) -> None:
 
 
 def _fuse_rows(
-    a: tuple[FloatArray, BoolArray, IntArray],
-    rows_a: IntArray,
-    b: tuple[FloatArray, BoolArray, IntArray],
-    rows_b: IntArray,
+    a: tuple[FloatArray, IntArray], rows_a: IntArray, b: tuple[FloatArray, IntArray], rows_b: IntArray
 ) -> None:
     """Fuse b's rows into a's, in place, where a particle holds both; where it holds b's alone, take that.
 
-    Each side is (landmarks (n, 9, M), present (n, M), counts (n, M)).
+    Each side is (landmarks (n, 9, M), counts (n, M), 0 = not held).
     """
     landmarks_a, landmarks_b = (side[0][rows].transpose(0, 2, 1) for side, rows in ((a, rows_a), (b, rows_b)))
-    in_a, in_b = a[1][rows_a], b[1][rows_b]
+    in_a, in_b = a[1][rows_a] > 0, b[1][rows_b] > 0
     row, particle = np.nonzero(in_a & in_b)
     one, two = landmarks_a[row, particle], landmarks_b[row, particle]
     means, covariances = fuse_landmarks(one[:, :3], one[:, 3:][:, UNPACK], two[:, :3], two[:, 3:][:, UNPACK])
     fused = np.where((in_b & ~in_a)[..., None], landmarks_b, landmarks_a)
     fused[row, particle] = np.concatenate([means, covariances[:, *UPPER]], axis=1)
     a[0][rows_a] = fused.transpose(0, 2, 1)
-    a[1][rows_a] |= in_b
-    a[2][rows_a] += np.where(in_b, b[2][rows_b], 0)
+    a[1][rows_a] += b[1][rows_b]
 
 
 def _align_pairs(

@@ -32,6 +32,8 @@ class StepReport:
         created: Per robot (n_i,) int64. Id of the landmark that the measurement created in at least one particle; -1
             if none did. A landmark stems from exactly one measurement.
         num_new: Landmarks created by the most probable particle.
+        num_matched: Measurements that the most probable particle matched to landmarks it held.
+        num_rejected: Measurements of which it made nothing: held back, in the dead zone, or named -1 by the caller.
         ess: Effective sample size after this step's weights, before resampling, in [1, M].
         nis: Mean of the squared Mahalanobis innovations (3 degrees of freedom, ideal 3) over the measurements that
             the most probable particle matched; NaN if it matched none.
@@ -41,6 +43,8 @@ class StepReport:
     associations: tuple[IntArray, ...]
     created: tuple[IntArray, ...]
     num_new: int
+    num_matched: int
+    num_rejected: int
     ess: float
     nis: float
     resampled: bool

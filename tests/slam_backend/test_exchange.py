@@ -19,7 +19,7 @@ def map_of(counts: dict[int, int]) -> LandmarkMap:
 def report_of(associations: list[list[int]], created: list[list[int]]) -> StepReport:
     """A report of a joint step."""
     rows = [tuple(np.array(row, dtype=np.int64) for row in rows) for rows in (associations, created)]
-    return StepReport(rows[0], rows[1], num_new=0, ess=1.0, nis=3.0, resampled=False)
+    return StepReport(rows[0], rows[1], num_new=0, num_matched=3, num_rejected=0, ess=1.0, nis=3.0, resampled=False)
 
 
 def test_new_landmarks_are_sent_with_descriptors_and_changed_ones_without() -> None:

@@ -1,0 +1,243 @@
+"""The landmarks of all particles, resampled lazily: ancestor indices are composed, and values move when they are used.
+
+A *slot* is one landmark of the joint map; its values lie in a *row* of `values` and `counts`, one entry per particle. A
+resampling moves no row. Instead each slot says by which *ancestor map* its row is to be read: particle m's values are
+those at `maps[map_of[slot], m]`; map 0 stands for the identity. Slots last brought up to date at the same time share a
+map, and a resampling composes the maps in use with its own ancestors: O(maps M) small integers in place of O(N M)
+landmarks. A frame touches only its candidates: their rows are copied, through their maps, to free ones, and from then
+on every particle's values are at its own place. So no two particles ever share what one of them writes.
+"""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_backend import _kernels
+from slam_backend._kernels import LANES
+from slam_backend.errors import FloatArray, IntArray
+
+MAX_MAPS = 512  # slots whose map is the oldest are brought up to date rather than keep more maps than this
+LINE = 64  # [bytes]; vectors that straddle cache lines are slow
+
+
+def aligned(shape: tuple[int, ...], dtype: Any) -> Any:
+    """Return zeros that start at a cache line."""
+    kind = np.dtype(dtype)
+    size = int(np.prod(shape)) * kind.itemsize
+    raw = np.zeros(size + LINE, dtype=np.uint8)
+    start = -raw.ctypes.data % LINE
+    return raw[start : start + size].view(kind).reshape(shape)
+
+
+class ParticleMaps:
+    """Landmark Gaussians, counts, descriptors and names of all particles.
+
+    Args:
+        num_particles: M.
+
+    Attributes:
+        values: (rows * 9 * P,) float64, each row [block][x, y, z, Sxx, Sxy, Sxz, Syy, Syz, Szz][lane], map frame.
+        counts: (rows, P) int32. How often the particle matched the landmark, its start included; 0: it lacks it.
+        row_of, map_of: (slots,) int64.
+        maps: (maps, P) int32. users: (maps,) int64, how many slots read by each.
+        ids: (slots,) int64. Stable names of the landmarks, -1 = free slot.
+        identities: (slots,) int64. The caller's own names, -1 = none.
+        descriptors: (slots, d) float32. half_norms: (slots,) half their squared length, infinite where free.
+        free_rows, free_slots: Stacks; `tops` = (their heights, the name of the next landmark).
+    """
+
+    def __init__(self, num_particles: int) -> None:
+        self.num_particles = num_particles
+        self.padded = -(-num_particles // LANES) * LANES
+        self.values: FloatArray = aligned((0,), np.float64)
+        self.counts: NDArray[np.int32] = aligned((0, self.padded), np.int32)
+        self.maps: NDArray[np.int32] = np.zeros((1, self.padded), dtype=np.int32)
+        self.users: IntArray = np.zeros(1, dtype=np.int64)
+        self.row_of: IntArray = np.zeros(0, dtype=np.int64)
+        self.map_of: IntArray = np.zeros(0, dtype=np.int64)
+        self.ids: IntArray = np.zeros(0, dtype=np.int64)
+        self.identities: IntArray = np.zeros(0, dtype=np.int64)
+        self.descriptors: NDArray[np.float32] = np.zeros((0, 0), dtype=np.float32)
+        self.half_norms: NDArray[np.float32] = np.zeros(0, dtype=np.float32)
+        self.free_rows: IntArray = np.zeros(0, dtype=np.int64)
+        self.free_slots: IntArray = np.zeros(0, dtype=np.int64)
+        self.tops: IntArray = np.zeros(3, dtype=np.int64)
+
+    @property
+    def next_id(self) -> int:
+        """The name that the next landmark will get."""
+        return int(self.tops[2])
+
+    @property
+    def nbytes(self) -> int:
+        """Memory held [bytes]."""
+        arrays = (
+            self.values, self.counts, self.maps, self.users, self.row_of, self.map_of, self.ids, self.identities,
+            self.descriptors, self.half_norms, self.free_rows, self.free_slots,
+        )  # fmt: skip
+        return sum(array.nbytes for array in arrays)
+
+    def used_slots(self) -> IntArray:
+        """Return the slots that hold a landmark of at least one particle, by ascending id."""
+        used = np.flatnonzero(self.ids >= 0)
+        return used[np.argsort(self.ids[used])]
+
+    # ------------------------------------------------------------------ room
+
+    def make_room(self, new: int, descriptor_size: int) -> None:
+        """See to it that `new` landmarks can start, and a row is left to bring landmarks up to date."""
+        if self.tops[1] < new or not self.descriptors.shape[1]:
+            self._grow_slots(max(64, len(self.ids), new - int(self.tops[1])), descriptor_size)
+        if self.tops[0] < new + 1:
+            self._grow_rows(max(64, len(self.counts) // 2, new + 1))
+
+    def _grow_slots(self, extra: int, descriptor_size: int) -> None:
+        old = len(self.ids)
+        for name, fill in (("row_of", 0), ("map_of", 0), ("ids", -1), ("identities", -1)):
+            setattr(self, name, np.concatenate([getattr(self, name), np.full(extra, fill, dtype=np.int64)]))
+        descriptors = aligned((old + extra, descriptor_size), np.float32)
+        if old and self.descriptors.shape[1]:
+            descriptors[:old] = self.descriptors
+        self.descriptors = descriptors
+        self.half_norms = np.concatenate([self.half_norms, np.full(extra, np.inf, dtype=np.float32)])
+        top = int(self.tops[1])
+        free = np.zeros(old + extra, dtype=np.int64)
+        free[:extra] = np.arange(old + extra - 1, old - 1, -1)  # the lowest is taken first once the old ones are gone
+        free[extra : extra + top] = self.free_slots[:top]
+        self.free_slots = free
+        self.tops[1] = extra + top
+
+    def _grow_rows(self, extra: int) -> None:
+        old, padded = len(self.counts), self.padded
+        values = aligned(((old + extra) * 9 * padded,), np.float64)
+        values[: len(self.values)] = self.values
+        counts = aligned((old + extra, padded), np.int32)
+        counts[:old] = self.counts
+        self.values, self.counts = values, counts
+        top = int(self.tops[0])
+        free = np.zeros(old + extra, dtype=np.int64)
+        free[:extra] = np.arange(old + extra - 1, old - 1, -1)
+        free[extra : extra + top] = self.free_rows[:top]
+        self.free_rows = free
+        self.tops[0] = extra + top
+
+    # ------------------------------------------------------------------ resampling
+
+    def resample(self, targets: IntArray, sources: IntArray) -> None:
+        """Let particle `targets[i]` become a copy of `sources[i]`; no target is a source."""
+        live = np.flatnonzero(self.users[1:] > 0) + 1
+        if len(live) + 1 == len(self.users):
+            if len(live) >= MAX_MAPS:
+                self._refresh_oldest()
+            else:
+                extra = min(max(16, len(self.users)), MAX_MAPS)
+                self.maps = np.concatenate([self.maps, np.zeros((extra, self.padded), dtype=np.int32)])
+                self.users = np.concatenate([self.users, np.zeros(extra, dtype=np.int64)])
+        _kernels.compose_maps(
+            targets, sources, self.maps, self.users, self.map_of, self.ids, self.row_of, self.counts, self.half_norms,
+            self.free_rows, self.free_slots, self.tops, self.num_particles,
+        )  # fmt: skip
+
+    def _refresh_oldest(self) -> None:
+        """Bring up to date the slots of the maps with the fewest users, a quarter of them."""
+        order = np.argsort(np.where(self.users[1:] > 0, self.users[1:], np.iinfo(np.int64).max))
+        chosen = order[: MAX_MAPS // 4] + 1
+        self.refresh(np.flatnonzero(np.isin(self.map_of, chosen) & (self.ids >= 0)))
+
+    def refresh(self, slots: IntArray) -> None:
+        """Bring slots up to date: afterwards they are read in place."""
+        if not self.tops[0]:
+            self._grow_rows(64)
+        _kernels.refresh(
+            slots, self.values, self.counts, self.row_of, self.map_of, self.maps, self.users, self.free_rows, self.tops
+        )
+
+    # ------------------------------------------------------------------ reading and writing whole maps
+
+    def of_particle(self, m: int, slots: IntArray) -> tuple[FloatArray, NDArray[np.int32]]:
+        """Return values (n, 9) and counts (n,) of one particle."""
+        places = np.where(self.map_of[slots] > 0, self.maps[self.map_of[slots], m], m)
+        rows = self.row_of[slots]
+        blocks = self.values.reshape(-1, self.padded // LANES, 9, LANES)
+        return blocks[rows, places // LANES, :, places % LANES], self.counts[rows, places]
+
+    def dense(self, slots: IntArray) -> tuple[FloatArray, NDArray[np.int32]]:
+        """Return values (n, 9, M) and counts (n, M) of all particles. Copies."""
+        self.refresh(slots)
+        rows, m = self.row_of[slots], self.num_particles
+        blocks = self.values.reshape(-1, self.padded // LANES, 9, LANES)[rows]
+        values = blocks.transpose(0, 2, 1, 3).reshape(len(rows), 9, self.padded)[:, :, :m]
+        return np.ascontiguousarray(values), self.counts[rows, :m]
+
+    def load(
+        self, values: FloatArray, counts: IntArray, descriptors: NDArray[np.float32], ids: IntArray,
+        identities: IntArray, next_id: int,
+    ) -> None:  # fmt: skip
+        """Replace all landmarks by these: values (n, 9, M), counts (n, M), one row each of the others."""
+        keep = (counts > 0).any(axis=1)
+        values, counts, descriptors = values[keep], counts[keep], descriptors[keep]
+        n, m = len(values), self.num_particles
+        self.__init__(m)  # type: ignore[misc]
+        self.tops[2] = next_id
+        if not n:
+            return
+        self.make_room(n, descriptors.shape[1])
+        slots, rows = np.arange(n), np.arange(n)
+        padded = np.zeros((n, 9, self.padded))
+        padded[:, :, :m] = values
+        blocks = self.values.reshape(-1, self.padded // LANES, 9, LANES)
+        blocks[rows] = padded.reshape(n, 9, -1, LANES).transpose(0, 2, 1, 3)
+        self.counts[rows, :m] = counts
+        self.row_of[slots], self.map_of[slots] = rows, 0
+        self.ids[slots], self.identities[slots] = ids[keep], identities[keep]
+        self.descriptors[slots] = descriptors
+        self.half_norms[slots] = 0.5 * np.einsum("nd,nd->n", descriptors, descriptors)
+        self.tops[0] -= n  # the lowest rows and slots lie on top of the stacks
+        self.tops[1] -= n
+
+    # ------------------------------------------------------------------ snapshots
+
+    def get_state(self) -> dict[str, Any]:
+        """Return all that decides how the maps go on, compact and shared with nothing."""
+        used = np.flatnonzero(self.ids >= 0)
+        live = np.flatnonzero(self.users > 0)
+        number = np.zeros(len(self.users), dtype=np.int64)
+        number[live] = np.arange(1, len(live) + 1)
+        rows = self.row_of[used]
+        return {
+            "num_particles": self.num_particles,
+            "values": np.take(self.values.reshape(-1, 9 * self.padded), rows, axis=0),
+            "counts": np.take(self.counts, rows, axis=0),
+            "maps": np.take(self.maps, live, axis=0),
+            "map_of": number[self.map_of[used]],
+            "ids": self.ids[used],
+            "identities": self.identities[used],
+            "descriptors": self.descriptors[used],
+            "next_id": self.next_id,
+        }
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Go on as the maps that gave `state`; rows already allocated are used again."""
+        n, m, maps = len(state["ids"]), int(state["num_particles"]), state["maps"]
+        size = state["descriptors"].shape[1]
+        if m != self.num_particles or len(self.counts) < n or len(self.ids) < n or self.descriptors.shape[1] != size:
+            self.__init__(m)  # type: ignore[misc]
+            if n:
+                self.make_room(n, size)
+        slots, rows = len(self.ids), len(self.counts)
+        self.values.reshape(-1, 9 * self.padded)[:n] = state["values"]
+        self.counts[:n] = state["counts"]
+        self.row_of[:n], self.map_of[:n] = np.arange(n), state["map_of"]
+        for name, fill in (("ids", -1), ("identities", -1)):
+            getattr(self, name)[:n] = state[name]
+            getattr(self, name)[n:] = fill
+        self.descriptors[:n] = state["descriptors"]
+        self.half_norms[:n] = 0.5 * np.einsum("nd,nd->n", state["descriptors"], state["descriptors"])
+        self.half_norms[n:] = np.inf
+        self.maps = np.concatenate([np.zeros((1, self.padded), dtype=np.int32), maps])
+        self.users = np.bincount(state["map_of"], minlength=len(maps) + 1).astype(np.int64)
+        self.users[0] = 0
+        self.free_rows[: rows - n] = np.arange(rows - 1, n - 1, -1)
+        self.free_slots[: slots - n] = np.arange(slots - 1, n - 1, -1)
+        self.tops[:] = rows - n, slots - n, state["next_id"]
