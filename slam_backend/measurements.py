@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from slam_backend.errors import FloatArray, bad_argument, check_array
 
 LARGEST_DESCRIPTOR = 1e6  # of one component; squares of distances then stay far from the end of float32
-LEAST_VARIANCE, LARGEST_VARIANCE = 1e-18, 1e12  # [m^2]; determinants then stay far from the end of float64
+LEAST_VARIANCE, LARGEST_VARIANCE = 1e-14, 1e12  # [m^2]; log-weights then keep their differences in float64
 LARGEST_CONDITION = 1e8  # about 1 / sqrt(machine epsilon): with more, updates in float64 lose positive definiteness
 
 

@@ -1,5 +1,6 @@
 """Input that makes no sense is refused with one clear error, and leaves no trace in the filter."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -111,9 +112,11 @@ def test_unknown_estimates_and_states_are_refused() -> None:
     with pytest.raises(ValueError, match=r"^estimate: expected one of 'best', 'mixture', got '?mean"):
         slam.map("mean")  # type: ignore[arg-type]
     state = slam.get_state()
-    del state["_ids"]
-    with pytest.raises(ValueError, match=r"^state: expected a dict from FastSlam.get_state, got no '_ids'\. Pass it"):
-        slam.set_state(state)
+    for name in state:
+        part = {key: value for key, value in state.items() if key != name}
+        with pytest.raises(ValueError, match=rf"^state: expected a dict from FastSlam\.get_state, got no '{name}'\."):
+            slam.set_state(part)
+    assert_same(slam.get_state(), state)
 
 
 def test_nothing_to_do_is_no_error() -> None:
@@ -129,3 +132,189 @@ def test_nothing_to_do_is_no_error() -> None:
         assert report.ess == pytest.approx(3.0)
     np.testing.assert_array_equal(report.associations[0], [-1, 0])
     assert (slam.num_landmarks, report.num_new) == (1, 1)
+
+
+def bad_frame(points: Any = FRAME.points, looks: Any = FRAME.descriptors, noise: Any = None) -> dict[str, Any]:
+    """Return a step in which the second robot reports this frame; the first one's is good."""
+    return {"odometry": [MOVE, MOVE], "measurements": [FRAME, Measurements(points, looks, noise)]}
+
+
+def with_entry(array: Any, value: float) -> Any:
+    """Return a copy with its last number replaced."""
+    changed = np.array(array, dtype=np.float64)
+    changed.flat[-1] = value
+    return changed
+
+
+def turned(variances: list[float]) -> Any:
+    """Return two equal covariances with these eigenvalues, along no axis."""
+    axes = np.linalg.qr(np.arange(9.0).reshape(3, 3) + np.eye(3))[0]
+    covariance = axes @ np.diag(variances) @ axes.T
+    return np.array([0.5 * (covariance + covariance.T)] * 2)
+
+
+REFUSED: dict[str, tuple[Callable[[], dict[str, Any]], str]] = {
+    "covariance indefinite": (lambda: bad_frame(noise=turned([1.0, 1.0, -1e-3])), r"covariances: .*positive definite"),
+    "covariance singular": (lambda: bad_frame(noise=turned([1.0, 1.0, 0.0])), r"covariances: expected"),
+    "covariance zero": (lambda: bad_frame(noise=np.zeros((2, 3, 3))), r"covariances: .*positive definite"),
+    "covariance too flat": (lambda: bad_frame(noise=turned([1.0, 1.0, 1e-10])), r"covariances: .*ratios of eigenv"),
+    "covariance too small": (lambda: bad_frame(noise=turned([1e-200] * 3)), r"covariances: .*eigenvalues from 1e-14"),
+    "covariance too large": (lambda: bad_frame(noise=turned([1e200] * 3)), r"covariances: .*eigenvalues from 1e-14"),
+    "covariance lopsided": (lambda: bad_frame(noise=[with_entry(np.eye(3), 1.0) + np.tri(3)] * 2), r".*symmetric"),
+    "covariance of one point": (lambda: bad_frame(noise=np.eye(3)[None]), r"covariances: expected an array of shape"),
+    "covariance NaN": (lambda: bad_frame(noise=with_entry([np.eye(3)] * 2, np.nan)), r"covariances: .*finite numbers"),
+    "point NaN": (lambda: bad_frame(with_entry(FRAME.points, np.nan)), r"points: expected finite numbers"),
+    "point infinite": (lambda: bad_frame(with_entry(FRAME.points, np.inf)), r"points: expected finite numbers"),
+    "descriptor NaN": (lambda: bad_frame(looks=with_entry(np.eye(2, 5), np.nan)), r"descriptors: .*finite numbers"),
+    "descriptor infinite": (lambda: bad_frame(looks=with_entry(np.eye(2, 5), -np.inf)), r"descriptors: .*finite"),
+    "descriptor huge": (lambda: bad_frame(looks=1e20 * np.eye(2, 5)), r"descriptors: .*numbers within \+-1e\+06"),
+    "descriptors longer": (
+        lambda: bad_frame(looks=np.eye(2, 6)),
+        r"measurements\[1\]\.descriptors: expected vectors of size 5 as in the map, got shape \(2, 6\)",
+    ),
+    "descriptors without length": (
+        lambda: bad_frame(looks=np.zeros((2, 0))),
+        r"measurements\[1\]\.descriptors: expected vectors of size 5 as in the map, got shape \(2, 0\)",
+    ),
+    "point at the camera centre": (
+        lambda: bad_frame([[0.0, 0.0, 2.0], [0.0, 0.0, 0.0]]),
+        r"measurements\[1\]\.points: expected depths Z >= 0\.05 m, got 0\.0\. Drop points at or behind the camera",
+    ),
+    "point at the horizon": (
+        lambda: bad_frame([[0.0, 0.0, 2.0], [0.0, 0.0, 1e7]]),
+        r"measurements\[1\]\.points: expected numbers within \+-10000, got 10000000\.0\. Check the units",
+    ),
+    "point at the horizon with covariances": (
+        lambda: bad_frame([[0.0, 0.0, 2.0], [-1e150, 0.0, 1.0]], noise=turned([1.0] * 3)),
+        r"measurements\[1\]\.points: expected numbers within \+-10000, got",
+    ),
+    "pose out of this world": (
+        lambda: GOOD | {"poses": [None, [0.0, 1e9, 0.0]]},
+        r"poses\[1\]: expected numbers within \+-1e\+06, got",
+    ),
+    "identity NaN": (lambda: GOOD | {"identities": [[1, np.nan], None]}, r"identities\[0\]: expected whole numbers"),
+}
+
+
+@pytest.mark.parametrize("proposal", ["fastslam2", "fastslam1"])
+@pytest.mark.parametrize("case", list(REFUSED))
+def test_a_refused_frame_leaves_no_trace_in_a_running_filter(case: str, proposal: Any) -> None:
+    """Three refusals in a row leave a filter that has resampled as it was; later steps are the same, bit for bit."""
+    make, message = REFUSED[case]
+    slam, untouched = (FastSlam(2, 5, proposal=proposal, seed=1, resample_threshold=1.0) for _ in range(2))
+    for one in (slam, untouched):
+        for _ in range(3):
+            one.step(**GOOD)
+    for _ in range(3):
+        with pytest.raises(ValueError, match="^" + message) as caught:
+            slam.step(**make())
+        assert str(caught.value).endswith(".")
+    assert_same(slam.get_state(), untouched.get_state())
+    for _ in range(2):
+        assert_same(slam.step(**GOOD), untouched.step(**GOOD))
+    assert_same(slam.get_state(), untouched.get_state())
+
+
+def assert_sound(slam: FastSlam) -> None:
+    """All that a filter tells is finite, weights sum to one, and covariances are positive definite."""
+    assert slam.weights.sum() == pytest.approx(1.0, abs=1e-9)
+    for robot in range(slam.num_robots):
+        assert np.isfinite(slam.particles(robot)[0]).all()
+        assert np.isfinite(slam.pose(robot).covariance).all()
+    for estimate in ("best", "mixture"):
+        result = slam.map(estimate)  # type: ignore[arg-type]
+        assert np.isfinite(result.means).all()
+        np.linalg.cholesky(result.covariances)  # raises where one is not positive definite
+
+
+@pytest.mark.parametrize("proposal", ["fastslam2", "fastslam1"])
+@pytest.mark.parametrize("given", [False, True])
+def test_thousands_of_measurements_in_a_step(proposal: Any, given: bool) -> None:
+    """A frame of 3,000 points makes 3,000 landmarks, and the same frame again finds each of them."""
+    rng = np.random.default_rng(2)
+    looks = rng.normal(size=(3000, 64))
+    looks /= np.linalg.norm(looks, axis=1, keepdims=True)
+    points = rng.uniform([-4.0, -3.0, 1.0], [4.0, 3.0, 8.0], (3000, 3))
+    frame = Measurements(points, looks, np.array([1e-4 * np.eye(3)] * 3000) if given else None)
+    slam = FastSlam(2, 3, proposal=proposal)
+    first = slam.step([None, None], [frame, None], poses=[np.zeros(3), None])
+    assert (first.num_new, slam.map_size) == (3000, 3000)
+    again = slam.step([None, MOVE], [frame, frame], poses=[np.zeros(3), np.zeros(3)])
+    for found in again.associations:
+        np.testing.assert_array_equal(found, first.associations[0])
+    assert (again.num_new, slam.map_size) == (0, 3000)
+    assert_sound(slam)
+
+
+@pytest.mark.parametrize("proposal", ["fastslam2", "fastslam1"])
+@pytest.mark.parametrize("named", [False, True])
+def test_a_landmark_at_the_camera_centre_is_one_like_others_with_given_covariances(proposal: Any, named: bool) -> None:
+    """Seen from ahead, from its very place and from beyond, it is the mean of what was measured."""
+    camera = StereoCamera(mount=(0.2, -0.1, 0.3))
+    rng = np.random.default_rng(3)
+    slam = FastSlam(1, 4, camera, proposal=proposal)
+    seen = []
+    for ahead in (2.0, 1.0, 0.0, 0.0, -0.5, -2.0):
+        point = np.array([0.0, 0.0, ahead]) + (0.05 * rng.standard_normal(3) if ahead else 0.0)
+        frame = Measurements([point], np.eye(1, 5), 0.0025 * np.eye(3)[None])
+        slam.step([None], [frame], identities=[[9]] if named else None, poses=[[-ahead, 0.0, 0.0]])
+        seen.append(camera.robot_from_camera(point) - [ahead, 0.0, 0.0])
+    result = slam.map()
+    assert len(result) == 1
+    np.testing.assert_allclose(result.means[0], np.mean(seen, axis=0), atol=1e-12)
+    np.testing.assert_allclose(result.covariances[0], 0.0025 / 6.0 * np.eye(3), atol=1e-15)
+    assert_sound(slam)
+
+
+@pytest.mark.parametrize("proposal", ["fastslam2", "fastslam1"])
+def test_driving_through_a_landmark(proposal: Any) -> None:
+    """A robot with noisy odometry that passes through a landmark holds one landmark, near where it is."""
+    rng = np.random.default_rng(4)
+    slam = FastSlam(1, 50, proposal=proposal, seed=2)
+    for step in range(21):
+        point = np.array([0.0, 0.0, 1.0 - 0.1 * step]) + 0.02 * rng.standard_normal(3)
+        frame = Measurements([point], np.eye(1, 5), 4e-4 * np.eye(3)[None])
+        slam.step([[0.1, 0.0, 0.0] if step else None], [frame])
+        assert_sound(slam)
+    assert len(slam.map()) == 1
+    np.testing.assert_allclose(slam.map("mixture").means[0], [1.0, 0.0, 0.0], atol=0.1)
+
+
+@pytest.mark.parametrize("proposal", ["fastslam2", "fastslam1"])
+def test_a_landmark_at_the_camera_centre_cannot_be_seen_by_the_camera(proposal: Any) -> None:
+    """What the camera model says of it is undefined: a stereo frame leaves it alone, even if the caller names it."""
+    slam = FastSlam(1, 4, proposal=proposal)
+    noise = 0.0025 * np.eye(3)[None]
+    slam.step([None], [Measurements(np.zeros((1, 3)), np.eye(1, 5), noise)], identities=[[9]])
+    before = slam.map()
+    for names in ([[9]], None):
+        slam.step([None], [Measurements([[0.0, 0.0, 2.0]], np.eye(1, 5))], identities=names)
+        assert_sound(slam)
+    after = slam.map()
+    at = int(np.flatnonzero(after.ids == before.ids[0])[0])  # type: ignore[index]
+    np.testing.assert_array_equal(after.means[at], before.means[0])
+    np.testing.assert_array_equal(after.covariances[at], before.covariances[0])
+
+
+@pytest.mark.parametrize("proposal", ["fastslam2", "fastslam1"])
+@pytest.mark.parametrize(
+    ("point", "noise", "move"),
+    [
+        ([0.0, 0.0, 0.05], None, MOVE),
+        ([500.0, -300.0, 990.0], None, MOVE),
+        ([9000.0, 9000.0, 9000.0], 1e12, MOVE),
+        ([0.1, 0.2, 3.0], 1.1e-14, MOVE),
+        ([0.1, 0.2, 3.0], None, [100.0, -100.0, 0.0]),
+        ([0.1, 0.2, 3.0], None, [0.0, 0.0, 3000.0]),
+        ([0.1, 0.2, 3.0], 0.01, [100.0, -100.0, 3000.0]),
+    ],
+)
+def test_extreme_readings_do_no_harm(proposal: Any, point: Any, noise: float | None, move: Any) -> None:
+    """Far points, tiny and huge covariances and long jumps, among ordinary readings, leave the filter sound."""
+    covariances = None if noise is None else noise * np.eye(3)[None]
+    extreme = Measurements([point], np.eye(1, 5), covariances)
+    slam = FastSlam(2, 6, proposal=proposal, seed=3)
+    for step in range(40):
+        odd = step % 4 == 3
+        slam.step([move if odd else MOVE, MOVE], [extreme if odd else FRAME, FRAME if odd else extreme])
+        assert_sound(slam)
