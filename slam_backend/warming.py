@@ -30,7 +30,7 @@ def warm_up() -> float:
         angles = np.linspace(0.0, 2.0 * np.pi, LANDMARKS, endpoint=False)
         points = np.column_stack([2.0 * np.cos(angles), np.sin(angles), np.linspace(4.0, 6.0, LANDMARKS)])
         descriptors = np.eye(LANDMARKS, dtype=np.float32)
-        names = np.arange(LANDMARKS)
+        names, some = np.arange(LANDMARKS), np.arange(LANDMARKS) - 1  # one of the latter is to be rejected
         plain = Measurements(points, descriptors)
         given = Measurements(points, descriptors, np.tile(1e-4 * np.eye(3), (LANDMARKS, 1, 1)))
         move, still = np.array([0.0, 0.0, 0.01]), np.zeros(3)
@@ -40,7 +40,7 @@ def warm_up() -> float:
                 slam.step([None, None], [frame, None])
                 for _ in range(STEPS):
                     slam.step([move, None], [frame, frame])
-                slam.step([None, None], [frame, frame], [names, names], [still, None])
+                slam.step([None, None], [frame, frame], [names, some], [still, None])
                 slam.step([move, move], [None, None])
         team = TeamSlam(2, num_particles=4, attempts=AttemptOptions(every=1))
         for _ in range(STEPS):

@@ -7,6 +7,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from training.bench_command import bench
+from training.bench_filter_command import bench_filter
 from training.replay_command import replay_mrclam
 from training.run import run
 
@@ -21,6 +22,7 @@ app.command("run")(run)
 replay = typer.Typer(help="Run the backend on the log of real robots.", no_args_is_help=True)
 replay.command("mrclam")(replay_mrclam)
 app.add_typer(replay, name="replay")
+bench.command("filter")(bench_filter)
 app.add_typer(bench, name="bench")
 
 

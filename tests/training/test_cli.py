@@ -14,7 +14,7 @@ def _run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
     return int(end.value.code or 0)
 
 
-@pytest.mark.parametrize("command", [(), ("replay",), ("replay", "mrclam")])
+@pytest.mark.parametrize("command", [(), ("replay",), ("replay", "mrclam"), ("bench",), ("bench", "filter")])
 def test_every_command_explains_itself(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], command: tuple[str, ...]
 ) -> None:

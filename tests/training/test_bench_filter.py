@@ -1,0 +1,209 @@
+import gc
+import json
+import sys
+import tomllib
+from dataclasses import replace
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from training import cli, compile_timing
+from training.bench_filter import BenchConfig, BenchResult, count_trials, run_bench
+from training.bench_filter_command import parse_counts
+from training.filter_bounds import arithmetic_bound_ms, bytes_moved, copy_bound_ms, map_bytes
+from training.filter_goals import goals_of
+from training.filter_load import FilterLoad
+from training.filter_tables import print_result
+from training.filter_trials import PlainRow, Row
+from training.machine_rates import copy_rate, multiply_add_rate, processor
+from training.step_timing import Timing, time_calls
+
+TINY = ("--particles", "5,9", "--landmarks", "40", "--measurements", "3", "--robots", "1,2", "--steps", "4")
+
+
+def _run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
+    monkeypatch.setattr(sys, "argv", ["vslam", "bench", "filter", *arguments])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    return int(end.value.code or 0)
+
+
+def _result(milliseconds: Any, loads: list[FilterLoad], plain: tuple[PlainRow, ...] = ()) -> BenchResult:
+    """A result in which the median of each load is given by a function of it."""
+    rows = [
+        Row(
+            load=load, timing=Timing(milliseconds(load), 0.1, 9.0, 0.1, 3), copy_bound_ms=0.01, right=1.0, ess=0.5,
+            arithmetic_bound_ms=0.02, landmarks_held=load.landmarks, resampled=1.0, nbytes=80 * map_bytes(load) // 76,
+        )
+        for load in loads
+    ]  # fmt: skip
+    machine = {
+        "processor": "abacus", "load_before": 2.5, "copy_bytes_per_s": 1e9, "copy_in_cache_bytes_per_s": 4e9,
+        "multiply_adds_per_s_float64": 1e9, "multiply_adds_per_s_float32": 2e9,
+    }  # fmt: skip
+    state = {"get_state": Timing(0.4, 0.1, 0.9, 0.1, 3), "set_state": Timing(0.6, 0.1, 0.9, 0.1, 3)}
+    return BenchResult(machine, tuple(rows), plain, state, None, complete=False)
+
+
+def test_a_bench_leaves_a_folder_that_repeats_it(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """One row for each combination, in table, metrics.json and the copy; the config repeats them all."""
+    first, second, copy = tmp_path / "first", tmp_path / "second", tmp_path / "copy.json"
+    assert _run(monkeypatch, *TINY, "--out", str(first), "--json", str(copy)) == 0
+    shown = capsys.readouterr().out
+    assert all(word in shown for word in ("K=2", "fastslam1", "fastslam2", "get_state", "bytes per particle"))
+    metrics = json.loads((first / "metrics.json").read_text())
+    assert metrics == json.loads(copy.read_text())
+    keys = ("proposal", "particles", "landmarks", "measurements", "robots")
+    loads = [tuple(row[key] for key in keys) for row in metrics["rows"]]
+    assert loads == [(p, m, 40, 3, k) for p in ("fastslam1", "fastslam2") for m in (5, 9) for k in (1, 2)]
+    for row in metrics["rows"]:
+        assert 0.0 < row["min_ms"] <= row["low_ms"] <= row["median_ms"] <= row["high_ms"]
+        assert row["calls"] == 4
+        assert row["resampled"] == 1.0
+        assert row["right"] >= 0.5  # of twelve
+        assert row["bytes_per_landmark"] >= 76.0
+    assert [row["plain_ms"] is None for row in metrics["rows"]] == [False, True] * 4  # with one robot only
+    assert (first / "speed.png").read_bytes().startswith(b"\x89PNG")
+    assert _run(monkeypatch, "--config", str(first), "--out", str(second), "--no-plain") == 0
+    configs = [tomllib.loads((folder / "config.toml").read_text())["config"] for folder in (first, second)]
+    assert configs[1] == configs[0] | {"plain": False}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--particles", "10;20"), "particles: expected numbers with commas between, got '10;20'. Write them like"),
+        (("--particles", "0"), "particles: expected an int >= 1, got 0."),
+        (("--landmarks", "20"), "landmarks: expected an int >= 30, got 20."),
+        (("--steps", "0"), "steps: expected an int >= 1, got 0."),
+        (("--json", "/nowhere/copy.json"), "json: expected a place that can be written, got no access."),
+        (("--config", "/nowhere"), "config: expected the config.toml of an earlier run, got no such file."),
+    ],
+)
+def test_bad_input_is_one_line_and_status_2(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], message: str
+) -> None:
+    """Refused before anything is timed or written."""
+    assert _run(monkeypatch, *arguments) == 2
+    shown = capsys.readouterr()
+    assert shown.err.startswith(f"error {message}")
+    assert shown.err.count("\n") == 1
+
+
+def test_unknown_names_in_a_config_are_refused() -> None:
+    """A misspelt key of a config file is named."""
+    with pytest.raises(ValueError, match=r"config: expected one of particles, .*, got 'partikel'"):
+        BenchConfig.from_mapping({"partikel": [1]})
+
+
+def test_who_stops_keeps_what_is_done() -> None:
+    """After Ctrl-C no trial begins; finished rows are there, and the result says that it is not all."""
+    config = BenchConfig(particles=(3,), landmarks=(30,), measurements=(2,), robots=(1, 2), steps=2)
+    begun: list[str] = []
+    result = run_bench(config, begun.append, should_stop=lambda: len(begun) > 2)
+    assert len(begun) == 3 < count_trials(config)
+    assert [row.load.robots for row in result.rows] == [1, 2]
+    assert (result.plain, result.state, result.complete) == ((), {}, False)
+
+
+def test_every_trial_is_announced() -> None:
+    """The progress bar ends at its end."""
+    config = BenchConfig(particles=(3,), landmarks=(30,), measurements=(2,), robots=(1,), steps=2)
+    begun: list[str] = []
+    assert run_bench(config, begun.append).complete
+    assert len(begun) == count_trials(config)
+
+
+def test_goals_are_held_against_the_rows_they_are_about() -> None:
+    """Times against limits, ratios over N, M and K from the rows that differ in these alone; missing rows, no goal."""
+    config = BenchConfig()
+    result = _result(lambda load: 1e-4 * load.particles * load.landmarks**0.25 * load.robots, config.loads())
+    goals = {goal.name: goal for goal in goals_of(result)}
+    assert goals["fastslam1, M=1000, N=300, B=15"].value == pytest.approx(0.1 * 300**0.25)
+    assert goals["fastslam1, M=1000, N=300, B=15"].is_met is False  # 0.42 over 0.4 ms
+    assert goals["fastslam2, M=1000, N=300, B=15"].is_met is True
+    assert goals["fastslam1, M=1000: time at N=1000 over N=100"].value == pytest.approx(10**0.25)
+    assert goals["fastslam1, M=1000: time at N=1000 over N=100"].is_met is False
+    assert goals["fastslam1, M=100: time at N=1000 over N=100"].is_met is True
+    assert goals["fastslam2, N=300: time at M=1000 over M=100"].value == pytest.approx(10.0)
+    assert goals["fastslam2, M=100: time at K=3 over K=1, same B"].value == pytest.approx(3.0)
+    assert goals["fastslam2, M=100: time at K=3 over K=1, same B"].is_met is None
+    assert (goals["get_state, M=100, N=300"].is_met, goals["set_state, M=100, N=300"].is_met) == (True, False)
+    few = _result(lambda load: 1.0, [FilterLoad()])
+    assert [goal.name for goal in goals_of(few)][:1] == ["fastslam2, M=100, N=300, B=15"]
+    assert len(goals_of(few)) == 3
+
+
+def test_the_table_tells_all() -> None:
+    """Robots side by side, factors over both bounds, the extrapolated reference, a busy machine, an early stop."""
+    load = FilterLoad(particles=1000)
+    plain = PlainRow(load=replace(load, particles=2), timing=Timing(7.0, 6.0, 8.0, 6.0, 5))
+    result = _result(lambda load: 0.5 * load.robots, [load, replace(load, robots=3)], (plain,))
+    shown = StringIO()
+    print_result(Console(file=shown, width=160), result, goals_of(result))
+    text = shown.getvalue()
+    line = next(line for line in text.splitlines() if "1000" in line and "fastslam2" in line)
+    assert [cell.strip() for cell in line.strip("│ ").split("│")] == [
+        "fastslam2", "1000", "300", "15", "0.500", "0.100-9.00", "0.100", "1.50", "50.0", "25.0", "100%", "3500",
+    ]  # fmt: skip
+    for words in ("median in ms", "80 bytes per particle and landmark", "was busy (load 2.5)", "Stopped early", "met"):
+        assert words in text
+
+
+def test_timing_is_by_quantiles_of_single_calls() -> None:
+    """Ten per cent are below the low and above the high figure, half are below the median."""
+    timing = Timing.of(np.linspace(0.0, 1.0, 101))
+    assert (timing.low_ms, timing.median_ms, timing.high_ms) == pytest.approx((100.0, 500.0, 900.0))
+    assert (timing.min_ms, timing.calls) == (0.0, 101)
+
+
+def test_calls_are_timed_without_the_garbage_collector() -> None:
+    """It is off during the calls and as before afterwards, errors included; the first calls warm up."""
+    seconds, results = time_calls(lambda number: (number, gc.isenabled()), range(5), warm_up=2)
+    assert results == [(2, False), (3, False), (4, False)]
+    assert (len(seconds), bool((seconds > 0.0).all())) == (3, True)
+    with pytest.raises(ZeroDivisionError):
+        time_calls(lambda number: 1 // number, [0])
+    assert gc.isenabled()
+
+
+def test_bounds_follow_from_counts_and_rates() -> None:
+    """Bytes grow with B M alone, whatever N; times are counts over the rates measured in this process."""
+    load = FilterLoad(particles=1000)
+    assert bytes_moved(load) == 2 * 15 * 1000 * 76
+    assert bytes_moved(replace(load, landmarks=1000)) == bytes_moved(replace(load, robots=3)) == bytes_moved(load)
+    assert map_bytes(load) == 300 * 1000 * 76
+    assert copy_bound_ms(load) * copy_rate(map_bytes(load)) == pytest.approx(1e3 * bytes_moved(load))
+    small, large = (arithmetic_bound_ms(replace(load, proposal=p)) for p in ("fastslam1", "fastslam2"))
+    assert 2.0 < large / small < 4.0
+    assert multiply_add_rate("float32") > 0.0
+    assert processor()
+
+
+def test_compilation_is_timed_in_a_cache_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two new processes share a cache that begins empty; its size is told, and it is gone afterwards."""
+    code = """
+import json, os, pathlib
+folder = pathlib.Path(os.environ["NUMBA_CACHE_DIR"])
+found = len(list(folder.iterdir()))
+(folder / f"kernel{found}").write_bytes(bytes(100))
+print(json.dumps({"found": found, "folder": str(folder)}))
+"""
+    monkeypatch.setattr(compile_timing, "WARM_UP", code)
+    times = compile_timing.time_compilation()
+    assert (times["cold"]["found"], times["cached"]["found"]) == (0, 1)
+    assert (times["cache_files"], times["cache_bytes"]) == (2, 200)
+    assert not Path(times["cold"]["folder"]).exists()
+
+
+def test_counts_with_commas() -> None:
+    """Blanks around the numbers do not matter; anything else is refused by the option's name."""
+    assert parse_counts("robots", "1, 3") == (1, 3)
+    with pytest.raises(ValueError, match="robots: expected numbers with commas between, got '1-3'"):
+        parse_counts("robots", "1-3")

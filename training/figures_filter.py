@@ -1,0 +1,96 @@
+"""The picture of the filter's speed: against the landmarks, the particles and the robots."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from slam_backend.errors import FloatArray
+from training.bench_filter import BenchResult
+from training.filter_goals import COMMON, STEP_MS
+from training.filter_trials import Row
+
+COLOURS = {"fastslam1": "#0072B2", "fastslam2": "#D55E00"}
+INK = "0.35"
+AXES = (
+    ("landmarks", "landmarks in the map, N", "B = 15, K = 1"),
+    ("particles", "particles, M", "N = 300, B = 15, K = 1"),
+    ("robots", "robots, K", "N = 300, B = 15 in all"),
+)
+LEGEND = [
+    *(Line2D([], [], color=colour, marker="o", label=name) for name, colour in COLOURS.items()),
+    Patch(color=INK, alpha=0.2, lw=0, label="10-90 % of the steps"),
+    Line2D([], [], color=INK, ls=":", label="least possible: the greater of the two bounds"),
+    Line2D([], [], color=INK, ls="", marker="_", ms=14, mew=2, label="goal"),
+    Line2D([], [], color=INK, ls="--", lw=1.0, label="plain reference, extrapolated"),
+]
+
+
+def draw_speed(file: Path, result: BenchResult) -> None:
+    """Draw the time of a step against N, M and K into a PNG file: medians beside bounds, goals and the reference."""
+    figure = Figure(figsize=(12.0, 5.0), layout="constrained")
+    panels = figure.subplots(1, 3, sharey=True)
+    for ax, (name, label, title) in zip(panels, AXES, strict=True):
+        numbers = {key: value for key, value in COMMON.items() if key != name}
+        rows = [row for row in result.rows if all(getattr(row.load, key) == value for key, value in numbers.items())]
+        ax.set(xscale="linear" if name == "robots" else "log", yscale="log", xlabel=label, title=title)
+        _draw_panel(ax, rows, name)
+        if name == "particles":
+            _draw_references(ax, rows, result)
+        shown = sorted({getattr(row.load, name) for row in rows})
+        ax.set_xticks(shown, [f"{value:,}" for value in shown])
+        ax.set_xticks([], minor=True)
+        ax.margins(x=0.16)
+        ax.grid(color="0.92")
+        ax.spines[["top", "right"]].set_visible(False)
+    panels[0].set_ylabel("time of a step [ms]")
+    figure.legend(handles=LEGEND, loc="outside lower center", ncols=3, frameon=False, fontsize=9)
+    figure.savefig(file, dpi=120)
+
+
+def _draw_panel(ax: Axes, rows: Sequence[Row], name: str) -> None:
+    """Draw one line for each proposal, and for each number of particles unless these are the abscissa."""
+    ways = sorted({(str(row.load.proposal), 0 if name == "particles" else row.load.particles) for row in rows})
+    for proposal, particles in ways:
+        line = [row for row in rows if row.load.proposal == proposal and particles in (0, row.load.particles)]
+        line.sort(key=lambda row: int(getattr(row.load, name)))
+        x, low, median, high, bound = _columns(line, name)
+        colour = COLOURS[proposal]
+        ax.plot(x, median, color=colour, marker="o", ms=4)
+        ax.fill_between(x, low, high, color=colour, alpha=0.15, lw=0)
+        ax.plot(x, bound, color=colour, ls=":", lw=1.2)
+        if particles:
+            for values in (median, bound):
+                ax.annotate(
+                    f"M={particles:,}", (x[-1], values[-1]), xytext=(5, 0), textcoords="offset points", fontsize=7,
+                    color=colour, va="center",
+                )  # fmt: skip
+
+
+def _draw_references(ax: Axes, rows: Sequence[Row], result: BenchResult) -> None:
+    """Draw the goals, and the plain reference where it was timed."""
+    for (proposal, particles), limit in STEP_MS.items():
+        ax.plot(particles, limit, ls="", marker="_", ms=16, mew=2, color=COLOURS[proposal])
+    for proposal, colour in COLOURS.items():
+        plain: list[Any] = [
+            (row.load.particles, result.plain_ms(row.load)) for row in rows if row.load.proposal == proposal
+        ]
+        known = sorted(pair for pair in plain if pair[1] is not None)
+        if known:
+            ax.plot(*np.transpose(known), color=colour, ls="--", lw=1.0)
+
+
+def _columns(line: Sequence[Row], name: str) -> FloatArray:
+    """Return the abscissa, the low, median and high time, and the bound [ms] of a line, (5, n)."""
+    return np.transpose([
+        (
+            getattr(row.load, name), row.timing.low_ms, row.timing.median_ms, row.timing.high_ms,
+            max(row.copy_bound_ms, row.arithmetic_bound_ms),
+        )
+        for row in line
+    ])  # fmt: skip

@@ -1,0 +1,162 @@
+"""What the filter is timed on: robots in front of a cloud of landmarks, of which they measure any at random."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_backend.camera import ROBOT_FROM_CAMERA
+from slam_backend.errors import FloatArray, IntArray, bad_argument, check_choice, check_int
+from slam_backend.filter_options import PROPOSALS, FilterOptions
+from slam_backend.geometry import between, compose, inverse, transform_points
+from slam_backend.measurements import Measurements
+
+Proposal = Literal["fastslam2", "fastslam1"]
+
+DESCRIPTOR_SIZE = 64
+DESCRIPTOR_NOISE = 0.1  # root mean square L2 length of what is added to a descriptor before it is normalised again
+DEPTHS = (2.0, 7.0)  # [m]
+IMAGE_SHARE = 0.8  # of the image in which the first robot sees the landmarks; the rest is room to move
+MAPPED_AT_ONCE = 50  # measurements in a frame while the map is built
+GAP = 0.1  # between robots, side by side [m]
+SWAY_POSITION, SWAY_HEADING = 0.1, 0.03  # amplitudes of the robots' motion [m], [rad]
+SWAY_PER_STEP = np.array([0.11, 0.19])  # their phases' steps [rad]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FilterLoad:
+    """One row of the table.
+
+    Attributes:
+        proposal: Of the filter.
+        particles: M.
+        landmarks: N; all particles hold all of them.
+        measurements: B, of all robots together in a step.
+        robots: K.
+        lookalikes: So many landmarks share one descriptor; 1: all differ.
+        seed: Of all random draws.
+    """
+
+    proposal: Proposal = "fastslam2"
+    particles: int = 100
+    landmarks: int = 300
+    measurements: int = 15
+    robots: int = 1
+    lookalikes: int = 1
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        check_choice("proposal", self.proposal, PROPOSALS)
+        check_int("particles", self.particles, 1, "Use at least one particle; 100 is a good start.")
+        check_int("robots", self.robots, 1, "Use 1 to 8 robots.")
+        check_int("measurements", self.measurements, self.robots, "Give each robot at least one.")
+        cure = "A robot's measurements are of different landmarks, and it sees nearly all of them."
+        check_int("landmarks", self.landmarks, 2 * self.measurements, cure)
+        check_int("lookalikes", self.lookalikes, 1, "Use 1 for landmarks that all look different.")
+        check_int("seed", self.seed, 0, "Use 0 or a positive number.")
+
+    @property
+    def options(self) -> FilterOptions:
+        """Of the filter: the noise that it assumes is the true one, and it resamples at every step."""
+        return FilterOptions(num_particles=self.particles, proposal=self.proposal, resample_threshold=1.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LoadStep:
+    """The readings of one step.
+
+    Attributes:
+        odometry: Per robot (3,) [m, m, rad], or None.
+        frames: Per robot its measurements, or None.
+        names: Per robot (n_i,) int64, the true names of what it measured.
+    """
+
+    odometry: tuple[FloatArray | None, ...]
+    frames: tuple[Measurements | None, ...]
+    names: tuple[IntArray, ...]
+
+
+class LoadWorld:
+    """Landmarks, and robots that sway in front of them.
+
+    Landmarks fill the first robot's view between two depths, evenly over the image. Robots stand side by side at known
+    poses and sway by decimetres, so that each sees nearly all of them at all times. Measurements in a step are drawn at
+    random from what is in view, so that two steps have little in common.
+
+    Args:
+        load: How much.
+    """
+
+    def __init__(self, load: FilterLoad) -> None:
+        self.load = load
+        self._rng = np.random.default_rng(load.seed)
+        self._camera = load.options.camera
+        self._motion = load.options.motion
+        depth = self._rng.uniform(*DEPTHS, load.landmarks)
+        half_image = [0.5 * self._camera.width, 0.5 * self._camera.height]
+        image = IMAGE_SHARE * self._rng.uniform(-1.0, 1.0, (load.landmarks, 2)) * half_image
+        seen = np.column_stack([image * (depth / self._camera.focal_px)[:, None], depth])
+        self.landmarks: FloatArray = seen @ ROBOT_FROM_CAMERA.T  # (N, 3), map frame: the first robot starts near 0
+        kinds = self._rng.standard_normal((-(-load.landmarks // load.lookalikes), DESCRIPTOR_SIZE))
+        self.descriptors = _unit(kinds)[np.arange(load.landmarks) // load.lookalikes]
+        self.starts = np.zeros((load.robots, 3))
+        self.starts[:, 1] = GAP * (np.arange(load.robots) - 0.5 * (load.robots - 1))
+        self._phases = self._rng.uniform(0.0, 2.0 * np.pi, (load.robots, 2))
+        self._time = 0
+
+    def true_pose(self, robot: int, time: int) -> FloatArray:
+        """Return a robot's true pose (3,), map frame; at time 0 it is at its start."""
+        phases = self._phases[robot]
+        ahead, turn = np.sin(SWAY_PER_STEP * time + phases) - np.sin(phases)
+        return compose(self.starts[robot], [SWAY_POSITION * ahead, 0.0, SWAY_HEADING * turn])
+
+    def mapping(self, sweeps: int) -> Iterator[LoadStep]:
+        """Yield steps in which the first robot, at its start, measures all landmarks `sweeps` times, by name."""
+        rest = (None,) * (self.load.robots - 1)
+        for _ in range(sweeps):
+            order = self._rng.permutation(self.load.landmarks)
+            for begin in range(0, len(order), MAPPED_AT_ONCE):
+                names = order[begin : begin + MAPPED_AT_ONCE]
+                none = tuple(np.empty(0, np.int64) for _ in rest)
+                yield LoadStep((None, *rest), (self._measure(self.starts[0], names), *rest), (names, *none))
+
+    def course(self, num: int) -> Iterator[LoadStep]:
+        """Yield `num` steps in which all robots move and measure, B in all, their shares as equal as can be."""
+        load = self.load
+        shares = load.measurements // load.robots + (np.arange(load.robots) < load.measurements % load.robots)
+        for _ in range(num):
+            odometry: list[FloatArray] = []
+            frames: list[Measurements] = []
+            names: list[IntArray] = []
+            for robot, share in enumerate(shares):
+                before, now = self.true_pose(robot, self._time), self.true_pose(robot, self._time + 1)
+                move = between(before, now)
+                odometry.append(move + self._rng.standard_normal(3) * self._motion.sigmas(move))
+                in_view = np.flatnonzero(self._camera.sees(self._seen_from(now)))
+                if len(in_view) < share:
+                    cure = "Use more landmarks, or fewer measurements."
+                    raise bad_argument("landmarks", f"{share} in a robot's view", f"a view of {len(in_view)}", cure)
+                names.append(self._rng.choice(in_view, share, replace=False))
+                frames.append(self._measure(now, names[-1]))
+            self._time += 1
+            yield LoadStep(tuple(odometry), tuple(frames), tuple(names))
+
+    def _seen_from(self, pose: FloatArray) -> FloatArray:
+        """Return the landmarks (N, 3) [m] in the frame of the camera of a robot at `pose`."""
+        return self._camera.camera_from_robot(transform_points(inverse(pose), self.landmarks))
+
+    def _measure(self, pose: FloatArray, names: IntArray) -> Measurements:
+        """Return noisy measurements of landmarks from `pose`."""
+        pixels = self._camera.project(self._seen_from(pose)[names])
+        sigmas = [self._camera.sigma_px, self._camera.sigma_px, self._camera.sigma_disparity_px]
+        pixels += self._rng.standard_normal(pixels.shape) * sigmas
+        noise = self._rng.standard_normal((len(names), DESCRIPTOR_SIZE)) * (DESCRIPTOR_NOISE / np.sqrt(DESCRIPTOR_SIZE))
+        return Measurements(self._camera.triangulate(pixels), _unit(self.descriptors[names] + noise))
+
+
+def _unit(vectors: FloatArray) -> NDArray[np.float32]:
+    """Return the vectors (n, d) at length 1."""
+    unit: NDArray[np.float32] = (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.float32)
+    return unit

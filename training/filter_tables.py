@@ -1,0 +1,107 @@
+"""The tables that `vslam bench filter` ends with."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from rich.console import Console
+from rich.table import Table
+
+from training.bench_filter import BenchResult
+from training.filter_bounds import MULTIPLY_ADDS
+from training.filter_goals import Goal
+from training.filter_trials import PLAIN_PARTICLES, Row
+
+BUSY = 1.2  # load of the last minute above which another process was running
+
+
+def print_result(console: Console, result: BenchResult, goals: Sequence[Goal]) -> None:
+    """Print rows, goals, and what else was measured."""
+    machine = result.machine
+    if result.rows:
+        console.print(_rows(result))
+        console.print(
+            "x bytes: over the copy of 2 B M (72 + 4) bytes in a working set as large as the maps. x arithmetic: over "
+            f"B M times {MULTIPLY_ADDS['fastslam1']} (fastslam1) or {MULTIPLY_ADDS['fastslam2']} (fastslam2) "
+            "multiply-adds and the descriptors' product, at the rate of a matrix product. right: measurements given to "
+            f"the landmark they are of. plain: the reference with {PLAIN_PARTICLES} particles, times M / "
+            f"{PLAIN_PARTICLES}.",
+            highlight=False,
+        )
+    if goals:
+        console.print(_goals(goals))
+    console.print(
+        f"{machine['processor']}, one thread: copies {machine['copy_bytes_per_s'] / 1e9:.1f} GB/s "
+        f"({machine['copy_in_cache_bytes_per_s'] / 1e9:.0f} GB/s in cache), multiplies and adds "
+        f"{machine['multiply_adds_per_s_float64'] / 1e9:.0f} (float64), "
+        f"{machine['multiply_adds_per_s_float32'] / 1e9:.0f} (float32) billion times a second.",
+        highlight=False,
+    )
+    if result.rows:
+        largest = max(result.rows, key=lambda row: row.load.particles * row.load.landmarks)
+        console.print(
+            f"Memory: {largest.bytes_per_landmark:.0f} bytes per particle and landmark; {largest.nbytes / 1e6:.0f} MB "
+            f"for M={largest.load.particles}, N={largest.load.landmarks}.",
+            highlight=False,
+        )
+    if result.compilation is not None:
+        cold, cached = result.compilation["cold"], result.compilation["cached"]
+        console.print(
+            f"Kernels: compiled in {cold['compile_s']:.0f} s, once; taken from the cache "
+            f"({result.compilation['cache_bytes'] / 1e6:.1f} MB) in {cached['warm_up_s']:.1f} s; "
+            f"import {cached['import_s']:.1f} s.",
+            highlight=False,
+        )
+    if machine["load_before"] is not None and machine["load_before"] > BUSY:
+        console.print(
+            f"The machine was busy (load {machine['load_before']:.1f}): times may be too long.", highlight=False
+        )
+    if not result.complete:
+        console.print("Stopped early; the rest was not measured.")
+
+
+def _rows(result: BenchResult) -> Table:
+    """Return the table of times: one line for each number of particles, landmarks and measurements."""
+    robots = sorted({row.load.robots for row in result.rows})
+    first, *more = robots
+    table = Table(title="One step of the filter, unknown association, resampling at every step: median in ms")
+    for heading in ("proposal", "M", "N", "B", f"K={first}", "10-90 %", "least", *(f"K={k}" for k in more)):
+        table.add_column(heading, justify="left" if heading == "proposal" else "right")
+    for heading in ("x bytes", "x arithmetic", "right", "plain"):
+        table.add_column(heading, justify="right")
+    for row in result.rows:
+        if row.load.robots != first:
+            continue
+        others = [result.find(**_numbers(row, robots=k)) for k in more]
+        timing, load, plain = row.timing, row.load, result.plain_ms(row.load)
+        table.add_row(
+            load.proposal, str(load.particles), str(load.landmarks), str(load.measurements),
+            _ms(timing.median_ms), f"{_ms(timing.low_ms)}-{_ms(timing.high_ms)}", _ms(timing.min_ms),
+            *("" if other is None else _ms(other.timing.median_ms) for other in others),
+            f"{timing.median_ms / row.copy_bound_ms:.1f}", f"{timing.median_ms / row.arithmetic_bound_ms:.1f}",
+            f"{row.right:.0%}", "" if plain is None else f"{plain:.0f}",
+        )  # fmt: skip
+    return table
+
+
+def _goals(goals: Sequence[Goal]) -> Table:
+    """Return the table of goals."""
+    table = Table(title="Goals")
+    for heading in ("figure", "measured", "at most", ""):
+        table.add_column(heading, justify="left" if heading in ("figure", "") else "right")
+    for goal in goals:
+        shown = _ms(goal.value) if goal.unit else f"{goal.value:.2f}"
+        limit = "" if goal.limit is None else f"{goal.limit:g} {goal.unit}".strip()
+        verdict = {True: "[green]met[/]", False: "[red]missed[/]", None: ""}[goal.is_met]
+        table.add_row(goal.name, f"{shown} {goal.unit}".strip(), limit, verdict)
+    return table
+
+
+def _numbers(row: Row, robots: int) -> dict[str, object]:
+    """Return what tells a row's load from those of other rows."""
+    load = replace(row.load, robots=robots)
+    return {name: getattr(load, name) for name in ("proposal", "particles", "landmarks", "measurements", "robots")}
+
+
+def _ms(value: float) -> str:
+    """Show milliseconds with three digits that count."""
+    return f"{value:.3f}" if value < 1.0 else f"{value:.2f}" if value < 10.0 else f"{value:.1f}"
