@@ -44,10 +44,11 @@ class StereoEkf:
         self.covariance = (np.eye(3) - gain @ g) @ self.covariance
 
 
-def test_stereo_on_a_known_path_makes_it_independent_ekfs() -> None:
+@PROPOSALS
+def test_stereo_on_a_known_path_makes_it_independent_ekfs(proposal: Any) -> None:
     """Two robots, 17 landmarks, exact poses: means to 1e-9 m and covariances to 1e-9 of their size are the EKFs'."""
     world = StereoWorld(np.random.default_rng(21))
-    slam = FastSlam(2, 3, world.camera, proposal="fastslam1")
+    slam = FastSlam(2, 3, world.camera, proposal=proposal)
     filters: dict[int, StereoEkf] = {}
     poses = np.array([[0.0, 0.0, 0.0], [0.4, -0.3, 2.0]])
     for _ in range(40):

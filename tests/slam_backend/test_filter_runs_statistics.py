@@ -42,7 +42,7 @@ def test_uncertainty_of_whole_runs(steps: int, lowest: float, highest: float) ->
     """The median of NEES / 3 is near its ideal (0.79) in a first turn, and bounded after three; NIS / 3 is near 1.
 
     100 particles, 20 runs. Bounds: 99.9 % of 3000 draws of 20 among 400 (three turns: 240) runs with seeds from 100 on
-    lie between 0.51 and 1.42 (1.88 and 6.23: over-confident), their NIS between 0.85 and 1.08.
+    lie between 0.51 and 1.42 (1.8 and 6.23: over-confident), their NIS between 0.85 and 1.08.
     """
     runs = [run(seed, 100, steps) for seed in range(20)]
     assert lowest < np.median([squares for squares, _ in runs]) < highest
