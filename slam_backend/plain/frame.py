@@ -1,12 +1,12 @@
 """One robot's frame in the plain filter: predictions with explicit Jacobians, densities, landmark EKFs.
 
 Measurements are compared in the space in which they are made, (u, v, disparity) for a stereo camera and the camera
-frame for points with given covariances; the compiled kernels map innovations to metres in the map frame. Densities
-per pixel^3 are multiplied by the camera's constant f^3 b, which turns them into those that the kernels quote.
+frame for points with given covariances. Densities per pixel^3 are multiplied by the camera's constant f^3 b; they are
+then those of points in space, N(r; 0, S) Z^4, where r and S are measured in metres and Z is the predicted depth.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -15,17 +15,14 @@ from slam_backend._kernels import MIN_DEPTH
 from slam_backend.camera import ROBOT_FROM_CAMERA, StereoCamera
 from slam_backend.errors import FloatArray
 from slam_backend.measurements import Measurements
+from slam_backend.plain.pose_belief import turn_about_vertical
 
-
-def turn_about_vertical(theta: float) -> FloatArray:
-    """Return the 3 x 3 rotation by theta about the vertical axis."""
-    c, s = np.cos(theta), np.sin(theta)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+LOG_2PI = float(np.log(2.0 * np.pi))
 
 
 @dataclass
 class Landmark:
-    """One EKF: mean (3,) and covariance (3, 3) in the map frame, and how often it was measured."""
+    """One EKF: mean (3,) [m] and covariance (3, 3) [m^2] in the map frame, and how often it was measured."""
 
     mean: FloatArray
     covariance: FloatArray
@@ -33,82 +30,88 @@ class Landmark:
 
 
 @dataclass(frozen=True)
-class Prior:
-    """What is known of a pose: it is mean + root xi, xi ~ N(xi^, spread); N(0, 1) before any measurement."""
-
-    mean: FloatArray
-    root: FloatArray
-    xi: FloatArray = field(default_factory=lambda: np.zeros(3))
-    spread: FloatArray = field(default_factory=lambda: np.eye(3))
-
-    @property
-    def pose(self) -> FloatArray:
-        """The most probable pose."""
-        return self.mean + self.root @ self.xi
-
-    @property
-    def covariance(self) -> FloatArray:
-        """Of the pose."""
-        return self.root @ self.spread @ self.root.T
-
-
-@dataclass(frozen=True)
 class Innovation:
-    """Measured minus predicted (3,), its covariance S (3, 3), and how the prediction moves with the pose (3, 3)."""
+    """How far a measurement is from its prediction, and how far it may be.
+
+    Attributes:
+        innovation: (3,) measured minus predicted (z - z^), in the space of the measurement.
+        covariance: (3, 3) S, of the innovation.
+        by_pose: (3, 3) H = dz^ / d pose.
+        log_unit: Added to log-densities of the innovation, so that they are those of points in space.
+    """
 
     innovation: FloatArray
     covariance: FloatArray
     by_pose: FloatArray
     log_unit: float
-    cap: float = np.inf
 
     @cached_property
     def distance(self) -> float:
         """Squared Mahalanobis distance D (l. 19)."""
-        return min(self.cap, float(self.innovation @ np.linalg.solve(self.covariance, self.innovation)))
+        return float(self.innovation @ np.linalg.solve(self.covariance, self.innovation))
 
     @cached_property
-    def log_density(self) -> float:
-        """The log of N(innovation; 0, S) (Eq. 11), for image coordinates in the unit of the kernels."""
-        log_det = np.linalg.slogdet(2.0 * np.pi * self.covariance)[1]
-        return float(-0.5 * (self.distance + log_det)) + self.log_unit
+    def log_det(self) -> float:
+        """The log-determinant of S, for points in space."""
+        return float(np.linalg.slogdet(self.covariance)[1]) - 2.0 * self.log_unit
 
     @property
-    def cost(self) -> float:
-        """What choosing this landmark costs: -2 log density."""
-        return -2.0 * self.log_density
+    def log_density(self) -> float:
+        """Log N(innovation; 0, S) (Eq. 11), for points in space."""
+        return log_density(self.distance, self.log_det)
 
-    def within(self, cap: float) -> "Innovation":
-        """Return the same with a distance of at most `cap`: by the caller's word the match is right."""
-        return replace(self, cap=cap)
+    def widened(self, pose_covariance: FloatArray) -> "Innovation":
+        """Return the same where the pose is uncertain too: S + H P H^T."""
+        return replace(self, covariance=self.covariance + self.by_pose @ pose_covariance @ self.by_pose.T)
+
+    def in_terms_of(self, root: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return what the measurement tells of xi, where pose = x + root xi, at xi = 0.
+
+        Returns:
+            The information (3, 3) A^T S^-1 A, A = H root, and the gradient (3,) of D / 2, -A^T S^-1 (z - z^).
+        """
+        a = self.by_pose @ root
+        solved = np.linalg.solve(self.covariance, np.column_stack([a, self.innovation]))
+        return a.T @ solved[:, :3], -a.T @ solved[:, 3]
+
+
+def log_density(distance: float, log_det: float) -> float:
+    """Return the log of a Gaussian density in three dimensions, by D and log|S|."""
+    return -0.5 * (distance + log_det + 3.0 * LOG_2PI)
 
 
 class Frame:
     """The measurements of one robot in one step as vectors z (n, 3) with their noise covariances R (n, 3, 3).
 
     Args:
-        measurements: What the camera reported.
+        measurements: What the camera reported; None: nothing.
         kept: Indices of the measurements to be used.
         names: Of the landmarks measured, by the caller's word; None: unknown.
         camera: Its assumed model.
     """
 
     def __init__(
-        self, measurements: Measurements, kept: Sequence[int], names: Sequence[int] | None, camera: StereoCamera
+        self,
+        measurements: Measurements | None,
+        kept: Sequence[int],
+        names: Sequence[int] | None,
+        camera: StereoCamera,
     ) -> None:
+        seen = Measurements.empty() if measurements is None else measurements
+        rows = list(kept)
         self.camera = camera
         self.names = names
-        self.points = measurements.points[list(kept)]
-        self.descriptors = measurements.descriptors[list(kept)].astype(np.float64)
-        self.in_image = measurements.covariances is None
-        if measurements.covariances is None:
+        self.points = seen.points[rows]
+        self.descriptors = seen.descriptors[rows].astype(np.float64)
+        self.in_image = seen.covariances is None
+        if seen.covariances is None:
             self.z = camera.project(self.points)
             sigmas = [camera.sigma_px, camera.sigma_px, camera.sigma_disparity_px]
-            self.noises = np.tile(np.diag(np.square(sigmas)), (len(kept), 1, 1))
+            self.noises = np.tile(np.diag(np.square(sigmas)), (len(rows), 1, 1))
             self.log_unit = float(np.log(camera.focal_px**3 * camera.baseline))
         else:
             self.z = self.points
-            self.noises = measurements.covariances[kept]
+            self.noises = seen.covariances[rows]
             self.log_unit = 0.0
 
     def __len__(self) -> int:
@@ -134,27 +137,19 @@ class Frame:
         )
         return self.camera.project(point), by_point @ g, by_point @ h
 
-    def linearise(self, prior: Prior, landmark: Landmark, b: int) -> Innovation | None:
-        """Return the innovation of measurement b at the most probable pose, that pose taken as known (Eqs. 5-7)."""
-        prediction = self.predict(prior.pose, landmark.mean)
+    def compare(self, pose: FloatArray, landmark: Landmark, b: int) -> Innovation | None:
+        """Return how measurement b differs from what a known pose predicts (Eqs. 5-7); None if it cannot be seen."""
+        prediction = self.predict(pose, landmark.mean)
         if prediction is None:
             return None
         z_hat, g, h = prediction
         covariance = g @ landmark.covariance @ g.T + self.noises[b]  # Eq. 7
         return Innovation(self.z[b] - z_hat, covariance, h, self.log_unit)
 
-    def compare(self, prior: Prior, landmark: Landmark, b: int) -> Innovation | None:
-        """Return the same with the uncertainty of the pose included: what a gate tests."""
-        term = self.linearise(prior, landmark, b)
-        if term is None:
-            return None
-        covariance = term.covariance + term.by_pose @ prior.covariance @ term.by_pose.T
-        return replace(term, covariance=covariance)
-
-    def metres(self, prior: Prior, landmark: Landmark, b: int) -> float:
+    def metres(self, pose: FloatArray, landmark: Landmark, b: int) -> float:
         """Return how far a measured point lies from a landmark [m]; a camera's are scaled to the landmark's depth."""
-        offset = landmark.mean - [prior.pose[0], prior.pose[1], 0.0]
-        point = self.camera.camera_from_robot(turn_about_vertical(prior.pose[2]).T @ offset)
+        offset = landmark.mean - [pose[0], pose[1], 0.0]
+        point = self.camera.camera_from_robot(turn_about_vertical(pose[2]).T @ offset)
         scale = point[2] / self.points[b, 2] if self.in_image else 1.0
         return float(scale * np.linalg.norm(self.points[b] - point))
 
@@ -171,19 +166,16 @@ class Frame:
         to_map = turn @ ROBOT_FROM_CAMERA
         return Landmark(mean, to_map @ noise @ to_map.T)
 
-    def update(self, pose: FloatArray, landmark: Landmark, b: int, iterations: int) -> None:
-        """Improve a landmark by its measurement at a known pose: the EKF, linearised anew at each iteration."""
+    def update(self, pose: FloatArray, landmark: Landmark, b: int) -> None:
+        """Improve a landmark by its measurement at a known pose (EKF); one that cannot be seen is only counted."""
         landmark.count += 1
-        prior, sigma = landmark.mean.copy(), landmark.covariance
-        mean = prior.copy()
-        for _ in range(iterations):
-            prediction = self.predict(pose, mean)
-            if prediction is None:
-                return
-            z_hat, g, _ = prediction
-            s = g @ sigma @ g.T + self.noises[b]  # Eq. 7
-            gain = np.linalg.solve(s, g @ sigma).T  # Eq. 8
-            mean = prior + gain @ (self.z[b] - z_hat - g @ (prior - mean))  # Eq. 9
+        prediction = self.predict(pose, landmark.mean)
+        if prediction is None:
+            return
+        z_hat, g, _ = prediction
+        sigma = landmark.covariance
+        s = g @ sigma @ g.T + self.noises[b]  # Eq. 7
+        gain = np.linalg.solve(s, g @ sigma).T  # Eq. 8
+        landmark.mean = landmark.mean + gain @ (self.z[b] - z_hat)  # Eq. 9
         keep = np.eye(3) - gain @ g
-        landmark.mean = mean
         landmark.covariance = keep @ sigma @ keep.T + gain @ self.noises[b] @ gain.T  # Eq. 10, Joseph's form

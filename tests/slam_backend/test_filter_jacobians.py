@@ -7,19 +7,23 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from slam_backend import _kernels
 from slam_backend.camera import ROBOT_FROM_CAMERA, StereoCamera
 from slam_backend.errors import FloatArray
-from slam_backend.geometry import transform_points
+from slam_backend.filter import FastSlam
+from slam_backend.geometry import compose, inverse, transform_points
 from slam_backend.measurements import Measurements
-from slam_backend.plain.frame import Frame, turn_about_vertical
+from slam_backend.motion import OdometryModel
+from slam_backend.plain.frame import Frame
+from slam_backend.plain.pose_belief import turn_about_vertical
 
 CAMERA = StereoCamera(mount=(0.3, -0.2, 0.5))
-PARAMETERS = np.array([320.0, 0.12, 0.2, 0.1, *CAMERA.mount])
+NOISES = np.diag([CAMERA.sigma_px**2, CAMERA.sigma_px**2, CAMERA.sigma_disparity_px**2])
 LOOK = np.eye(1, 3, dtype=np.float32)
 
 poses = st.tuples(st.floats(-3.0, 3.0), st.floats(-3.0, 3.0), st.floats(-3.1, 3.1)).map(np.array)
+moves = st.tuples(st.floats(-0.3, 0.3), st.floats(-0.3, 0.3), st.floats(-0.2, 0.2)).map(np.array)
 points = st.tuples(st.floats(-2.0, 2.0), st.floats(-1.0, 1.0), st.floats(1.0, 6.0)).map(np.array)
+errors = st.tuples(*[st.floats(-2.0, 2.0)] * 3).map(np.array)
 HOW = pytest.mark.parametrize("is_given", [False, True], ids=["camera model", "given covariances"])
 
 
@@ -28,15 +32,10 @@ def derivative(function: Callable[[FloatArray], FloatArray], at: FloatArray, ste
     return np.column_stack([(function(at + d) - function(at - d)) / (2.0 * step) for d in step * np.eye(len(at))])
 
 
-def compiled_innovation(pose: FloatArray, mean: FloatArray, point: FloatArray, is_given: bool) -> FloatArray:
-    """Return what the kernels make of one measured point: r (3,), R (6,), depth."""
-    in_robot_axes = (ROBOT_FROM_CAMERA @ point)[None]
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    return np.array(
-        _kernels._innovation(
-            pose[0], pose[1], c, s, *mean, in_robot_axes, np.zeros((1, 6)), 0, is_given, PARAMETERS
-        )
-    )
+def seen_from(pose: FloatArray, mean: FloatArray, is_given: bool) -> FloatArray:
+    """Return the ideal measurement (3,) of a point in the map: in the camera frame, or (u, v, disparity)."""
+    point = CAMERA.camera_from_robot(transform_points(inverse(pose), mean))
+    return point if is_given else CAMERA.project(point)
 
 
 @HOW
@@ -45,40 +44,51 @@ def test_jacobians_of_the_plain_model(is_given: bool, pose: FloatArray, point: F
     """G and H are the derivatives of the prediction by landmark and by pose (Eq. 6)."""
     frame = Frame(Measurements(point[None], LOOK, np.eye(3)[None] if is_given else None), [0], None, CAMERA)
     mean = transform_points(pose, CAMERA.robot_from_camera(point))
-
-    def predict(pose: FloatArray, mean: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        prediction = frame.predict(pose, mean)
-        assert prediction is not None
-        return prediction
-
-    z_hat, g, h = predict(pose, mean)
+    prediction = frame.predict(pose, mean)
+    assert prediction is not None
+    z_hat, g, h = prediction
     np.testing.assert_allclose(z_hat, frame.z[0], atol=1e-9)
-    np.testing.assert_allclose(g, derivative(lambda m: predict(pose, m)[0], mean), rtol=1e-6, atol=1e-5)
-    np.testing.assert_allclose(h, derivative(lambda p: predict(p, mean)[0], pose), rtol=1e-6, atol=1e-5)
+    np.testing.assert_allclose(g, derivative(lambda m: seen_from(pose, m, is_given), mean), rtol=1e-6, atol=1e-5)
+    np.testing.assert_allclose(h, derivative(lambda p: seen_from(p, mean, is_given), pose), rtol=1e-6, atol=1e-5)
+
+
+def mapped(pose: FloatArray, point: FloatArray, is_given: bool, motion: OdometryModel) -> tuple[FastSlam, FloatArray]:
+    """Return a filter that knows one landmark, measured once without error from a known pose, and its covariance."""
+    covariance = 0.01 * np.eye(3) if is_given else CAMERA.covariance(point)
+    slam = FastSlam(1, 1, CAMERA, motion)
+    slam.step([None], [Measurements(point[None], LOOK, covariance[None] if is_given else None)], [[0]], [pose])
+    to_map = turn_about_vertical(pose[2]) @ ROBOT_FROM_CAMERA
+    return slam, to_map @ covariance @ to_map.T
 
 
 @HOW
-@given(pose=poses, point=points)
-def test_jacobian_of_the_compiled_model(is_given: bool, pose: FloatArray, point: FloatArray) -> None:
-    """The kernels' innovation in metres moves with the pose as their H says, and with the landmark as minus one."""
+@given(pose=poses, point=points, move=moves)
+def test_jacobians_of_the_compiled_model(is_given: bool, pose: FloatArray, point: FloatArray, move: FloatArray) -> None:
+    """A measurement as predicted leaves the pose, with the covariance (P0^-1 + H^T S^-1 H)^-1, H by differences."""
+    motion = OdometryModel(floor_position=0.05, floor_heading=0.02)
+    slam, landmark = mapped(pose, point, is_given, motion)
     mean = transform_points(pose, CAMERA.robot_from_camera(point))
-    np.testing.assert_allclose(compiled_innovation(pose, mean, point, is_given)[:3], 0.0, atol=1e-12)
-    by_pose = derivative(lambda p: compiled_innovation(p, mean, point, is_given)[:3], pose)
-    rows = np.array(_kernels._whitened(mean[0], mean[1], pose[0], pose[1], np.eye(3))).reshape(2, 3)
-    np.testing.assert_allclose(np.vstack([rows, np.zeros(3)]), by_pose, atol=1e-7)
-    by_landmark = derivative(lambda m: compiled_innovation(pose, m, point, is_given)[:3], mean)
-    np.testing.assert_allclose(by_landmark, -np.eye(3), atol=1e-7)
+    after = compose(pose, move)
+    z = seen_from(after, mean, is_given)
+    seen = z if is_given else CAMERA.triangulate(z)
+    slam.step([move], [Measurements(seen[None], LOOK, 0.02 * np.eye(3)[None] if is_given else None)], [[0]])
+    g = derivative(lambda m: seen_from(after, m, is_given), mean)
+    h = derivative(lambda p: seen_from(p, mean, is_given), after)
+    s = g @ landmark @ g.T + (0.02 * np.eye(3) if is_given else NOISES)
+    turn = turn_about_vertical(pose[2])
+    prior = turn @ np.diag(motion.sigmas(move) ** 2) @ turn.T
+    expected = np.linalg.inv(np.linalg.inv(prior) + h.T @ np.linalg.solve(s, h))
+    np.testing.assert_allclose(slam.pose().covariance, expected, rtol=1e-5, atol=1e-9)
+    np.testing.assert_allclose(seen_from(slam.pose().mean, mean, True), seen_from(after, mean, True), atol=1e-9)
 
 
-@given(pose=poses, point=points, noise=st.tuples(*[st.floats(-2.0, 2.0)] * 3).map(np.array))
-def test_innovation_is_that_of_the_image_coordinates(pose: FloatArray, point: FloatArray, noise: FloatArray) -> None:
-    """The kernels' innovation is triangulation's Jacobian at the predicted point times that of (u, v, disparity)."""
-    pixels = CAMERA.project(point)
+@given(pose=poses, point=points, error=errors)
+def test_innovation_is_that_of_the_image_coordinates(pose: FloatArray, point: FloatArray, error: FloatArray) -> None:
+    """What the compiled filter, which works in metres, calls NIS is that of (u, v, disparity)."""
+    slam, landmark = mapped(pose, point, False, OdometryModel())
     mean = transform_points(pose, CAMERA.robot_from_camera(point))
-    values = compiled_innovation(pose, mean, CAMERA.triangulate(pixels + noise), is_given=False)
-    to_map = turn_about_vertical(pose[2]) @ ROBOT_FROM_CAMERA
-    jacobian = to_map @ derivative(CAMERA.triangulate, pixels, 1e-4)
-    np.testing.assert_allclose(values[:3], jacobian @ noise, rtol=1e-5, atol=1e-7)
-    noises = to_map @ CAMERA.covariance(point) @ to_map.T
-    np.testing.assert_allclose(values[3:9], noises[np.triu_indices(3)], atol=1e-9)
-    assert values[9] == pytest.approx(point[2])
+    seen = CAMERA.triangulate(CAMERA.project(point) + error)
+    report = slam.step([None], [Measurements(seen[None], LOOK)], [[0]], [pose])
+    g = derivative(lambda m: seen_from(pose, m, False), mean)
+    s = g @ landmark @ g.T + NOISES
+    assert report.nis == pytest.approx(error @ np.linalg.solve(s, error), rel=1e-5, abs=1e-9)

@@ -1,0 +1,37 @@
+"""What all particles together say: mixtures of their Gaussians, of a pose and of landmarks."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from slam_backend.errors import FloatArray
+from slam_backend.geometry import wrap_angle
+from slam_backend.plain.frame import Landmark
+from slam_backend.plain.pose_belief import PoseBelief
+from slam_backend.reports import PoseEstimate
+
+
+def pose_mixture(beliefs: Sequence[PoseBelief], weights: FloatArray) -> PoseEstimate:
+    """Return mean and covariance of a weighted mixture of Gaussian poses; headings are averaged on the circle."""
+    means = np.array([belief.mean for belief in beliefs])
+    theta = np.arctan2(weights @ np.sin(means[:, 2]), weights @ np.cos(means[:, 2]))
+    mean = np.array([weights @ means[:, 0], weights @ means[:, 1], wrap_angle(theta)])
+    covariance = np.zeros((3, 3))
+    for belief, weight in zip(beliefs, weights, strict=True):
+        offset = belief.mean - mean
+        offset[2] = wrap_angle(offset[2])
+        covariance += weight * (belief.covariance + np.outer(offset, offset))
+    return PoseEstimate(mean, covariance)
+
+
+def landmark_mixture(landmarks: Sequence[Landmark], weights: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return mean (3,) and covariance (3, 3) of a weighted mixture of the particles' estimates of one landmark.
+
+    sum w_m (Sigma_m + (mu_m - mu)(mu_m - mu)^T), with the weights scaled to sum to 1.
+    """
+    shares = weights / weights.sum()
+    mean: FloatArray = sum((share * one.mean for share, one in zip(shares, landmarks, strict=True)), np.zeros(3))
+    covariance = np.zeros((3, 3))
+    for share, one in zip(shares, landmarks, strict=True):
+        covariance += share * (one.covariance + np.outer(one.mean - mean, one.mean - mean))
+    return mean, covariance

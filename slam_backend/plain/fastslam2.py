@@ -1,0 +1,190 @@
+"""One robot's turn with the proposal of FastSLAM 2.0: the measurements shape the pose that is sampled.
+
+Montemerlo et al., FastSLAM 2.0 (IJCAI 2003), for frames of several measurements with unknown association: what is
+beyond doubt at the predicted pose refines the pose; there every measurement is matched, held back or becomes a
+landmark; the matches give the Gaussian from which the pose is sampled, and the weight.
+"""
+
+import numpy as np
+
+from slam_backend.errors import FloatArray
+from slam_backend.filter_options import FilterOptions
+from slam_backend.plain.frame import Frame, Innovation, log_density
+from slam_backend.plain.pose_belief import PoseBelief, WhitenedPose, lower_root
+from slam_backend.plain.turn import NEW, REJECTED, Candidates, Landmarks, Turn
+
+WIDE_HEADING = 0.03  # [rad]; a predicted heading less certain than this asks for more iterations
+MORE_ITERATIONS = 3
+
+Gates = dict[tuple[int, int], Innovation]  # by measurement and landmark, for the candidates that can be seen
+
+
+def fastslam2_turn(
+    landmarks: Landmarks,
+    prior: PoseBelief,
+    frame: Frame,
+    candidates: Candidates,
+    normals: FloatArray,
+    options: FilterOptions,
+    is_exact: bool,
+) -> Turn:
+    """Associate in two passes, sample the pose, weigh the particle and update its map.
+
+    Args:
+        landmarks: The particle's map; it is changed.
+        prior: Of the pose, after the motion.
+        frame: What the robot measured, at least one measurement.
+        candidates: Per measurement the landmarks of the particle that may have caused it.
+        normals: (3,) standard normal numbers, from which the pose is sampled.
+        options: Of the filter.
+        is_exact: Whether the caller gave the pose, which is then never doubted.
+    """
+    predicted = WhitenedPose.before_measurements(prior.mean, lower_root(prior.covariance))
+    iterations = 1 + MORE_ITERATIONS * bool(prior.covariance[2, 2] > WIDE_HEADING**2)
+    gates = gates_at(predicted, landmarks, frame, candidates)  # pass A
+    if options.recovery_position > 0.0 and not is_exact and is_lost(gates, candidates, options):
+        doubt = np.diag([options.recovery_position, options.recovery_position, options.recovery_heading])
+        predicted, iterations = WhitenedPose.before_measurements(prior.mean, doubt), 1 + MORE_ITERATIONS
+        gates = gates_at(predicted, landmarks, frame, candidates)
+    tentative = beyond_doubt(gates, frame, candidates, options)
+    refined = refine(predicted, landmarks, frame, tentative, iterations, options.position_gate)
+    chosen, log_unmatched = decide(refined, landmarks, frame, candidates, options)  # pass B
+    matches = {b: name for b, name in enumerate(chosen) if name >= 0}
+    posterior, log_evidence = pose_given(refined, landmarks, frame, matches)
+    pose = posterior.sample(normals)
+    for b, name in enumerate(chosen):
+        if name >= 0:
+            frame.update(pose, landmarks[name], b)
+        elif name != REJECTED:
+            landmarks[name] = frame.new_landmark(pose, b)
+    distances = [np.nan] * len(frame)
+    for b, name in matches.items():
+        distances[b] = gates[b, name].distance if (b, name) in gates else np.inf
+    belief = PoseBelief(posterior.pose, posterior.covariance)
+    return Turn(belief, pose, chosen, distances, log_unmatched + log_evidence)
+
+
+def gates_at(here: WhitenedPose, landmarks: Landmarks, frame: Frame, candidates: Candidates) -> Gates:
+    """Compare each measurement with each of its candidates that can be seen, the doubt about the pose included."""
+    gates: Gates = {}
+    for b, possible in enumerate(candidates):
+        for _, name in possible:
+            term = frame.compare(here.pose, landmarks[name], b)
+            if term is not None:
+                gates[b, name] = term.widened(here.covariance)
+    return gates
+
+
+def is_lost(gates: Gates, candidates: Candidates, options: FilterOptions) -> bool:
+    """Tell whether three or more, and most, of the measurements with one look-alike contradict the prior."""
+    verdicts = []
+    for b, possible in enumerate(candidates):
+        looks = [e / options.descriptor_sigma**2 for e, _ in possible]
+        if looks and (len(looks) == 1 or looks[1] - looks[0] >= options.ambiguity):
+            gate = gates.get((b, possible[0][1]))
+            verdicts.append(gate is None or gate.distance > options.position_gate)
+    return sum(verdicts) >= 3 and 2 * sum(verdicts) > len(verdicts)
+
+
+def beyond_doubt(gates: Gates, frame: Frame, candidates: Candidates, options: FilterOptions) -> dict[int, int]:
+    """Match, at the predicted pose, each measurement that has one good candidate and no good second."""
+    matches: dict[int, int] = {}
+    for b, possible in enumerate(candidates):
+        costs = []
+        for e, name in possible:
+            gate = gates.get((b, name))
+            if gate is not None and (frame.names is not None or gate.distance <= options.position_gate):
+                costs.append((gate.distance + gate.log_det + e / options.descriptor_sigma**2, name))
+        costs.sort()
+        if not costs or (len(costs) > 1 and costs[1][0] - costs[0][0] < options.ambiguity):
+            continue
+        name = costs[0][1]
+        if not (options.one_to_one and name in matches.values()):
+            matches[b] = name
+    return matches
+
+
+def refine(
+    predicted: WhitenedPose,
+    landmarks: Landmarks,
+    frame: Frame,
+    matches: dict[int, int],
+    iterations: int,
+    scale: float,
+) -> WhitenedPose:
+    """Go towards the mode of p(pose, matched measurements) by Gauss-Newton, with weights 1 / (1 + D / scale) (Cauchy).
+
+    D counts what is known of the pose so far: one wrong match hardly counts once the right ones agree.
+    """
+    here = predicted
+    for _ in range(iterations):
+        information, gradient = np.eye(3), here.xi
+        for b, name in matches.items():
+            term = frame.compare(here.pose, landmarks[name], b)
+            if term is None:
+                continue
+            weight = 1.0 / (1.0 + term.widened(here.covariance).distance / scale)
+            told, slope = term.in_terms_of(here.root)
+            information = information + weight * told
+            gradient = gradient + weight * slope
+        here = here.at(here.xi - np.linalg.solve(information, gradient), information)
+    return here
+
+
+def decide(
+    refined: WhitenedPose, landmarks: Landmarks, frame: Frame, candidates: Candidates, options: FilterOptions
+) -> tuple[list[int], float]:
+    """Match, hold back, pass over or start a landmark, measurement by measurement, at the refined pose.
+
+    Returns:
+        The choices, and the log-likelihood of the measurements that were not matched.
+    """
+    gates = gates_at(refined, landmarks, frame, candidates)
+    chosen: list[int] = []
+    total = 0.0
+    for b, possible in enumerate(candidates):
+        is_dead = False
+        costs = []
+        for e, name in possible:
+            gate = gates.get((b, name))
+            if gate is None:
+                continue
+            distance = gate.distance if frame.names is None else min(gate.distance, options.position_gate)
+            is_dead |= distance <= options.dead_zone
+            is_dead |= frame.metres(refined.pose, landmarks[name], b) <= options.dead_radius
+            if distance <= options.position_gate and not (options.one_to_one and name in chosen):
+                cost = distance + gate.log_det + e / options.descriptor_sigma**2
+                costs.append((cost, name, log_density(distance, gate.log_det)))
+        costs.sort()
+        if len(costs) > 1 and costs[1][0] - costs[0][0] < options.ambiguity:
+            chosen.append(REJECTED)  # held back; yet it is explained as well as its better candidate explains it
+            total += costs[0][2]
+        elif costs:
+            chosen.append(costs[0][1])
+        else:
+            chosen.append(REJECTED if is_dead else NEW - b)
+            total += frame.log_clutter(b, options.new_landmark_density)
+    return chosen, total
+
+
+def pose_given(
+    refined: WhitenedPose, landmarks: Landmarks, frame: Frame, matches: dict[int, int]
+) -> tuple[WhitenedPose, float]:
+    """Return the posterior of the pose given the matched measurements, linearised at the refined pose.
+
+    Returns:
+        The posterior, and the log-evidence of the measurements: of the linearised model, without approximation.
+    """
+    xi = refined.xi
+    information, gradient = np.eye(3), xi
+    log_evidence = -0.5 * float(xi @ xi)
+    for b, name in matches.items():
+        term = frame.compare(refined.pose, landmarks[name], b)
+        assert term is not None, "what cannot be seen from the refined pose is not matched there"
+        told, slope = term.in_terms_of(refined.root)
+        information = information + told
+        gradient = gradient + slope
+        log_evidence += term.log_density
+    step = np.linalg.solve(information, gradient)
+    log_evidence += 0.5 * float(gradient @ step - np.linalg.slogdet(information)[1])
+    return refined.at(xi - step, information), log_evidence

@@ -1,0 +1,54 @@
+"""What goes into and comes out of one robot's turn, whatever the proposal: in one particle, and in all."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from slam_backend.errors import FloatArray
+from slam_backend.plain.frame import Landmark
+from slam_backend.plain.pose_belief import PoseBelief
+
+REJECTED = -1
+NEW = -2  # minus b: the landmark that measurement b starts, until all particles have decided and it gets its name
+
+Landmarks = dict[int, Landmark]  # one particle's map, by name
+Candidates = list[list[tuple[float, int]]]  # per measurement (squared descriptor distance E, landmark), nearest first
+
+
+@dataclass(frozen=True)
+class Turn:
+    """What one particle made of one robot's step.
+
+    Attributes:
+        posterior: Of the pose, before it was sampled.
+        pose: (3,) the sample [m, m, rad].
+        chosen: Per measurement the landmark to which it was given, `REJECTED`, or `NEW` minus its number.
+        distances: Per measurement the squared Mahalanobis distance of its match at the predicted pose, infinite
+            where the match could not be seen from there; NaN where nothing was matched.
+        log_likelihood: Of the measurements, given the particle's past.
+    """
+
+    posterior: PoseBelief
+    pose: FloatArray
+    chosen: list[int]
+    distances: list[float]
+    log_likelihood: float
+
+
+class RobotStep:
+    """What one robot's step came to: per measurement of its frame (n) and per particle (M).
+
+    Attributes:
+        associations: (n, M) int64. The landmark to which the particle gave the measurement; -1: to none.
+        distances: (n, M) float64. Squared Mahalanobis distance of the match; NaN where there is none.
+        created: (n,) int64. The landmark that the measurement started in at least one particle; -1: none.
+        log_likelihoods: (M,) float64. What the particle's weight is multiplied by.
+        measured: Whether a measurement was used.
+    """
+
+    def __init__(self, size: int, num_particles: int) -> None:
+        self.associations = np.full((size, num_particles), -1, np.int64)
+        self.distances = np.full((size, num_particles), np.nan)
+        self.created = np.full(size, -1, np.int64)
+        self.log_likelihoods = np.zeros(num_particles)
+        self.measured = False
