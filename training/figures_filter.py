@@ -56,9 +56,12 @@ def draw_speed(file: Path, result: BenchResult) -> None:
 def _draw_panel(ax: Axes, rows: Sequence[Row], name: str) -> None:
     """Draw one line for each proposal, and for each number of particles unless these are the abscissa."""
     ways = sorted({(str(row.load.proposal), 0 if name == "particles" else row.load.particles) for row in rows})
+    longest = len({getattr(row.load, name) for row in rows})
     for proposal, particles in ways:
         line = [row for row in rows if row.load.proposal == proposal and particles in (0, row.load.particles)]
         line.sort(key=lambda row: int(getattr(row.load, name)))
+        if len(line) < longest:  # rows that were timed for another panel
+            continue
         x, low, median, high, bound = _columns(line, name)
         colour = COLOURS[proposal]
         ax.plot(x, median, color=colour, marker="o", ms=4)
