@@ -8,12 +8,13 @@ from numpy.typing import NDArray
 from slam_backend import _kernels
 from slam_backend._kernels import LANES
 from slam_backend._particle_maps import aligned
-from slam_backend.camera import ROBOT_FROM_CAMERA
 from slam_backend.errors import FloatArray, IntArray
 from slam_backend.measurements import Measurements
 
 UPPER = np.triu_indices(3)  # where the six stored elements of a covariance stand in the full matrix
 EMPTY = Measurements.empty(0)
+NO_COVARIANCES = np.zeros((0, 3, 3))
+NO_COVARIANCES.setflags(write=False)
 
 
 class Turn(NamedTuple):
@@ -70,6 +71,7 @@ class FrameBuffers:
         self.records: FloatArray = aligned((0, _kernels.CANDIDATE_ROWS * LANES), np.float64)
         self._found: NDArray[np.int32] = np.zeros((0, padded), dtype=np.int32)
         self._distances: FloatArray = np.zeros((0, padded))
+        self._new_slots: IntArray = np.zeros(0, dtype=np.int64)
 
     def start(self, most: int) -> None:
         """Begin a step with at most `most` measurements."""
@@ -78,6 +80,7 @@ class FrameBuffers:
         if most > len(self._found):
             self._found = np.zeros((2 * most, self.padded), dtype=np.int32)
             self._distances = np.zeros((2 * most, self.padded))
+            self._new_slots = np.zeros(2 * most, dtype=np.int64)
 
     def make_room(self, candidates: int) -> None:
         """Provide working space for so many candidates."""
@@ -86,29 +89,23 @@ class FrameBuffers:
 
     def take(self, robot: int, frame: Measurements | None, names: IntArray | None) -> Turn:
         """Return a robot's readings as the kernels take them, with room for what becomes of them."""
-        frame = EMPTY if frame is None else frame
-        size = len(frame)
+        if frame is None:
+            frame = EMPTY
         points, covariances, descriptors = frame.points, frame.covariances, frame.descriptors
-        keep = np.arange(size)
+        size = len(points)
         if names is not None and size and names.min() < 0:
             keep = np.flatnonzero(names >= 0)
             points, descriptors, names = points[keep], descriptors[keep], names[keep]
             covariances = None if covariances is None else covariances[keep]
-        num = len(points)
-        noises = np.zeros((num, 6))
-        if covariances is not None and num:
-            noises[:] = (ROBOT_FROM_CAMERA @ covariances @ ROBOT_FROM_CAMERA.T)[:, *UPPER]
-        first = self.used
-        self.used += num
+            for array in (points, descriptors, covariances):
+                if array is not None:
+                    array.setflags(write=False)  # as those of a frame: kernels are compiled once
+        else:
+            keep = np.arange(size)
+        points, noises = _kernels.to_robot_axes(points, NO_COVARIANCES if covariances is None else covariances)
+        first, num = self.used, len(points)
+        self.used = last = first + num
         return Turn(
-            size=size,
-            keep=keep,
-            points=points @ ROBOT_FROM_CAMERA.T,
-            noises=noises,
-            given=covariances is not None,
-            descriptors=descriptors,
-            names=names,
-            found=self._found[first : first + num],
-            distances=self._distances[first : first + num],
-            new_slots=np.full(num, _kernels.REJECTED, dtype=np.int64),
-        )
+            size, keep, points, noises, covariances is not None, descriptors, names,
+            self._found[first:last], self._distances[first:last], self._new_slots[first:last],
+        )  # fmt: skip

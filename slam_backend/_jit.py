@@ -61,5 +61,5 @@ def _bits_float(typing_context: Any, x: Any) -> Any:
     return types.float64(types.int64), code
 
 
-float_bits: Callable[[float], int] = intrinsic(_float_bits)
-bits_float: Callable[[int], float] = intrinsic(_bits_float)
+float_bits = cast(Callable[[float], int], intrinsic(_float_bits))
+bits_float = cast(Callable[[int], float], intrinsic(_bits_float))

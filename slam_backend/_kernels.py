@@ -6,7 +6,7 @@ flat workspace, which the compiler turns into vector instructions; decisions bec
 
 Landmarks lie in `values[row, block, c, lane]` (flattened) with c = (x, y, z, Sxx, Sxy, Sxz, Syy, Syz, Szz) in the map
 frame, and `counts[row, particle]` says how often the particle saw it (0: it does not hold it). Resampling does not move
-them: see `_particle_maps.py`, which also says what `row_of`, `map_of` and `maps` are. Everything is expressed in the
+them: see `_particle_maps.py`, which says what `row_of`, `map_of` and `maps` are. Everything is expressed in the
 map frame, where the derivative of a measured point with respect to the landmark is the identity (the robot only yaws).
 
 The measurement model (Eqs. 5-7). A landmark mu lies at e = mu - p from the camera centre p. A point v measured in the
@@ -24,10 +24,9 @@ uncertain is r^T S^-1 r - g^T (L + J)^-1 g (Woodbury), its log-determinant log|S
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam_backend._jit import bits_float, float_bits, jit, lanes, lanes_inlined
-from slam_backend.errors import FloatArray, Int32Array, IntArray
+from slam_backend.errors import Float32Array, FloatArray, Int32Array, IntArray
 
 LANES = 32
 REJECTED = -1
@@ -35,6 +34,7 @@ MIN_DEPTH = 0.05  # [m]; nothing is predicted nearer to the camera plane than th
 MIN_CONTRADICTIONS = 3.0  # three points fix a pose with one to spare
 WIDE_HEADING = 0.03  # [rad]; where the heading is less sure, one step of Gauss-Newton is not enough
 ZERO_PIVOT = 1e-12  # relative to the variance: below it a direction is taken to be exact
+FAR = np.float32(1e18)  # no descriptor comes near a free slot's
 LOG_2PI = math.log(2.0 * math.pi)
 HALF_PI_HIGH = 1.5707963267341256  # pi / 2 in two parts: the first has 33 bits, so that small multiples are exact
 HALF_PI_LOW = 6.077100506506192e-11
@@ -64,6 +64,7 @@ Q_SQUARE, Q_DET, Q_DET_POSE, Q_DEPTH, Q_METRES2, Q_D, Q_FIRST_D, Q_HELD = (LANES
 CANDIDATE_ROWS = 17
 
 TILE = 9 * LANES
+RUN = 64  # descriptors looked at together
 SHIFT = LANES.bit_length() - 1  # particle m is lane m & (LANES - 1) of block m >> SHIFT
 
 
@@ -346,7 +347,8 @@ def _log_likelihood(work: FloatArray, i: int) -> float:
     log_depth = _log(work[DEPTHS + i]) + LN2 * work[DEPTHS_EXP + i]
     matched: float = work[SUM_D + i] + 3.0 * LOG_2PI * work[MATCHED + i] + log_det
     unmatched: float = work[CLUTTER + i]
-    return -0.5 * matched + 4.0 * log_depth + unmatched
+    total: float = -0.5 * matched + 4.0 * log_depth + unmatched
+    return total
 
 
 @lanes
@@ -872,18 +874,80 @@ def _open_slot(
 
 
 @jit
+def extent(points: FloatArray) -> tuple[float, float]:
+    """Return the smallest depth Z and the largest coordinate, by magnitude, of points (n, 3), camera frame."""
+    nearest, farthest = np.inf, 0.0
+    for n in range(len(points)):
+        nearest = min(nearest, points[n, 2])
+        for c in range(3):
+            farthest = max(farthest, abs(points[n, c]))
+    return nearest, farthest
+
+
+@jit
+def to_robot_axes(points: FloatArray, covariances: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Turn points (n, 3) and covariances (n, 3, 3), or none (0, 3, 3), from camera axes to the robot's.
+
+    Returns:
+        (n, 3) relative to the camera centre, x ahead, y left, z up; (n, 6) upper triangles by rows, zeros for none.
+    """
+    n = len(points)
+    turned = np.empty((n, 3))
+    noises = np.zeros((n, 6))
+    for i in range(n):
+        turned[i, 0], turned[i, 1], turned[i, 2] = points[i, 2], -points[i, 0], -points[i, 1]
+    for i in range(len(covariances)):
+        noises[i, 0], noises[i, 1], noises[i, 2] = covariances[i, 2, 2], -covariances[i, 2, 0], -covariances[i, 2, 1]
+        noises[i, 3], noises[i, 4], noises[i, 5] = covariances[i, 0, 0], covariances[i, 0, 1], covariances[i, 1, 1]
+    return turned, noises
+
+
+@lanes
+def _head_distances(
+    measured: Float32Array, b: int, heads: Float32Array, stride: int, n: int, out: Float32Array
+) -> None:
+    """Write the squared distances over every `stride`-th component between a measured and all stored descriptors."""
+    for slot in range(n):
+        out[slot] = np.float32(0.0)
+    for k in range(heads.shape[0]):
+        value = measured[b, k * stride]
+        row = heads[k]
+        for slot in range(n):
+            difference = value - row[slot]
+            out[slot] += difference * difference
+
+
+@lanes
+def _hits(partial: Float32Array, limit: float, hits: IntArray) -> int:
+    """Write the indices of the entries up to `limit`, ascending; return how many. Runs without one are skipped."""
+    count, n = 0, len(partial)
+    for first in range(0, n, RUN):
+        last = min(first + RUN, n)
+        run = partial[first:last]
+        inside = 0
+        for i in range(len(run)):
+            inside += 1 if run[i] <= limit else 0
+        if inside > 0:
+            for i in range(len(run)):
+                if run[i] <= limit:
+                    hits[count] = first + i
+                    count += 1
+    return count
+
+
+@jit
 def find_candidates(
-    products: NDArray[np.float32], measured: NDArray[np.float32], stored: NDArray[np.float32],
-    half_norms: NDArray[np.float32], ids: IntArray, names: IntArray, identities: IntArray, named: bool, gate: float,
+    measured: Float32Array, stored: Float32Array, heads: Float32Array, ids: IntArray, names: IntArray,
+    identities: IntArray, named: bool, gate: float,
 ) -> tuple[IntArray, IntArray, FloatArray, IntArray, IntArray, IntArray]:
     """List for each measurement the landmarks that may have caused it, nearest descriptor first.
 
+    Some components alone rule most landmarks out, for all particles at once; the others are compared in full.
+
     Args:
-        products: (B, n) scalar products of measured and stored descriptors: what makes the search one matrix product
-            for all particles. Distances near the gate are computed anew, so that its rounding decides nothing.
         measured: (B, d) descriptors of the frame.
         stored: (n, d) descriptors of the landmarks.
-        half_norms: (n,) half of their squared lengths; infinite where the slot is free.
+        heads: (h, n) every (d / h)-th component of them; large where the slot is free.
         ids: (n,) stable names of the landmarks, -1 = free; equal distances are ordered by them.
         names: (B,) the caller's names of the measurements, if `named`.
         identities: (n,) the caller's names of the landmarks.
@@ -894,26 +958,31 @@ def find_candidates(
         starts (B + 1,) of each measurement's candidates; per candidate its slot, squared distance E, measurement, and
         the previous candidate with the same slot (-1: none); and all these slots, each once.
     """
-    num, n = measured.shape[0], len(ids)  # products are looked at where there are measurements and no names
+    num, n = measured.shape[0], len(ids)
+    while n > 0 and ids[n - 1] < 0:
+        n -= 1
     starts = np.zeros(num + 1, dtype=np.int64)
     size = 4 * num + 16
     slots = np.empty(size, dtype=np.int64)
     squares = np.empty(size)
+    partial = np.empty(n, dtype=np.float32)
+    hits = np.empty(n, dtype=np.int64)
+    stride = measured.shape[1] // max(heads.shape[0], 1)
+    limit = 1.0001 * gate + 1e-4  # rounding of single precision decides nothing
     total = 0
     for b in range(num):
         starts[b] = total
-        threshold = np.inf
-        if not named:
-            norm = 0.0
-            for j in range(measured.shape[1]):
-                norm += float(measured[b, j]) * float(measured[b, j])
-            threshold = 0.5 * (norm - gate * 1.001 - 1e-3)
-        for slot in range(n):
-            if named:
-                if identities[slot] != names[b] or ids[slot] < 0:
-                    continue
-            elif products[b, slot] - half_norms[slot] < threshold:
-                continue
+        if named:
+            count = 0
+            for slot in range(n):
+                if identities[slot] == names[b] and ids[slot] >= 0:
+                    hits[count] = slot
+                    count += 1
+        else:
+            _head_distances(measured, b, heads, stride, n, partial)
+            count = _hits(partial, limit, hits)
+        for k in range(count):
+            slot = hits[k]
             e = 0.0
             for j in range(measured.shape[1]):
                 difference = float(measured[b, j]) - float(stored[slot, j])
@@ -1440,8 +1509,8 @@ def mixture(means: FloatArray, covariances: FloatArray, weights: FloatArray) -> 
 
 @jit
 def name_new(
-    new_slots: IntArray, measured: NDArray[np.float32], names: IntArray, named: bool, ids: IntArray,
-    identities: IntArray, stored: NDArray[np.float32], half_norms: NDArray[np.float32], tops: IntArray,
+    new_slots: IntArray, measured: Float32Array, names: IntArray, named: bool, ids: IntArray,
+    identities: IntArray, stored: Float32Array, heads: Float32Array, tops: IntArray,
 ) -> None:
     """Give the landmarks that a frame has started their lasting names `tops[2]`, ..., in the order of measurements.
 
@@ -1449,7 +1518,7 @@ def name_new(
         new_slots: (B,) slot of the landmark that each measurement started, -1 = none.
         measured: (B, d) descriptors; a landmark takes that of its first measurement.
         names: (B,) the caller's names, if `named`.
-        ids, identities, stored, half_norms, tops: The store, see `ParticleMaps`.
+        ids, identities, stored, heads, tops: The store, see `ParticleMaps`.
     """
     for b in range(len(new_slots)):
         slot = new_slots[b]
@@ -1458,11 +1527,10 @@ def name_new(
         ids[slot] = tops[2]
         tops[2] += 1
         identities[slot] = names[b] if named else -1
-        norm = 0.0
         for j in range(measured.shape[1]):
             stored[slot, j] = measured[b, j]
-            norm += float(measured[b, j]) * float(measured[b, j])
-        half_norms[slot] = 0.5 * norm
+        for k in range(heads.shape[0]):
+            heads[k, slot] = measured[b, k * (measured.shape[1] // heads.shape[0])]
 
 
 @jit
@@ -1537,76 +1605,80 @@ def settle(ancestors: IntArray, count: int) -> tuple[IntArray, IntArray]:
 
 
 @jit
-def copy_particles(
-    poses: FloatArray, starts: FloatArray, means: FloatArray, covariances: FloatArray, path_log_weights: FloatArray,
-    targets: IntArray, sources: IntArray,
-) -> None:
-    """Copy what particles hold beside their maps onto others, in place; no target is a source."""
-    for i in range(len(targets)):
-        target, source = targets[i], sources[i]
-        path_log_weights[target] = path_log_weights[source]
-        for robot in range(poses.shape[0]):
-            for c in range(3):
+def resample(
+    ancestors: IntArray, poses: FloatArray, starts: FloatArray, means: FloatArray, covariances: FloatArray,
+    path_log_weights: FloatArray, maps: Int32Array, users: IntArray, map_of: IntArray, ids: IntArray,
+    row_of: IntArray, counts: Int32Array, heads: Float32Array, free_rows: IntArray, free_slots: IntArray,
+    tops: IntArray,
+) -> int:
+    """Let particles become copies of their ancestors, their landmarks lazily, and free what no survivor holds.
+
+    Landmarks that were up to date get one new ancestor map; the others' maps are composed with it.
+
+    Args:
+        ancestors: (M,) index of each new particle's parent, ascending; they are settled first.
+        poses, starts, means, covariances: (K, c, P); columns are copied.
+        path_log_weights: (M,), likewise.
+        maps and the following: The store, see `ParticleMaps`. At least one map is free.
+
+    Returns:
+        How many maps are still free.
+    """
+    count = len(ancestors)
+    targets, sources = settle(ancestors, count)
+    moves = len(targets)
+    for i in range(moves):
+        path_log_weights[targets[i]] = path_log_weights[sources[i]]
+    for robot in range(poses.shape[0]):
+        for c in range(3):
+            for i in range(moves):
+                target, source = targets[i], sources[i]
                 poses[robot, c, target] = poses[robot, c, source]
                 starts[robot, c, target] = starts[robot, c, source]
                 means[robot, c, target] = means[robot, c, source]
-            for c in range(6):
-                covariances[robot, c, target] = covariances[robot, c, source]
-
-
-@jit
-def release(
-    slot: int, ids: IntArray, row_of: IntArray, map_of: IntArray, users: IntArray, half_norms: NDArray[np.float32],
-    free_rows: IntArray, free_slots: IntArray, tops: IntArray,
-) -> None:
-    """Give back a slot that no particle holds."""
-    ids[slot] = -1
-    half_norms[slot] = np.inf
-    if map_of[slot] > 0:
-        users[map_of[slot]] -= 1
-        map_of[slot] = 0
-    free_rows[tops[0]] = row_of[slot]
-    free_slots[tops[1]] = slot
-    tops[0] += 1
-    tops[1] += 1
-
-
-@jit
-def compose_maps(
-    targets: IntArray, sources: IntArray, maps: Int32Array, users: IntArray, map_of: IntArray, ids: IntArray,
-    row_of: IntArray, counts: Int32Array, half_norms: NDArray[np.float32], free_rows: IntArray, free_slots: IntArray,
-    tops: IntArray, num_particles: int,
-) -> None:
-    """Let the landmarks of all particles follow a resampling without moving them, and free what no survivor holds.
-
-    Landmarks that were up to date get one new ancestor map, the others' maps are composed with it.
-    """
-    moved = len(targets) > 0
+        for c in range(6):
+            for i in range(moves):
+                covariances[robot, c, targets[i]] = covariances[robot, c, sources[i]]
+    fresh, free = 0, 0
     for e in range(1, len(users)):
         if users[e] > 0:
-            for i in range(len(targets)):
-                maps[e, targets[i]] = maps[e, sources[i]]
-    fresh = 0
+            own = maps[e]
+            for i in range(moves):
+                own[targets[i]] = own[sources[i]]
+        else:
+            fresh = e
+            free += 1
+    used = False
     for slot in range(len(ids)):
         if ids[slot] < 0:
             continue
-        if moved and map_of[slot] == 0:
-            if fresh == 0:
-                fresh = 1
-                while users[fresh] > 0:
-                    fresh += 1
-                for m in range(maps.shape[1]):
-                    maps[fresh, m] = m
-                for i in range(len(targets)):
-                    maps[fresh, targets[i]] = sources[i]
+        if moves > 0 and map_of[slot] == 0:
+            if not used:
+                used = True
+                free -= 1
+                own = maps[fresh]
+                for m in range(len(own)):
+                    own[m] = m
+                for i in range(moves):
+                    own[targets[i]] = sources[i]
             map_of[slot] = fresh
             users[fresh] += 1
         e = map_of[slot]
         row = row_of[slot]
         alive = False
-        for m in range(num_particles):
+        for m in range(count):
             if counts[row, maps[e, m] if e > 0 else m] > 0:
                 alive = True
                 break
         if not alive:
-            release(slot, ids, row_of, map_of, users, half_norms, free_rows, free_slots, tops)
+            if e > 0:
+                users[e] -= 1
+                map_of[slot] = 0
+            ids[slot] = -1
+            for k in range(heads.shape[0]):
+                heads[k, slot] = FAR
+            free_rows[tops[0]] = row
+            free_slots[tops[1]] = slot
+            tops[0] += 1
+            tops[1] += 1
+    return free

@@ -30,6 +30,11 @@ def aligned(shape: tuple[int, ...], dtype: Any) -> Any:
     return raw[start : start + size].view(kind).reshape(shape)
 
 
+def _num_heads(descriptor_size: int) -> int:
+    """Return how many components of a descriptor are compared first: a quarter where they are many."""
+    return descriptor_size // 4 if descriptor_size >= 32 and descriptor_size % 4 == 0 else descriptor_size
+
+
 class ParticleMaps:
     """Landmark Gaussians, counts, descriptors and names of all particles.
 
@@ -43,7 +48,7 @@ class ParticleMaps:
         maps: (maps, P) int32. users: (maps,) int64, how many slots read by each.
         ids: (slots,) int64. Stable names of the landmarks, -1 = free slot.
         identities: (slots,) int64. The caller's own names, -1 = none.
-        descriptors: (slots, d) float32. half_norms: (slots,) half their squared length, infinite where free.
+        descriptors: (slots, d) float32. heads: (h, slots) every (d / h)-th component of them, `FAR` where free.
         free_rows, free_slots: Stacks; `tops` = (their heights, the name of the next landmark).
     """
 
@@ -59,7 +64,8 @@ class ParticleMaps:
         self.ids: IntArray = np.zeros(0, dtype=np.int64)
         self.identities: IntArray = np.zeros(0, dtype=np.int64)
         self.descriptors: NDArray[np.float32] = np.zeros((0, 0), dtype=np.float32)
-        self.half_norms: NDArray[np.float32] = np.zeros(0, dtype=np.float32)
+        self.heads: NDArray[np.float32] = np.zeros((0, 0), dtype=np.float32)
+        self._free_maps = 0
         self.free_rows: IntArray = np.zeros(0, dtype=np.int64)
         self.free_slots: IntArray = np.zeros(0, dtype=np.int64)
         self.tops: IntArray = np.zeros(3, dtype=np.int64)
@@ -74,7 +80,7 @@ class ParticleMaps:
         """Memory held [bytes]."""
         arrays = (
             self.values, self.counts, self.maps, self.users, self.row_of, self.map_of, self.ids, self.identities,
-            self.descriptors, self.half_norms, self.free_rows, self.free_slots,
+            self.descriptors, self.heads, self.free_rows, self.free_slots,
         )  # fmt: skip
         return sum(array.nbytes for array in arrays)
 
@@ -100,7 +106,11 @@ class ParticleMaps:
         if old and self.descriptors.shape[1]:
             descriptors[:old] = self.descriptors
         self.descriptors = descriptors
-        self.half_norms = np.concatenate([self.half_norms, np.full(extra, np.inf, dtype=np.float32)])
+        heads = aligned((_num_heads(descriptor_size), old + extra), np.float32)
+        heads[:] = _kernels.FAR
+        if old and len(self.heads):
+            heads[:, :old] = self.heads
+        self.heads = heads
         top = int(self.tops[1])
         free = np.zeros(old + extra, dtype=np.int64)
         free[:extra] = np.arange(old + extra - 1, old - 1, -1)  # the lowest is taken first once the old ones are gone
@@ -124,20 +134,29 @@ class ParticleMaps:
 
     # ------------------------------------------------------------------ resampling
 
-    def resample(self, targets: IntArray, sources: IntArray) -> None:
-        """Let particle `targets[i]` become a copy of `sources[i]`; no target is a source."""
-        live = np.flatnonzero(self.users[1:] > 0) + 1
-        if len(live) + 1 == len(self.users):
-            if len(live) >= MAX_MAPS:
-                self._refresh_oldest()
-            else:
-                extra = min(max(16, len(self.users)), MAX_MAPS)
-                self.maps = np.concatenate([self.maps, np.zeros((extra, self.padded), dtype=np.int32)])
-                self.users = np.concatenate([self.users, np.zeros(extra, dtype=np.int64)])
-        _kernels.compose_maps(
-            targets, sources, self.maps, self.users, self.map_of, self.ids, self.row_of, self.counts, self.half_norms,
-            self.free_rows, self.free_slots, self.tops, self.num_particles,
+    def resample(self, ancestors: IntArray, particles: Any) -> None:
+        """Let each particle become a copy of its ancestor.
+
+        Args:
+            ancestors: (M,) ascending.
+            particles: What else particles hold: poses, starts, means, covariances, path_log_weights.
+        """
+        if not self._free_maps:
+            self._make_maps()
+        arguments = (
+            ancestors, *particles, self.maps, self.users, self.map_of, self.ids, self.row_of, self.counts, self.heads,
+            self.free_rows, self.free_slots, self.tops,
         )  # fmt: skip
+        self._free_maps = _kernels.resample(*arguments)
+
+    def _make_maps(self) -> None:
+        """Provide a free map, by one more or by bringing slots up to date."""
+        if len(self.users) > MAX_MAPS:
+            self._refresh_oldest()
+        else:
+            extra = max(16, len(self.users))
+            self.maps = np.concatenate([self.maps, np.zeros((extra, self.padded), dtype=np.int32)])
+            self.users = np.concatenate([self.users, np.zeros(extra, dtype=np.int64)])
 
     def _refresh_oldest(self) -> None:
         """Bring up to date the slots of the maps with the fewest users, a quarter of them."""
@@ -192,9 +211,15 @@ class ParticleMaps:
         self.row_of[slots], self.map_of[slots] = rows, 0
         self.ids[slots], self.identities[slots] = ids[keep], identities[keep]
         self.descriptors[slots] = descriptors
-        self.half_norms[slots] = 0.5 * np.einsum("nd,nd->n", descriptors, descriptors)
+        self._set_heads(n)
         self.tops[0] -= n  # the lowest rows and slots lie on top of the stacks
         self.tops[1] -= n
+
+    def _set_heads(self, n: int) -> None:
+        """Write the heads of the first n slots; the others are free."""
+        if len(self.heads):
+            self.heads[:, :n] = self.descriptors[:n, :: self.descriptors.shape[1] // len(self.heads)].T
+            self.heads[:, n:] = _kernels.FAR
 
     # ------------------------------------------------------------------ snapshots
 
@@ -233,11 +258,10 @@ class ParticleMaps:
             getattr(self, name)[:n] = state[name]
             getattr(self, name)[n:] = fill
         self.descriptors[:n] = state["descriptors"]
-        self.half_norms[:n] = 0.5 * np.einsum("nd,nd->n", state["descriptors"], state["descriptors"])
-        self.half_norms[n:] = np.inf
+        self._set_heads(n)
         self.maps = np.concatenate([np.zeros((1, self.padded), dtype=np.int32), maps])
         self.users = np.bincount(state["map_of"], minlength=len(maps) + 1).astype(np.int64)
-        self.users[0] = 0
+        self.users[0], self._free_maps = 0, 0
         self.free_rows[: rows - n] = np.arange(rows - 1, n - 1, -1)
         self.free_slots[: slots - n] = np.arange(slots - 1, n - 1, -1)
         self.tops[:] = rows - n, slots - n, state["next_id"]

@@ -43,11 +43,7 @@ def check_step(
     exact: list[FloatArray | None] = []
     for robot in range(k):
         move, frame, identity, pose = odometry[robot], measurements[robot], identities[robot], poses[robot]
-        cure = "Give the motion (dx, dy, dtheta) in the previous robot frame, or None."
-        moves.append(None if move is None else check_array(f"odometry[{robot}]", move, (3,), cure))
-        if moves[-1] is not None and np.abs(moves[-1]).max() > FARTHEST_MOVE:
-            cure = "Check the units: metres and radians since the robot's last step."
-            raise bad_argument(f"odometry[{robot}]", f"numbers within +-{FARTHEST_MOVE:g}", move, cure)
+        moves.append(None if move is None else _check_move(robot, move))
         if frame is not None:
             if not isinstance(frame, Measurements):
                 raise bad_argument(f"measurements[{robot}]", "Measurements or None", frame, "Wrap the arrays.")
@@ -55,14 +51,36 @@ def check_step(
                 size = _check_frame(robot, frame, size)
         if identity is not None:
             wanted = (0 if frame is None else len(frame),)
-            identity = check_array(f"identities[{robot}]", identity, wanted, "Name each measurement.", dtype=np.int64)
+            if not (type(identity) is np.ndarray and identity.dtype == np.int64 and identity.shape == wanted):
+                cure = "Name each measurement."
+                identity = check_array(f"identities[{robot}]", identity, wanted, cure, dtype=np.int64)
         names.append(identity)
-        cure = "Give (x, y, theta) in the robot's own start frame, or None."
-        exact.append(None if pose is None else check_array(f"poses[{robot}]", pose, (3,), cure))
-        if exact[-1] is not None and np.abs(exact[-1]).max() > FARTHEST_POSE:
-            cure = "Check the units: metres and radians from the robot's start."
-            raise bad_argument(f"poses[{robot}]", f"numbers within +-{FARTHEST_POSE:g}", pose, cure)
+        exact.append(None if pose is None else _check_pose(robot, pose))
     return moves, list(measurements), names, exact
+
+
+def _check_move(robot: int, move: Any) -> FloatArray:
+    """Return a robot's odometry as a checked array."""
+    if type(move) is np.ndarray and move.dtype == np.float64 and move.shape == (3,):
+        x, y, turn = move.tolist()
+        if max(abs(x), abs(y), abs(turn)) <= FARTHEST_MOVE and x == x and y == y and turn == turn:  # NaN is not itself
+            return move
+    cure = "Give the motion (dx, dy, dtheta) in the previous robot frame, or None."
+    checked = check_array(f"odometry[{robot}]", move, (3,), cure)
+    if np.abs(checked).max() > FARTHEST_MOVE:
+        cure = "Check the units: metres and radians since the robot's last step."
+        raise bad_argument(f"odometry[{robot}]", f"numbers within +-{FARTHEST_MOVE:g}", move, cure)
+    return checked
+
+
+def _check_pose(robot: int, pose: Any) -> FloatArray:
+    """Return a robot's exact pose as a checked array."""
+    cure = "Give (x, y, theta) in the robot's own start frame, or None."
+    checked = check_array(f"poses[{robot}]", pose, (3,), cure)
+    if np.abs(checked).max() > FARTHEST_POSE:
+        cure = "Check the units: metres and radians from the robot's start."
+        raise bad_argument(f"poses[{robot}]", f"numbers within +-{FARTHEST_POSE:g}", pose, cure)
+    return checked
 
 
 def _check_frame(robot: int, frame: Measurements, size: int) -> int:
@@ -74,12 +92,10 @@ def _check_frame(robot: int, frame: Measurements, size: int) -> int:
             f"shape {frame.descriptors.shape}",
             "Use one kind of descriptor throughout a run.",
         )
-    if np.vdot(frame.points, frame.points) > FARTHEST_POINT**2:  # seldom; then perhaps only because they are many
-        farthest = float(np.abs(frame.points).max())
-        if farthest > FARTHEST_POINT:
-            cure = "Check the units, metres, and drop points without disparity."
-            raise bad_argument(f"measurements[{robot}].points", f"numbers within +-{FARTHEST_POINT:g}", farthest, cure)
-    nearest = float(frame.points[:, 2].min())
+    nearest, farthest = _kernels.extent(frame.points)
+    if farthest > FARTHEST_POINT:
+        cure = "Check the units, metres, and drop points without disparity."
+        raise bad_argument(f"measurements[{robot}].points", f"numbers within +-{FARTHEST_POINT:g}", farthest, cure)
     if frame.covariances is None and nearest < _kernels.MIN_DEPTH:
         raise bad_argument(
             f"measurements[{robot}].points",

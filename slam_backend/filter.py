@@ -331,47 +331,43 @@ class FastSlam:
         if num:
             maps.make_room(num, used.descriptors.shape[1])
         buffers.make_room(len(candidates.slots))
-        store: tuple[Any, ...] = (
+        starts, slots, squares, owners, same, unique = candidates
+        named = used.names is not None
+        store = (
             maps.values, maps.counts, maps.row_of, maps.map_of, maps.maps, maps.users,
             maps.free_rows, maps.free_slots, maps.tops,
         )  # fmt: skip
-        frame_arrays: tuple[Any, ...] = (used.points, used.noises, used.given, self._camera)
-        results: tuple[Any, ...] = (used.found, used.distances, used.new_slots, buffers.log_likelihood)
-        space: tuple[Any, ...] = (buffers.work, buffers.records)
-        starts, slots, squares, owners, same, unique = candidates
+        readings = (used.points, used.noises, used.given, self._camera)
+        results = (buffers.work, buffers.records, used.found, used.distances, used.new_slots, buffers.log_likelihood)
+        arguments: tuple[Any, ...]
         if options.proposal == "fastslam1":
-            _kernels.update_fastslam1(
-                poses, exact is None, move, sigmas, normals, *store, *frame_arrays,
-                starts, slots, owners, same, unique,
-                used.names is not None, options.position_gate, self._log_p0, options.one_to_one, *space, *results,
+            arguments = (
+                poses, exact is None, move, sigmas, normals, *store, *readings, starts, slots, owners, same, unique,
+                named, options.position_gate, self._log_p0, options.one_to_one, *results,
             )  # fmt: skip
+            _kernels.update_fastslam1(*arguments)
             means[:], covariances[:] = poses, 0.0
         else:
-            _kernels.update_fastslam2(
-                poses, means, covariances, blind, move, sigmas, normals, *store, *frame_arrays,
+            arguments = (
+                poses, means, covariances, blind, move, sigmas, normals, *store, *readings,
                 starts, slots, squares / options.descriptor_sigma**2, owners, same, unique,
-                used.names is not None, options.position_gate, options.dead_zone, options.dead_radius,
-                options.ambiguity, NOTHING if exact is not None else self._recovery, self._log_p0, options.one_to_one,
-                *space, *results,
+                named, options.position_gate, options.dead_zone, options.dead_radius, options.ambiguity,
+                NOTHING if exact is not None else self._recovery, self._log_p0, options.one_to_one, *results,
             )  # fmt: skip
+            _kernels.update_fastslam2(*arguments)
             self._blind[robot] = False
         _kernels.name_new(
             used.new_slots, used.descriptors, NO_NAMES if used.names is None else used.names, used.names is not None,
-            maps.ids, maps.identities, maps.descriptors, maps.half_norms, maps.tops,
+            maps.ids, maps.identities, maps.descriptors, maps.heads, maps.tops,
         )  # fmt: skip
         return used
 
     def _candidates(self, used: Turn) -> Candidates:
         """Return per measurement the slots that may have caused it: by the caller's names, else within E0."""
         maps = self._maps
-        named = used.names is not None
-        if named or not len(used.points) or not maps.descriptors.shape[1]:
-            products = np.empty((0, 0), dtype=np.float32)
-        else:
-            products = used.descriptors @ maps.descriptors.T
         found = _kernels.find_candidates(
-            products, used.descriptors, maps.descriptors, maps.half_norms, maps.ids,
-            NO_NAMES if used.names is None else used.names, maps.identities, named, self.options.descriptor_gate**2,
+            used.descriptors, maps.descriptors, maps.heads, maps.ids, NO_NAMES if used.names is None else used.names,
+            maps.identities, used.names is not None, self.options.descriptor_gate**2,
         )  # fmt: skip
         return Candidates(*found)
 
@@ -403,11 +399,8 @@ class FastSlam:
     def _resample(self) -> None:
         """Draw the particles anew in proportion to their weights; all that a particle holds goes with it."""
         ancestors = RESAMPLING[self.options.resampling](self._weights, self._rng)
-        targets, sources = _kernels.settle(ancestors, self.num_particles)
-        _kernels.copy_particles(
-            self._poses, self._starts, self._means, self._covariances, self._path_log_weights, targets, sources
-        )
-        self._maps.resample(targets, sources)
+        held: Any = (self._poses, self._starts, self._means, self._covariances, self._path_log_weights)
+        self._maps.resample(ancestors, held)
         self._log_weights.fill(-np.log(self.num_particles))
 
     def _mixture(self, robot: int) -> PoseEstimate:

@@ -1,5 +1,6 @@
 """The odometry motion model p(x_t | x_{t-1}, u_t) that a filter assumes (Eq. 4)."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,13 +37,13 @@ class OdometryModel:
 
     def sigmas(self, odometry: FloatArray) -> FloatArray:
         """Return the standard deviations (3,) [m, m, rad] of an odometry reading (3,) [m, m, rad]."""
-        distance = float(np.hypot(odometry[0], odometry[1]))
-        turn = abs(float(odometry[2]))
+        dx, dy, turn = (float(u) for u in odometry)
+        distance = math.hypot(dx, dy)
         return np.array(
             [
-                np.hypot(self.sigma_along * distance, self.floor_position),
-                np.hypot(self.sigma_across * distance, self.floor_position),
-                np.sqrt((self.sigma_heading * distance) ** 2 + (self.sigma_turn * turn) ** 2 + self.floor_heading**2),
+                math.hypot(self.sigma_along * distance, self.floor_position),
+                math.hypot(self.sigma_across * distance, self.floor_position),
+                math.hypot(self.sigma_heading * distance, self.sigma_turn * turn, self.floor_heading),
             ]
         )
 

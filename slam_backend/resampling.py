@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from slam_backend._jit import jit
 from slam_backend.errors import FloatArray, IntArray
 
 
@@ -26,16 +27,33 @@ def _invert(weights: FloatArray, uniforms: FloatArray) -> IntArray:
     return np.minimum(np.searchsorted(edges, uniforms, side="right"), len(weights) - 1).astype(np.int64)
 
 
+@jit
+def _strata(weights: FloatArray, offsets: FloatArray, count: int) -> IntArray:
+    """Return the ancestors of (i + offset) / count, i = 0 .. count - 1; `offsets` has one for all or one for each."""
+    total = 0.0
+    for m in range(len(weights)):
+        total += weights[m]
+    ancestors = np.empty(count, dtype=np.int64)
+    m, edge = 0, weights[0]
+    for i in range(count):
+        u = (i + offsets[i if len(offsets) > 1 else 0]) / count * total
+        while u >= edge and m < len(weights) - 1:
+            m += 1
+            edge += weights[m]
+        ancestors[i] = m
+    return ancestors
+
+
 def systematic(weights: FloatArray, rng: np.random.Generator, count: int | None = None) -> IntArray:
     """Draw with one uniform shared by all strata."""
     count = len(weights) if count is None else count
-    return _invert(weights, (np.arange(count) + rng.random()) / count)
+    return _strata(weights, rng.random(1), count)
 
 
 def stratified(weights: FloatArray, rng: np.random.Generator, count: int | None = None) -> IntArray:
     """Draw with one uniform per stratum."""
     count = len(weights) if count is None else count
-    return _invert(weights, (np.arange(count) + rng.random(count)) / count)
+    return _strata(weights, rng.random(count), count)
 
 
 def multinomial(weights: FloatArray, rng: np.random.Generator, count: int | None = None) -> IntArray:
