@@ -19,28 +19,36 @@ def jit(function: Callable[P, T]) -> Callable[P, T]:
     kernels that call each other therefore live in one module. `parallel=True` is left out on purpose, because it
     breaks forked workers.
     """
-    return cast(Callable[P, T], numba.njit(cache=True, nogil=True)(function))
+    return _compiled(function)
 
 
 def inlined(function: Callable[P, T]) -> Callable[P, T]:
     """Compile a small building block into each kernel that calls it: passing arrays costs more than its arithmetic."""
-    return cast(Callable[P, T], numba.njit(cache=True, nogil=True, forceinline=True)(function))
+    return _compiled(function, forceinline=True)
 
 
 # Lane kernels run the same arithmetic over a fixed number of particles, so that the compiler turns it into vector
 # instructions. Two things it needs: a product and a sum may be fused into one instruction (`contract`; sums are not
 # reordered, so the same machine gives the same bytes), and a division by zero gives inf instead of an exception.
-_LANES: dict[str, Any] = {"cache": True, "nogil": True, "fastmath": {"contract"}, "error_model": "numpy"}
+_LANES: dict[str, Any] = {"fastmath": {"contract"}, "error_model": "numpy"}
 
 
 def lanes(function: Callable[P, T]) -> Callable[P, T]:
     """Compile a kernel whose loops over lanes are to become vector instructions."""
-    return cast(Callable[P, T], numba.njit(**_LANES)(function))
+    return _compiled(function, **_LANES)
 
 
 def lanes_inlined(function: Callable[P, T]) -> Callable[P, T]:
     """Compile the arithmetic of one lane into the loops that call it."""
-    return cast(Callable[P, T], numba.njit(forceinline=True, **_LANES)(function))
+    return _compiled(function, forceinline=True, **_LANES)
+
+
+def _compiled(function: Callable[P, T], **options: Any) -> Callable[P, T]:
+    """Compile without the interpreter lock and with the cache on disk, if there is a place for it."""
+    try:
+        return cast(Callable[P, T], numba.njit(cache=True, nogil=True, **options)(function))
+    except RuntimeError:  # neither the package's folder nor the user's can be written: each process compiles anew
+        return cast(Callable[P, T], numba.njit(nogil=True, **options)(function))
 
 
 def _float_bits(typing_context: Any, x: Any) -> Any:

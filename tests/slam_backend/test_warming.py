@@ -1,10 +1,12 @@
 import subprocess
 import sys
 from collections.abc import Callable
+from typing import Any
 
 import numba
 import pytest
 
+from slam_backend import _jit
 from slam_backend.compilation import MESSAGE, watch_compilation
 from slam_backend.warming import warm_up
 
@@ -80,6 +82,25 @@ def test_a_second_warm_up_finds_everything_compiled() -> None:
     """What is compiled already takes no time."""
     warm_up()
     assert warm_up() == 0.0
+
+
+def test_kernels_work_where_no_cache_can_be_written(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A folder that is only read, and no home: kernels are compiled in each process anew, with the same results."""
+    usual = numba.njit
+
+    def without_place(**options: Any) -> Any:
+        def refuse(function: Callable[..., float]) -> Any:
+            raise RuntimeError(f"cannot cache function {function.__name__!r}: no locator available")
+
+        return refuse if options.get("cache") else usual(**options)
+
+    monkeypatch.setattr(numba, "njit", without_place)
+
+    def double(x: float) -> float:
+        return 2.0 * x
+
+    for compiled in (_jit.jit(double), _jit.inlined(double), _jit.lanes(double), _jit.lanes_inlined(double)):
+        assert compiled(4.0) == 8.0
 
 
 def test_a_watch_hears_of_our_kernels_only() -> None:
