@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from linear_world import CAMERA, LANDMARKS, turn
 from scipy import stats
 from stereo_world import EXACT_MOTION, StereoWorld
 
@@ -98,6 +99,36 @@ def test_a_pose_refined_by_one_landmark() -> None:
         innovation_squares.append(report.nis)
     assert_chi_square(innovation_squares, 3)
     assert_chi_square(pose_squares, 3)
+
+
+@pytest.mark.parametrize(("sigma", "tolerance"), [(1e-2, 1e-9), (1e-3, 1e-5), (1e-4, 1e-2)])
+@pytest.mark.parametrize("move", [np.array([0.5, 0.0, 0.1]), np.array([3.0, 0.0, 1.0])])
+def test_the_reported_nis_is_the_innovation_under_its_whole_covariance(
+    sigma: float, tolerance: float, move: FloatArray
+) -> None:
+    """r^T (Sigma + R + H P H^T)^-1 r, written out, for one look back after a noisy motion.
+
+    The larger the motion's noise beside the measurement's (here up to 5,000 times), the more digits the compiled form
+    loses; this is how many it may.
+    """
+    motion = OdometryModel()
+    sigmas = motion.sigmas(move)
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        slam = FastSlam(1, 3, CAMERA, motion, seed=seed)
+        pose = compose(np.zeros(3), move + rng.standard_normal(3) * sigmas)
+        points = []
+        for place in (np.zeros(3), pose):
+            in_robot = turn(place[2]).T @ (LANDMARKS[0] - [place[0], place[1], 0.0])
+            points.append(CAMERA.camera_from_robot(in_robot) + sigma * rng.standard_normal(3))
+        frames = [Measurements([point], np.eye(1, 5), sigma**2 * np.eye(3)[None]) for point in points]
+        slam.step([None], [frames[0]], identities=[[0]])
+        report = slam.step([move], [frames[1]], identities=[[0]])
+        mean = CAMERA.robot_from_camera(points[0])
+        by_pose = np.array([[1.0, 0.0, move[1] - mean[1]], [0.0, 1.0, mean[0] - move[0]], [0.0, 0.0, 0.0]])
+        innovation = turn(move[2]) @ CAMERA.robot_from_camera(points[1]) + [move[0], move[1], 0.0] - mean
+        whole = 2.0 * sigma**2 * np.eye(3) + by_pose @ np.diag(sigmas**2) @ by_pose.T
+        assert report.nis == pytest.approx(innovation @ np.linalg.solve(whole, innovation), abs=tolerance)
 
 
 def test_mixture_covariances_hold_what_the_path_may_be() -> None:
