@@ -17,8 +17,7 @@ camera). Where the caller gives covariances, k = 1 and there is no such factor.
 
 The pose. x = x0 + C xi with xi ~ N(0, I) before the frame: nothing is inverted, so a motion without noise needs no
 special case. With A = (dr/dx) C and S = Sigma + R, a match adds J = A^T S^-1 A to the information of xi and
-g = A^T S^-1 r to the gradient; and where xi has the information L, the squared Mahalanobis distance with the pose
-uncertain is r^T S^-1 r - g^T (L + J)^-1 g (Woodbury), its log-determinant log|S| + log|L + J| - log|L|.
+g = A^T S^-1 r to the gradient. A gate takes S + A P A^T, with P the covariance of xi.
 """
 
 import math
@@ -44,9 +43,9 @@ LN2 = math.log(2.0)
 # Rows of the workspace.
 X, Y, T, COS, SIN = (LANES * k for k in range(5))  # the pose at which innovations are taken
 X0, Y0, T0 = (LANES * k for k in range(5, 8))  # the predicted pose
-C00, C10, C11, C20, C21, C22 = (LANES * k for k in range(8, 14))  # lower factor of its covariance
+C00, C10, C11, C20, C21, C22 = (LANES * k for k in range(8, 14))  # factor C of its covariance, with C01 below
 XI0, XI1, XI2 = (LANES * k for k in range(14, 17))
-L00, L01, L02, L11, L12, L22 = (LANES * k for k in range(17, 23))  # information of xi
+SPREAD00, SPREAD01, SPREAD02, SPREAD11, SPREAD12, SPREAD22 = (LANES * k for k in range(17, 23))  # covariance of xi
 R0, R1, R2 = (LANES * k for k in range(23, 26))  # innovation
 N00, N01, N02, N11, N12, N22, DEPTH = (LANES * k for k in range(26, 33))  # sensor noise in map axes, predicted depth
 J00, J01, J02, J11, J12, J22, G0, G1, G2 = (LANES * k for k in range(33, 42))  # sums over matches
@@ -54,9 +53,8 @@ SUM_D, MATCHED, DET, DET_EXP, DEPTHS, DEPTHS_EXP = (LANES * k for k in range(42,
 CLUTTER = LANES * 48  # log-likelihood of the measurements that are not matched
 BEST, SECOND, CHOSEN, DEAD, LOG_BEST = (LANES * k for k in range(49, 54))  # of one measurement
 LOST, SURE, CONTRADICT, WIDE = (LANES * k for k in range(54, 58))
-SPREAD00, SPREAD01, SPREAD02, SPREAD11, SPREAD12, SPREAD22 = (LANES * k for k in range(58, 64))
-TAKEN, LOG_DET_L = LANES * 64, LANES * 65
-WORK_ROWS = 66
+TAKEN, C01 = LANES * 58, LANES * 59
+WORK_ROWS = 60
 
 # Rows of one candidate's record.
 QJ00, QJ01, QJ02, QJ11, QJ12, QJ22, QG0, QG1, QG2 = (LANES * k for k in range(9))
@@ -223,13 +221,12 @@ def _evaluate(work: FloatArray, tile: FloatArray, record: FloatArray) -> None:
     for i in range(LANES):
         rx, ry, rz = work[R0 + i], work[R1 + i], work[R2 + i]
         depth = work[DEPTH + i]
-        i00, i01, i02, i11, i12, i22, det = _invert(
-            tile[3 * LANES + i] + work[N00 + i], tile[4 * LANES + i] + work[N01 + i],
-            tile[5 * LANES + i] + work[N02 + i], tile[6 * LANES + i] + work[N11 + i],
-            tile[7 * LANES + i] + work[N12 + i], tile[8 * LANES + i] + work[N22 + i],
-        )  # Eq. 7
+        s00, s01 = tile[3 * LANES + i] + work[N00 + i], tile[4 * LANES + i] + work[N01 + i]
+        s02, s11 = tile[5 * LANES + i] + work[N02 + i], tile[6 * LANES + i] + work[N11 + i]
+        s12, s22 = tile[7 * LANES + i] + work[N12 + i], tile[8 * LANES + i] + work[N22 + i]
+        i00, i01, i02, i11, i12, i22, det = _invert(s00, s01, s02, s11, s12, s22)  # Eq. 7
         hx, hy = work[Y + i] - tile[LANES + i], tile[i] - work[X + i]
-        a0, a1, a2 = work[C00 + i] + hx * work[C20 + i], hx * work[C21 + i], hx * work[C22 + i]
+        a0, a1, a2 = work[C00 + i] + hx * work[C20 + i], work[C01 + i] + hx * work[C21 + i], hx * work[C22 + i]
         b0, b1, b2 = work[C10 + i] + hy * work[C20 + i], work[C11 + i] + hy * work[C21 + i], hy * work[C22 + i]
         sx = i00 * rx + i01 * ry + i02 * rz
         sy = i01 * rx + i11 * ry + i12 * rz
@@ -239,11 +236,16 @@ def _evaluate(work: FloatArray, tile: FloatArray, record: FloatArray) -> None:
         w0, w1, w2 = i01 * a0 + i11 * b0, i01 * a1 + i11 * b1, i01 * a2 + i11 * b2
         j00, j01, j02 = a0 * u0 + b0 * w0, a0 * u1 + b0 * w1, a0 * u2 + b0 * w2
         j11, j12, j22 = a1 * u1 + b1 * w1, a1 * u2 + b1 * w2, a2 * u2 + b2 * w2
+        # S + A P A^T, with P the covariance of xi: what the pose adds to the doubt about x and y.
+        q00, q01, q02 = work[SPREAD00 + i], work[SPREAD01 + i], work[SPREAD02 + i]
+        q11, q12, q22 = work[SPREAD11 + i], work[SPREAD12 + i], work[SPREAD22 + i]
+        u0, u1, u2 = q00 * a0 + q01 * a1 + q02 * a2, q01 * a0 + q11 * a1 + q12 * a2, q02 * a0 + q12 * a1 + q22 * a2
+        w0, w1, w2 = q00 * b0 + q01 * b1 + q02 * b2, q01 * b0 + q11 * b1 + q12 * b2, q02 * b0 + q12 * b1 + q22 * b2
         p00, p01, p02, p11, p12, p22, det_pose = _invert(
-            work[L00 + i] + j00, work[L01 + i] + j01, work[L02 + i] + j02,
-            work[L11 + i] + j11, work[L12 + i] + j12, work[L22 + i] + j22,
+            s00 + a0 * u0 + a1 * u1 + a2 * u2, s01 + a0 * w0 + a1 * w1 + a2 * w2, s02,
+            s11 + b0 * w0 + b1 * w1 + b2 * w2, s12, s22,
         )
-        distance = square - _form(p00, p01, p02, p11, p12, p22, g0, g1, g2)
+        distance = _form(p00, p01, p02, p11, p12, p22, rx, ry, rz)
         record[QJ00 + i], record[QJ01 + i], record[QJ02 + i] = j00, j01, j02
         record[QJ11 + i], record[QJ12 + i], record[QJ22 + i] = j11, j12, j22
         record[QG0 + i], record[QG1 + i], record[QG2 + i] = g0, g1, g2
@@ -398,7 +400,7 @@ def _robust_weights(
 
 @lanes
 def _step_pose(work: FloatArray, only_wide: bool) -> None:
-    """Take one step of Gauss-Newton from the sums: xi <- xi - J^-1 G, and the information L <- J."""
+    """Take one step of Gauss-Newton from the sums: xi <- xi - J^-1 G, with covariance J^-1."""
     for i in range(LANES):
         go = work[WIDE + i] > 0.0 or not only_wide
         i00, i01, i02, i11, i12, i22, _ = _invert(
@@ -408,12 +410,12 @@ def _step_pose(work: FloatArray, only_wide: bool) -> None:
         work[XI0 + i] -= i00 * g0 + i01 * g1 + i02 * g2 if go else 0.0
         work[XI1 + i] -= i01 * g0 + i11 * g1 + i12 * g2 if go else 0.0
         work[XI2 + i] -= i02 * g0 + i12 * g1 + i22 * g2 if go else 0.0
-        work[L00 + i] = work[J00 + i] if go else work[L00 + i]
-        work[L01 + i] = work[J01 + i] if go else work[L01 + i]
-        work[L02 + i] = work[J02 + i] if go else work[L02 + i]
-        work[L11 + i] = work[J11 + i] if go else work[L11 + i]
-        work[L12 + i] = work[J12 + i] if go else work[L12 + i]
-        work[L22 + i] = work[J22 + i] if go else work[L22 + i]
+        work[SPREAD00 + i] = i00 if go else work[SPREAD00 + i]
+        work[SPREAD01 + i] = i01 if go else work[SPREAD01 + i]
+        work[SPREAD02 + i] = i02 if go else work[SPREAD02 + i]
+        work[SPREAD11 + i] = i11 if go else work[SPREAD11 + i]
+        work[SPREAD12 + i] = i12 if go else work[SPREAD12 + i]
+        work[SPREAD22 + i] = i22 if go else work[SPREAD22 + i]
 
 
 @lanes
@@ -422,7 +424,7 @@ def _place(work: FloatArray) -> None:
     for i in range(LANES):
         xi0, xi1, xi2 = work[XI0 + i], work[XI1 + i], work[XI2 + i]
         theta = work[T0 + i] + work[C20 + i] * xi0 + work[C21 + i] * xi1 + work[C22 + i] * xi2
-        work[X + i] = work[X0 + i] + work[C00 + i] * xi0
+        work[X + i] = work[X0 + i] + work[C00 + i] * xi0 + work[C01 + i] * xi1
         work[Y + i] = work[Y0 + i] + work[C10 + i] * xi0 + work[C11 + i] * xi1
         work[T + i] = theta
         work[SIN + i], work[COS + i] = _sine_cosine(theta)
@@ -430,7 +432,10 @@ def _place(work: FloatArray) -> None:
 
 @lanes
 def _predict(work: FloatArray, mean: FloatArray, covariance: FloatArray, move: FloatArray, sigmas: FloatArray) -> None:
-    """Write the predicted pose x0 and the lower factor C of its covariance F P F^T + T diag(sigmas^2) T^T (Eq. 4).
+    """Write the predicted pose x0 and a factor C of its covariance P0 (Eq. 4, propagated).
+
+    C = T L with L the lower Cholesky factor of T^T P0 T, where T is the turn by the predicted heading. Rows N00 .. N22
+    hold T^T P0 T afterwards, COS and SIN the turn.
 
     Args:
         mean: (3 LANES,) the pose before the motion: rows x, y, theta.
@@ -454,29 +459,51 @@ def _predict(work: FloatArray, mean: FloatArray, covariance: FloatArray, move: F
         q02 = p02 - oy * p22
         q11 = p11 + 2.0 * ox * p12 + ox * ox * p22 + s * s * v0 + c * c * v1
         q12 = p12 + ox * p22
-        q22 = p22 + v2
-        work[N00 + i], work[N01 + i], work[N02 + i] = q00, q01, q02
-        work[N11 + i], work[N12 + i], work[N22 + i] = q11, q12, q22
-        work[WIDE + i] = 1.0 if q22 > WIDE_HEADING**2 else 0.0
+        # Factorised in the robot's axes, T^T P0 T: how the map frame happens to be turned plays no part.
+        s, c = _sine_cosine(work[T0 + i])
+        work[N00 + i] = c * c * q00 + 2.0 * c * s * q01 + s * s * q11
+        work[N01 + i] = c * s * (q11 - q00) + (c * c - s * s) * q01
+        work[N02 + i] = c * q02 + s * q12
+        work[N11 + i] = s * s * q00 - 2.0 * c * s * q01 + c * c * q11
+        work[N12 + i] = c * q12 - s * q02
+        work[N22 + i] = p22 + v2
+        work[COS + i], work[SIN + i] = c, s
+        work[WIDE + i] = 1.0 if p22 + v2 > WIDE_HEADING**2 else 0.0
     for i in range(LANES):
         _factorise(work, i)
 
 
+@lanes
+def _to_map_axes(work: FloatArray) -> None:
+    """Turn the covariance in rows N00 .. N22 from the robot's axes to the map's: T P T^T."""
+    for i in range(LANES):
+        c, s = work[COS + i], work[SIN + i]
+        r00, r01, r02 = work[N00 + i], work[N01 + i], work[N02 + i]
+        r11, r12 = work[N11 + i], work[N12 + i]
+        work[N00 + i] = c * c * r00 - 2.0 * c * s * r01 + s * s * r11
+        work[N01 + i] = c * s * (r00 - r11) + (c * c - s * s) * r01
+        work[N02 + i] = c * r02 - s * r12
+        work[N11 + i] = s * s * r00 + 2.0 * c * s * r01 + c * c * r11
+        work[N12 + i] = s * r02 + c * r12
+
+
 @lanes_inlined
 def _factorise(work: FloatArray, i: int) -> None:
-    """Write the lower Cholesky factor C of the covariance in rows N00 .. N22; a vanishing pivot gives a zero column."""
+    """Write C = T L, L L^T the covariance in rows N00 .. N22; a vanishing pivot gives L a column of zeros."""
     q00, q11, q22 = work[N00 + i], work[N11 + i], work[N22 + i]
-    c00 = math.sqrt(q00 if q00 > 0.0 else 0.0)
-    inverse = 1.0 / c00 if q00 > 0.0 else 0.0
-    c10, c20 = work[N01 + i] * inverse, work[N02 + i] * inverse
-    rest = q11 - c10 * c10
+    c, s = work[COS + i], work[SIN + i]
+    l00 = math.sqrt(q00 if q00 > 0.0 else 0.0)
+    inverse = 1.0 / l00 if q00 > 0.0 else 0.0
+    l10, l20 = work[N01 + i] * inverse, work[N02 + i] * inverse
+    rest = q11 - l10 * l10
     rest = rest if rest > ZERO_PIVOT * q11 else 0.0
-    c11 = math.sqrt(rest)
-    inverse = 1.0 / c11 if rest > 0.0 else 0.0
-    c21 = (work[N12 + i] - c20 * c10) * inverse
-    work[C00 + i], work[C10 + i], work[C11 + i] = c00, c10, c11
-    work[C20 + i], work[C21 + i] = c20, c21
-    rest = q22 - c20 * c20 - c21 * c21
+    l11 = math.sqrt(rest)
+    inverse = 1.0 / l11 if rest > 0.0 else 0.0
+    l21 = (work[N12 + i] - l20 * l10) * inverse
+    rest = q22 - l20 * l20 - l21 * l21
+    work[C00 + i], work[C01 + i] = c * l00 - s * l10, -s * l11
+    work[C10 + i], work[C11 + i] = s * l00 + c * l10, c * l11
+    work[C20 + i], work[C21 + i] = l20, l21
     work[C22 + i] = math.sqrt(rest if rest > ZERO_PIVOT * q22 else 0.0)
 
 
@@ -543,8 +570,8 @@ def _consider(work: FloatArray, record: FloatArray, q: float, look: float, named
         distance = record[Q_D + i]
         ok = record[Q_HELD + i] > 0.0 and (distance <= gate or (named and distance < np.inf))
         depth = record[Q_DEPTH + i]
-        log_det = _log(record[Q_DET + i]) - 8.0 * _log(depth if ok else 1.0) + _log(record[Q_DET_POSE + i])
-        cost = distance + log_det - work[LOG_DET_L + i] + look if ok else np.inf
+        log_det = _log(record[Q_DET_POSE + i] if ok else 1.0) - 8.0 * _log(depth if ok else 1.0)
+        cost = distance + log_det + look if ok else np.inf
         best, second = work[BEST + i], work[SECOND + i]
         better = cost < best
         work[SECOND + i] = best if better else (cost if cost < second else second)
@@ -595,8 +622,7 @@ def _consider_again(
         ok = front and distance <= gate and work[TAKEN + i] == 0.0
         work[DEAD + i] = 1.0 if near else work[DEAD + i]
         depth = record[Q_DEPTH + i]
-        log_det = _log(record[Q_DET + i]) - 8.0 * _log(depth if ok else 1.0) + _log(record[Q_DET_POSE + i])
-        log_det -= work[LOG_DET_L + i]
+        log_det = _log(record[Q_DET_POSE + i] if ok else 1.0) - 8.0 * _log(depth if ok else 1.0)
         cost = distance + log_det + look if ok else np.inf
         best, second = work[BEST + i], work[SECOND + i]
         better = cost < best
@@ -658,15 +684,21 @@ def _look_alikes(work: FloatArray, record: FloatArray, look: float, ambiguity: f
 
 @lanes
 def _widen_lost(work: FloatArray, recovery: FloatArray) -> int:
-    """Give lanes whose pose most matches contradict the factor diag(recovery); return how many lanes those are."""
+    """Give lanes whose pose most matches contradict the factor T diag(recovery), T the turn by the predicted heading.
+
+    Returns:
+        How many lanes those are.
+    """
     count = 0
     for i in range(LANES):
         lost = work[CONTRADICT + i] >= MIN_CONTRADICTIONS and 2.0 * work[CONTRADICT + i] > work[SURE + i]
         work[LOST + i] = 1.0 if lost else 0.0
         work[WIDE + i] = 1.0 if lost else work[WIDE + i]
-        work[C00 + i] = recovery[0] if lost else work[C00 + i]
-        work[C10 + i] = 0.0 if lost else work[C10 + i]
-        work[C11 + i] = recovery[1] if lost else work[C11 + i]
+        c, s = work[COS + i], work[SIN + i]
+        work[C00 + i] = c * recovery[0] if lost else work[C00 + i]
+        work[C01 + i] = -s * recovery[1] if lost else work[C01 + i]
+        work[C10 + i] = s * recovery[0] if lost else work[C10 + i]
+        work[C11 + i] = c * recovery[1] if lost else work[C11 + i]
         work[C20 + i] = 0.0 if lost else work[C20 + i]
         work[C21 + i] = 0.0 if lost else work[C21 + i]
         work[C22 + i] = recovery[2] if lost else work[C22 + i]
@@ -676,31 +708,20 @@ def _widen_lost(work: FloatArray, recovery: FloatArray) -> int:
 
 @lanes
 def _begin_pose(work: FloatArray) -> None:
-    """Start from xi = 0 with information I, at the predicted pose."""
+    """Start from xi = 0 with covariance I, at the predicted pose."""
     for i in range(LANES):
         work[XI0 + i] = 0.0
         work[XI1 + i] = 0.0
         work[XI2 + i] = 0.0
-        work[L00 + i] = 1.0
-        work[L01 + i] = 0.0
-        work[L02 + i] = 0.0
-        work[L11 + i] = 1.0
-        work[L12 + i] = 0.0
-        work[L22 + i] = 1.0
-        work[LOG_DET_L + i] = 0.0
+        work[SPREAD00 + i] = 1.0
+        work[SPREAD01 + i] = 0.0
+        work[SPREAD02 + i] = 0.0
+        work[SPREAD11 + i] = 1.0
+        work[SPREAD12 + i] = 0.0
+        work[SPREAD22 + i] = 1.0
         work[SURE + i] = 0.0
         work[CONTRADICT + i] = 0.0
         work[LOST + i] = 0.0
-
-
-@lanes
-def _log_information(work: FloatArray) -> None:
-    for i in range(LANES):
-        work[LOG_DET_L + i] = _log(
-            work[L00 + i] * (work[L11 + i] * work[L22 + i] - work[L12 + i] * work[L12 + i])
-            - work[L01 + i] * (work[L01 + i] * work[L22 + i] - work[L12 + i] * work[L02 + i])
-            + work[L02 + i] * (work[L01 + i] * work[L12 + i] - work[L11 + i] * work[L02 + i])
-        )
 
 
 @lanes
@@ -725,19 +746,20 @@ def _posterior(work: FloatArray, normals: FloatArray, log_likelihood: FloatArray
         xi0 -= i00 * g0 + i01 * g1 + i02 * g2
         xi1 -= i01 * g0 + i11 * g1 + i12 * g2
         xi2 -= i02 * g0 + i12 * g1 + i22 * g2
-        c00, c10, c11 = work[C00 + i], work[C10 + i], work[C11 + i]
+        c00, c01, c10, c11 = work[C00 + i], work[C01 + i], work[C10 + i], work[C11 + i]
         c20, c21, c22 = work[C20 + i], work[C21 + i], work[C22 + i]
-        out[i] = work[X0 + i] + c00 * xi0
+        out[i] = work[X0 + i] + c00 * xi0 + c01 * xi1
         out[LANES + i] = work[Y0 + i] + c10 * xi0 + c11 * xi1
         out[2 * LANES + i] = work[T0 + i] + c20 * xi0 + c21 * xi1 + c22 * xi2
         # P^ = C J^-1 C^T
+        h00, h01 = c00 * i00 + c01 * i01, c00 * i01 + c01 * i11
         h10, h11 = c10 * i00 + c11 * i01, c10 * i01 + c11 * i11
         h20, h21, h22 = (
             c20 * i00 + c21 * i01 + c22 * i02, c20 * i01 + c21 * i11 + c22 * i12, c20 * i02 + c21 * i12 + c22 * i22
         )
-        out[3 * LANES + i] = c00 * c00 * i00
-        out[4 * LANES + i] = c00 * h10
-        out[5 * LANES + i] = c00 * h20
+        out[3 * LANES + i] = h00 * c00 + h01 * c01
+        out[4 * LANES + i] = h10 * c00 + h11 * c01
+        out[5 * LANES + i] = h20 * c00 + h21 * c01
         out[6 * LANES + i] = h10 * c10 + h11 * c11
         out[7 * LANES + i] = h20 * c10 + h21 * c11
         out[8 * LANES + i] = h20 * c20 + h21 * c21 + h22 * c22
@@ -751,7 +773,7 @@ def _posterior(work: FloatArray, normals: FloatArray, log_likelihood: FloatArray
         xi1 += l10 * n0 + l11 * n1
         xi2 += l20 * n0 + l21 * n1 + l22 * n2
         theta = work[T0 + i] + c20 * xi0 + c21 * xi1 + c22 * xi2
-        work[X + i] = work[X0 + i] + c00 * xi0
+        work[X + i] = work[X0 + i] + c00 * xi0 + c01 * xi1
         work[Y + i] = work[Y0 + i] + c10 * xi0 + c11 * xi1
         work[SIN + i], work[COS + i] = _sine_cosine(theta)
         out[9 * LANES + i] = work[X + i]
@@ -857,15 +879,17 @@ def _mark_held(record: FloatArray, seen: Int32Array) -> None:
 
 @jit
 def _open_slot(
-    b: int, new_slots: IntArray, new_rows: IntArray, row_of: IntArray, map_of: IntArray, counts: Int32Array,
-    free_rows: IntArray, free_slots: IntArray, tops: IntArray,
+    b: int, new_slots: IntArray, new_rows: IntArray, row_of: IntArray, map_of: IntArray, values: FloatArray,
+    counts: Int32Array, free_rows: IntArray, free_slots: IntArray, tops: IntArray,
 ) -> None:
     """Give measurement b a free slot and row for the landmark that it starts in some particles."""
     tops[0] -= 1
     tops[1] -= 1
     new_rows[b] = free_rows[tops[0]]
     new_slots[b] = free_slots[tops[1]]
+    size = 9 * counts.shape[1]
     counts[new_rows[b], :] = 0
+    values[new_rows[b] * size : (new_rows[b] + 1) * size] = 0.0
     row_of[new_slots[b]] = new_rows[b]
     map_of[new_slots[b]] = 0
 
@@ -983,6 +1007,8 @@ def find_candidates(
             count = _hits(partial, limit, hits)
         for k in range(count):
             slot = hits[k]
+            if ids[slot] < 0:
+                continue
             e = 0.0
             for j in range(measured.shape[1]):
                 difference = float(measured[b, j]) - float(stored[slot, j])
@@ -1093,7 +1119,7 @@ def update_fastslam1(
             log_clutter = log_p0 + (0.0 if given else 4.0 * math.log(points[b, 0]))
             if _mask_of(chosen, -2.0, mask) > 0:  # l. 28-32
                 if new_slots[b] == REJECTED:
-                    _open_slot(b, new_slots, new_rows, row_of, map_of, counts, free_rows, free_slots, tops)
+                    _open_slot(b, new_slots, new_rows, row_of, map_of, values, counts, free_rows, free_slots, tops)
                 _new_landmark(
                     work, _tile(values, padded, new_rows[b], block), points, noises, b, given, camera, mask,
                     counts[new_rows[b], first : first + LANES],
@@ -1202,6 +1228,7 @@ def move_blind(
         real = min(LANES, num_particles - first)
         _prior(poses, means, covariances, blind, first, mean, covariance)
         _predict(work, mean, covariance, odometry, sigmas)
+        _to_map_axes(work)
         for i in range(LANES):
             means[0, first + i], means[1, first + i], means[2, first + i] = work[X0 + i], work[Y0 + i], work[T0 + i]
             covariances[0, first + i], covariances[1, first + i] = work[N00 + i], work[N01 + i]
@@ -1332,7 +1359,6 @@ def update_fastslam2(
                             _robust_weights(records[q], match[b], float(q), position_gate, mask)
                             _sum_matches(work, records[q], mask)
                 _step_pose(work, True)
-        _log_information(work)
         _place(work)
 
         # Pass B: decide at the refined pose.
@@ -1397,7 +1423,7 @@ def update_fastslam2(
                     _gate_and_update(work, tile, records[q], mask, np.inf)
             if _mask_of(match[b], -2.0, mask) > 0:
                 if new_slots[b] == REJECTED:
-                    _open_slot(b, new_slots, new_rows, row_of, map_of, counts, free_rows, free_slots, tops)
+                    _open_slot(b, new_slots, new_rows, row_of, map_of, values, counts, free_rows, free_slots, tops)
                 _new_landmark(
                     work, _tile(values, padded, new_rows[b], block), points, noises, b, given, camera, mask,
                     counts[new_rows[b], first : first + LANES],

@@ -93,7 +93,7 @@ class ParticleMaps:
 
     def make_room(self, new: int, descriptor_size: int) -> None:
         """See to it that `new` landmarks can start, and a row is left to bring landmarks up to date."""
-        if self.tops[1] < new or not self.descriptors.shape[1]:
+        if self.tops[1] < new:
             self._grow_slots(max(64, len(self.ids), new - int(self.tops[1])), descriptor_size)
         if self.tops[0] < new + 1:
             self._grow_rows(max(64, len(self.counts) // 2, new + 1))
@@ -225,17 +225,18 @@ class ParticleMaps:
 
     def get_state(self) -> dict[str, Any]:
         """Return all that decides how the maps go on, compact and shared with nothing."""
-        used = np.flatnonzero(self.ids >= 0)
-        live = np.flatnonzero(self.users > 0)
+        used = self.used_slots()
+        of, rows = self.map_of[used], self.row_of[used]
+        live, first = np.unique(of[of > 0], return_index=True)
+        live = live[np.argsort(first)]  # by their first users: equal maps give equal states
         number = np.zeros(len(self.users), dtype=np.int64)
         number[live] = np.arange(1, len(live) + 1)
-        rows = self.row_of[used]
         return {
             "num_particles": self.num_particles,
             "values": np.take(self.values.reshape(-1, 9 * self.padded), rows, axis=0),
             "counts": np.take(self.counts, rows, axis=0),
             "maps": np.take(self.maps, live, axis=0),
-            "map_of": number[self.map_of[used]],
+            "map_of": number[of],
             "ids": self.ids[used],
             "identities": self.identities[used],
             "descriptors": self.descriptors[used],

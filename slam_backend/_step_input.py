@@ -51,7 +51,9 @@ def check_step(
                 size = _check_frame(robot, frame, size)
         if identity is not None:
             wanted = (0 if frame is None else len(frame),)
-            if not (type(identity) is np.ndarray and identity.dtype == np.int64 and identity.shape == wanted):
+            if type(identity) is np.ndarray and identity.dtype == np.int64 and identity.shape == wanted:
+                identity = np.array(identity)
+            else:
                 cure = "Name each measurement."
                 identity = check_array(f"identities[{robot}]", identity, wanted, cure, dtype=np.int64)
         names.append(identity)
@@ -64,7 +66,7 @@ def _check_move(robot: int, move: Any) -> FloatArray:
     if type(move) is np.ndarray and move.dtype == np.float64 and move.shape == (3,):
         x, y, turn = move.tolist()
         if max(abs(x), abs(y), abs(turn)) <= FARTHEST_MOVE and x == x and y == y and turn == turn:  # NaN is not itself
-            return move
+            return np.array(move)
     cure = "Give the motion (dx, dy, dtheta) in the previous robot frame, or None."
     checked = check_array(f"odometry[{robot}]", move, (3,), cure)
     if np.abs(checked).max() > FARTHEST_MOVE:

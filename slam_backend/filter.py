@@ -426,7 +426,7 @@ class FastSlam:
     def get_state(self) -> dict[str, Any]:
         """Return all that decides how the filter goes on, its random stream included. Shares nothing with it."""
         state: dict[str, Any] = {name: getattr(self, name).copy() for name in self._STATE}
-        state |= {"steps": self._steps, "estimates": tuple(self._estimates), "maps": self._maps.get_state()}
+        state |= {"steps": self._steps, "estimates": _copies(self._estimates), "maps": self._maps.get_state()}
         return state | {"options": self.options, "rng": copy.deepcopy(self._rng.bit_generator.state)}
 
     def set_state(self, state: Mapping[str, Any]) -> None:
@@ -444,8 +444,14 @@ class FastSlam:
         for name in self._STATE:
             getattr(self, name)[:] = state[name]
         self._maps.set_state(state["maps"])
-        self._steps, self._estimates = state["steps"], list(state["estimates"])
+        self._steps, self._estimates = state["steps"], list(_copies(state["estimates"]))
+        # A stream of its own: the old one may be the caller's, or of another kind.
+        self._rng = np.random.Generator(getattr(np.random, state["rng"]["bit_generator"])(0))
         self._rng.bit_generator.state = state["rng"]
+
+
+def _copies(estimates: Sequence[PoseEstimate]) -> tuple[PoseEstimate, ...]:
+    return tuple(PoseEstimate(estimate.mean.copy(), estimate.covariance.copy()) for estimate in estimates)
 
 
 def _mixture(means: FloatArray, covariances: FloatArray, weights: FloatArray) -> PoseEstimate:

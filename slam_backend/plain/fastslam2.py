@@ -10,7 +10,7 @@ import numpy as np
 from slam_backend.errors import FloatArray
 from slam_backend.filter_options import FilterOptions
 from slam_backend.plain.frame import Frame, Innovation, log_density
-from slam_backend.plain.pose_belief import PoseBelief, WhitenedPose, lower_root
+from slam_backend.plain.pose_belief import PoseBelief, WhitenedPose
 from slam_backend.plain.turn import NEW, REJECTED, Candidates, Landmarks, Turn
 
 WIDE_HEADING = 0.03  # [rad]; a predicted heading less certain than this asks for more iterations
@@ -39,12 +39,12 @@ def fastslam2_turn(
         options: Of the filter.
         is_exact: Whether the caller gave the pose, which is then never doubted.
     """
-    predicted = WhitenedPose.before_measurements(prior.mean, lower_root(prior.covariance))
+    predicted = WhitenedPose.of(prior)
     iterations = 1 + MORE_ITERATIONS * bool(prior.covariance[2, 2] > WIDE_HEADING**2)
     gates = gates_at(predicted, landmarks, frame, candidates)  # pass A
     if options.recovery_position > 0.0 and not is_exact and is_lost(gates, candidates, options):
-        doubt = np.diag([options.recovery_position, options.recovery_position, options.recovery_heading])
-        predicted, iterations = WhitenedPose.before_measurements(prior.mean, doubt), 1 + MORE_ITERATIONS
+        doubt = np.diag([options.recovery_position, options.recovery_position, options.recovery_heading]) ** 2
+        predicted, iterations = WhitenedPose.of(PoseBelief(prior.mean, doubt)), 1 + MORE_ITERATIONS
         gates = gates_at(predicted, landmarks, frame, candidates)
     tentative = beyond_doubt(gates, frame, candidates, options)
     refined = refine(predicted, landmarks, frame, tentative, iterations, options.position_gate)

@@ -7,6 +7,8 @@ import numpy as np
 from slam_backend.errors import FloatArray
 from slam_backend.geometry import wrap_angle
 
+ZERO_PIVOT = 1e-12  # relative to the variance: below it a direction is taken to be exact
+
 
 def turn_about_vertical(theta: float) -> FloatArray:
     """Return the 3 x 3 rotation by theta [rad] about the vertical axis."""
@@ -22,12 +24,12 @@ def wrapped(pose: FloatArray) -> FloatArray:
 def lower_root(covariance: FloatArray) -> FloatArray:
     """Return the lower triangular C (3, 3) with C C^T = covariance (Cholesky).
 
-    A direction without uncertainty (a pivot <= 0) gets a column of zeros.
+    A direction without uncertainty (a pivot that vanishes beside its diagonal element) gets a column of zeros.
     """
     root = np.zeros((3, 3))
     for j in range(3):
         pivot = covariance[j, j] - root[j] @ root[j]
-        if pivot > 0.0:
+        if pivot > ZERO_PIVOT * covariance[j, j]:
             root[j:, j] = (covariance[j:, j] - root[j:] @ root[j]) / np.sqrt(pivot)
     return root
 
@@ -71,6 +73,12 @@ class WhitenedPose:
     def before_measurements(cls, start: FloatArray, root: FloatArray) -> "WhitenedPose":
         """Return N(start, root root^T): xi = 0 with unit information."""
         return cls(start, root, np.zeros(3), np.eye(3))
+
+    @classmethod
+    def of(cls, belief: PoseBelief) -> "WhitenedPose":
+        """Whiten a belief along the robot's own axes, however the map frame happens to be turned."""
+        turn = turn_about_vertical(belief.mean[2])
+        return cls.before_measurements(belief.mean, turn @ lower_root(turn.T @ belief.covariance @ turn))
 
     def at(self, xi: FloatArray, information: FloatArray) -> "WhitenedPose":
         """Return the same prior with something else known of xi."""
