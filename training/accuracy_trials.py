@@ -8,6 +8,7 @@ from typing import Any, Literal
 import numpy as np
 
 from slam_backend.errors import FloatArray, IntArray, check_choice, check_int
+from slam_backend.filter import FastSlam
 from slam_backend.geometry import transform_points, wrap_angle
 from slam_backend.metrics import align_se2, ate, map_rmse, nees
 from training.batch_ml import BatchEstimate, batch_ml
@@ -94,7 +95,7 @@ def play(trial: Trial) -> dict[str, Any]:
     begin = time.perf_counter()
     run = _run_of(trial.spec, trial.seed)
     if trial.method in FILTERS:
-        answer = _filtered(run, trial)
+        answer = follow(run, run.build_filter(trial.particles, trial.method, seed=trial.seed))  # type: ignore[arg-type]
     elif trial.method == "dead_reckoning":
         answer = Answer(BatchProblem.of_run(run).dead_reckoning().paths)
     else:
@@ -153,10 +154,9 @@ def _score_map(run: StereoRun, means: FloatArray, claims: IntArray, confirmed: A
     }
 
 
-def _filtered(run: StereoRun, trial: Trial) -> Answer:
-    """Let a filter take the run step by step, and note each pose when it is estimated."""
-    slam = run.build_filter(trial.particles, trial.method, seed=trial.seed)  # type: ignore[arg-type]
-    robots = range(trial.robots)
+def follow(run: StereoRun, slam: FastSlam) -> Answer:
+    """Let a filter, fresh from `run.build_filter`, take the run step by step; note each pose when it is estimated."""
+    robots = range(slam.num_robots)
     claims: dict[int, int] = {}  # id of a landmark -> true landmark behind the measurement that created it
     paths, covariances, ess, nis, times = [], [], [], [], []
     matched = wrong = held_back = total = 0
@@ -164,7 +164,7 @@ def _filtered(run: StereoRun, trial: Trial) -> Answer:
         begin = time.perf_counter()
         report = slam.step(**reading)
         times.append(time.perf_counter() - begin)
-        ess.append(report.ess / trial.particles)
+        ess.append(report.ess / slam.num_particles)
         nis.append(report.nis)
         for robot in robots:
             found, name = report.associations[robot].tolist(), names[robot].tolist()
