@@ -1476,10 +1476,10 @@ def weigh(
     for i in range(m):
         weights[i] = math.exp(log_weights[i] - largest)
         total += weights[i]
-    shift = largest + math.log(total)
+    log_total = math.log(total)
     squares = 0.0
     for i in range(m):
-        log_weights[i] -= shift
+        log_weights[i] = log_weights[i] - largest - log_total  # one after the other: the largest may be huge
         weights[i] /= total
         squares += weights[i] * weights[i]
     return 1.0 / squares

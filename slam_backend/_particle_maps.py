@@ -190,7 +190,7 @@ class ParticleMaps:
         return np.ascontiguousarray(values), self.counts[rows, :m]
 
     def load(
-        self, values: FloatArray, counts: IntArray, descriptors: NDArray[np.float32], ids: IntArray,
+        self, values: FloatArray, counts: NDArray[np.integer[Any]], descriptors: NDArray[np.float32], ids: IntArray,
         identities: IntArray, next_id: int,
     ) -> None:  # fmt: skip
         """Replace all landmarks by these: values (n, 9, M), counts (n, M), one row each of the others."""
@@ -214,6 +214,17 @@ class ParticleMaps:
         self._set_heads(n)
         self.tops[0] -= n  # the lowest rows and slots lie on top of the stacks
         self.tops[1] -= n
+
+    def taken(self, ancestors: IntArray) -> "ParticleMaps":
+        """Return maps of as many particles as there are ancestors (M',), each a copy of its ancestor's."""
+        slots = self.used_slots()
+        values, counts = self.dense(slots)
+        result = ParticleMaps(len(ancestors))
+        result.load(
+            values[:, :, ancestors], counts[:, ancestors], self.descriptors[slots], self.ids[slots],
+            self.identities[slots], self.next_id,
+        )  # fmt: skip
+        return result
 
     def _set_heads(self, n: int) -> None:
         """Write the heads of the first n slots; the others are free."""

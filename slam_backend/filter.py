@@ -16,6 +16,7 @@ from slam_backend import _kernels
 from slam_backend._frame_buffers import UPPER, Candidates, FrameBuffers, Turn
 from slam_backend._particle_maps import ParticleMaps, aligned
 from slam_backend._step_input import check_step
+from slam_backend.adaptation import AdaptiveParticles, next_num_particles
 from slam_backend.camera import StereoCamera
 from slam_backend.errors import FloatArray, IntArray, bad_argument, check_array, check_choice, check_int, check_seed
 from slam_backend.filter_options import FilterOptions
@@ -25,6 +26,7 @@ from slam_backend.measurements import Measurements
 from slam_backend.motion import OdometryModel
 from slam_backend.reports import PoseEstimate, StepReport
 from slam_backend.resampling import RESAMPLING
+from slam_backend.run_log import RobotLog
 
 UNPACK = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 NOTHING = np.zeros(3)
@@ -40,7 +42,7 @@ class FastSlam:
         initial_poses: (K, 3) [m, m, rad], map frame. None: all at the origin.
         num_particles, camera, motion, proposal, resampling, resample_threshold, position_gate, descriptor_gate,
         dead_zone, dead_radius, recovery_position, recovery_heading, descriptor_sigma, ambiguity,
-        new_landmark_density, one_to_one: See `FilterOptions`.
+        new_landmark_density, one_to_one, adaptive: See `FilterOptions`.
 
     Raises:
         ValueError: If an argument is out of its range; the text names it.
@@ -73,6 +75,7 @@ class FastSlam:
         ambiguity: float = 6.0,
         new_landmark_density: float = 0.01,
         one_to_one: bool = True,
+        adaptive: AdaptiveParticles | None = None,
         seed: int | np.random.SeedSequence | np.random.Generator = 0,
         initial_poses: ArrayLike | None = None,
     ) -> None:
@@ -93,6 +96,7 @@ class FastSlam:
             ambiguity=ambiguity,
             new_landmark_density=new_landmark_density,
             one_to_one=one_to_one,
+            adaptive=adaptive,
         )
         self._set_up(num_robots, options, seed)
         if initial_poses is not None:
@@ -111,9 +115,9 @@ class FastSlam:
         self._set_up(num_robots, options, seed)
         return self
 
-    def _set_up(self, num_robots: int, options: FilterOptions, seed: Any) -> None:
+    def _set_up(self, num_robots: int, options: FilterOptions, seed: Any, num_particles: int | None = None) -> None:
         k = check_int("num_robots", num_robots, 1, "Use at least one robot.")
-        m = options.num_particles
+        m = options.num_particles if num_particles is None else num_particles
         self.options = options
         self._rng = np.random.default_rng(check_seed(seed))
         self._maps = ParticleMaps(m)
@@ -127,6 +131,7 @@ class FastSlam:
         self._path_log_weights = np.zeros(m)  # Eq. 12: accumulated along the ancestral line
         self._weights = np.full(m, 1.0 / m)
         self._steps = 0
+        self._logs = [RobotLog() for _ in range(k)]
         self._buffers = FrameBuffers(padded)
         self._estimates = [self._mixture(robot) for robot in range(k)]
         camera = options.camera
@@ -163,6 +168,10 @@ class FastSlam:
     def descriptor_size(self) -> int:
         """Length of the descriptors in the map, 0 before the first one."""
         return int(self._maps.descriptors.shape[1])
+
+    def log(self, robot: int = 0) -> RobotLog:
+        """Return what the robot did and measured so far: odometry, points, and the landmarks they were taken for."""
+        return self._logs[self._check_robot(robot)].copy()
 
     @property
     def nbytes(self) -> int:
@@ -294,6 +303,13 @@ class FastSlam:
         self._estimates = [self._mixture(robot) for robot in range(len(frames))]
         threshold = self.options.resample_threshold * self.num_particles * (1.0 + 1e-9)
         report = self._report(turns, ess, resampled=buffers.used > 0 and ess <= threshold)
+        for robot, turn in enumerate(turns):
+            if turn.size or moves[robot] is not None or exact[robot] is not None:
+                ids = report.associations[robot]
+                self._logs[robot].append(
+                    self._steps - 1, moves[robot], exact[robot], turn.points,
+                    ids if len(turn.keep) == turn.size else ids[turn.keep], turn.noises if turn.given else None,
+                )  # fmt: skip
         if report.resampled:
             self._resample()
         return report
@@ -398,10 +414,30 @@ class FastSlam:
 
     def _resample(self) -> None:
         """Draw the particles anew in proportion to their weights; all that a particle holds goes with it."""
-        ancestors = RESAMPLING[self.options.resampling](self._weights, self._rng)
-        held: Any = (self._poses, self._starts, self._means, self._covariances, self._path_log_weights)
-        self._maps.resample(ancestors, held)
-        self._log_weights.fill(-np.log(self.num_particles))
+        count = self.num_particles
+        if self.options.adaptive is not None:
+            poses = np.ascontiguousarray(self._poses[:, :, :count].transpose(0, 2, 1))
+            count = next_num_particles(self.options.adaptive, poses, self._weights)
+        ancestors = RESAMPLING[self.options.resampling](self._weights, self._rng, count)
+        if count == self.num_particles:
+            held = (self._poses, self._starts, self._means, self._covariances, self._path_log_weights)
+            self._maps.resample(ancestors, held)
+            self._log_weights.fill(-np.log(count))
+        else:
+            self._become(ancestors)
+
+    def _become(self, ancestors: IntArray) -> None:
+        """Go on with as many particles as there are ancestors (M',), equally weighted."""
+        self._maps = self._maps.taken(ancestors)
+        for name in ("_poses", "_starts", "_means", "_covariances"):
+            old = getattr(self, name)
+            array = aligned((*old.shape[:2], self._maps.padded), np.float64)
+            array[:, :, : len(ancestors)] = old[:, :, ancestors]
+            setattr(self, name, array)
+        self._path_log_weights = self._path_log_weights[ancestors]
+        self._weights = np.full(len(ancestors), 1.0 / len(ancestors))
+        self._log_weights = np.full(len(ancestors), -np.log(len(ancestors)))
+        self._buffers = FrameBuffers(self._maps.padded)
 
     def _mixture(self, robot: int) -> PoseEstimate:
         return _mixture(self._means[robot], self._covariances[robot], self._weights)
@@ -417,6 +453,7 @@ class FastSlam:
             array = getattr(self, name)
             array[:] = array[order]
         self._blind = self._blind[order]
+        self._logs = [self._logs[robot] for robot in order]
         self._estimates = [self._estimates[robot] for robot in order]
 
     # ------------------------------------------------------------------ snapshots
@@ -427,6 +464,7 @@ class FastSlam:
         """Return all that decides how the filter goes on, its random stream included. Shares nothing with it."""
         state: dict[str, Any] = {name: getattr(self, name).copy() for name in self._STATE}
         state |= {"steps": self._steps, "estimates": _copies(self._estimates), "maps": self._maps.get_state()}
+        state["logs"] = tuple(log.get_state() for log in self._logs)
         return state | {"options": self.options, "rng": copy.deepcopy(self._rng.bit_generator.state)}
 
     def set_state(self, state: Mapping[str, Any]) -> None:
@@ -435,15 +473,19 @@ class FastSlam:
         Raises:
             ValueError: If `state` is not one of `get_state`.
         """
-        missing = [name for name in (*self._STATE, "steps", "estimates", "maps", "options", "rng") if name not in state]
+        names = (*self._STATE, "steps", "estimates", "maps", "logs", "options", "rng")
+        missing = [name for name in names if name not in state]
         if missing:
             raise bad_argument("state", "a dict from FastSlam.get_state", f"no {missing[0]!r}", "Pass it unchanged.")
-        same = state["options"] == self.options and state["_poses"].shape == self._poses.shape
+        shapes = [state[name].shape == getattr(self, name).shape for name in ("_poses", "_weights")]
+        same = state["options"] == self.options and all(shapes)
         if not same:
-            self._set_up(len(state["_poses"]), state["options"], 0)
+            self._set_up(len(state["_poses"]), state["options"], 0, len(state["_weights"]))
         for name in self._STATE:
             getattr(self, name)[:] = state[name]
         self._maps.set_state(state["maps"])
+        for log, logged in zip(self._logs, state["logs"], strict=True):
+            log.set_state(logged)
         self._steps, self._estimates = state["steps"], list(_copies(state["estimates"]))
         # A stream of its own: the old one may be the caller's, or of another kind.
         self._rng = np.random.Generator(getattr(np.random, state["rng"]["bit_generator"])(0))

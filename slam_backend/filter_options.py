@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
+from slam_backend.adaptation import AdaptiveParticles
 from slam_backend.camera import StereoCamera
 from slam_backend.errors import bad_argument, check_choice, check_float, check_int
 from slam_backend.motion import OdometryModel
@@ -36,7 +37,8 @@ class FilterOptions:
         ambiguity: A runner-up whose cost (squared Mahalanobis + log-determinant + descriptor) is nearer than this
             makes a measurement ambiguous, and it is held back (`fastslam2`) [-].
         new_landmark_density: p0, density of measurements that match nothing [1/m^3].
-        one_to_one: Match a landmark at most once in a frame (`fastslam2` always does).
+        one_to_one: Match a landmark at most once in a frame; False: measurements choose independently, as in the paper.
+        adaptive: How the number of particles follows the spread of the poses at each resampling; None: it stays.
     """
 
     num_particles: int = 100
@@ -55,6 +57,7 @@ class FilterOptions:
     ambiguity: float = 6.0
     new_landmark_density: float = 0.01
     one_to_one: bool = True
+    adaptive: AdaptiveParticles | None = None
 
     def __post_init__(self) -> None:
         check_int("num_particles", self.num_particles, 1, "Use at least one particle; 100 is a good start.")
@@ -70,5 +73,8 @@ class FilterOptions:
         for name in ("dead_radius", "recovery_position", "recovery_heading"):
             check_float(name, getattr(self, name), "Use 0 to switch it off.", at_least=0.0)
         check_float("ambiguity", self.ambiguity, "Use 0 to hold nothing back.", at_least=0.0)
+        if self.adaptive is not None and not isinstance(self.adaptive, AdaptiveParticles):
+            cure = "Build one: AdaptiveParticles()."
+            raise bad_argument("adaptive", "AdaptiveParticles or None", self.adaptive, cure)
         if not isinstance(self.one_to_one, bool):
             raise bad_argument("one_to_one", "a bool", self.one_to_one, "Say True or False.")

@@ -116,8 +116,9 @@ def merge_filters(
     )
     joint._steps = max(a._steps, b._steps)
     joint._estimates = [joint._mixture(robot) for robot in range(joint.num_robots)]
-    renamed = np.concatenate([pairs[:, ::-1], np.column_stack([dense_b.ids[own], new_ids])])
-    return joint, renamed.astype(np.int64)
+    renamed = np.concatenate([pairs[:, ::-1], np.column_stack([dense_b.ids[own], new_ids])]).astype(np.int64)
+    joint._logs = [log.copy() for log in a._logs] + [log.renamed(renamed[:, 0], renamed[:, 1]) for log in b._logs]
+    return joint, renamed
 
 
 class _Dense(NamedTuple):
