@@ -27,7 +27,7 @@ import numpy as np
 from slam_backend._jit import bits_float, float_bits, jit, lanes, lanes_inlined
 from slam_backend.errors import Float32Array, FloatArray, Int32Array, IntArray
 
-LANES = 32
+LANES = 64
 REJECTED = -1
 MIN_DEPTH = 0.05  # [m]; nothing is predicted nearer to the camera plane than this
 MIN_CONTRADICTIONS = 3.0  # three points fix a pose with one to spare

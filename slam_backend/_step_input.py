@@ -5,22 +5,25 @@ from typing import Any
 import numpy as np
 
 from slam_backend import _kernels
+from slam_backend.camera import StereoCamera
 from slam_backend.errors import FloatArray, IntArray, bad_argument, check_array
 from slam_backend.measurements import Measurements
 
 FARTHEST_MOVE = 1e4  # [m, rad]; no robot moves so far between two steps
 FARTHEST_POINT = 1e4  # [m]; no camera measures so far; at a million times this, covariances overflow
+FLATTEST = 1e4  # depth over breadth of a stereo point's covariance; flatter ones lose their digits
 FARTHEST_POSE = 1e6  # [m, rad]; no robot goes so far from its start
 
 
 def check_step(
-    k: int, size: int, odometry: Any, measurements: Any, identities: Any, poses: Any
+    k: int, size: int, camera: StereoCamera, odometry: Any, measurements: Any, identities: Any, poses: Any
 ) -> tuple[list[FloatArray | None], list[Measurements | None], list[IntArray | None], list[FloatArray | None]]:
     """Return the arguments of `FastSlam.step` for k robots as lists of checked arrays.
 
     Args:
         k: Number of robots.
         size: Length of the map's descriptors, 0 if there are none yet.
+        camera: Of the robots.
         odometry, measurements, identities, poses: As in `FastSlam.step`.
 
     Raises:
@@ -48,7 +51,7 @@ def check_step(
             if not isinstance(frame, Measurements):
                 raise bad_argument(f"measurements[{robot}]", "Measurements or None", frame, "Wrap the arrays.")
             if len(frame):
-                size = _check_frame(robot, frame, size)
+                size = _check_frame(robot, frame, size, camera)
         if identity is not None:
             wanted = (0 if frame is None else len(frame),)
             if type(identity) is np.ndarray and identity.dtype == np.int64 and identity.shape == wanted:
@@ -85,7 +88,7 @@ def _check_pose(robot: int, pose: Any) -> FloatArray:
     return checked
 
 
-def _check_frame(robot: int, frame: Measurements, size: int) -> int:
+def _check_frame(robot: int, frame: Measurements, size: int, camera: StereoCamera) -> int:
     """Check one frame against the map's descriptor size (0 = any) and the camera model; return its descriptor size."""
     if size not in (0, frame.descriptors.shape[1]):
         raise bad_argument(
@@ -95,9 +98,12 @@ def _check_frame(robot: int, frame: Measurements, size: int) -> int:
             "Use one kind of descriptor throughout a run.",
         )
     nearest, farthest = _kernels.extent(frame.points)
-    if farthest > FARTHEST_POINT:
+    limit = FARTHEST_POINT
+    if frame.covariances is None:
+        limit = min(limit, FLATTEST * camera.baseline * camera.sigma_px / camera.sigma_disparity_px)
+    if farthest > limit:
         cure = "Check the units, metres, and drop points without disparity."
-        raise bad_argument(f"measurements[{robot}].points", f"numbers within +-{FARTHEST_POINT:g}", farthest, cure)
+        raise bad_argument(f"measurements[{robot}].points", f"numbers within +-{limit:g}", farthest, cure)
     if frame.covariances is None and nearest < _kernels.MIN_DEPTH:
         raise bad_argument(
             f"measurements[{robot}].points",

@@ -13,12 +13,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from slam_backend import _kernels
+from slam_backend._existence_step import ExistenceStep
 from slam_backend._frame_buffers import UPPER, Candidates, FrameBuffers, Turn
 from slam_backend._particle_maps import ParticleMaps, aligned
 from slam_backend._step_input import check_step
 from slam_backend.adaptation import AdaptiveParticles, next_num_particles
 from slam_backend.camera import StereoCamera
 from slam_backend.errors import FloatArray, IntArray, bad_argument, check_array, check_choice, check_int, check_seed
+from slam_backend.existence import ExistenceModel
 from slam_backend.filter_options import FilterOptions
 from slam_backend.geometry import between, compose, rotate_covariances, rotation, wrap_angle
 from slam_backend.landmark_map import LandmarkMap
@@ -42,7 +44,7 @@ class FastSlam:
         initial_poses: (K, 3) [m, m, rad], map frame. None: all at the origin.
         num_particles, camera, motion, proposal, resampling, resample_threshold, position_gate, descriptor_gate,
         dead_zone, dead_radius, recovery_position, recovery_heading, descriptor_sigma, ambiguity,
-        new_landmark_density, one_to_one, adaptive: See `FilterOptions`.
+        new_landmark_density, one_to_one, adaptive, existence: See `FilterOptions`.
 
     Raises:
         ValueError: If an argument is out of its range; the text names it.
@@ -76,6 +78,7 @@ class FastSlam:
         new_landmark_density: float = 0.01,
         one_to_one: bool = True,
         adaptive: AdaptiveParticles | None = None,
+        existence: ExistenceModel | None = None,
         seed: int | np.random.SeedSequence | np.random.Generator = 0,
         initial_poses: ArrayLike | None = None,
     ) -> None:
@@ -97,6 +100,7 @@ class FastSlam:
             new_landmark_density=new_landmark_density,
             one_to_one=one_to_one,
             adaptive=adaptive,
+            existence=existence,
         )
         self._set_up(num_robots, options, seed)
         if initial_poses is not None:
@@ -120,7 +124,9 @@ class FastSlam:
         m = options.num_particles if num_particles is None else num_particles
         self.options = options
         self._rng = np.random.default_rng(check_seed(seed))
-        self._maps = ParticleMaps(m)
+        existence = options.existence
+        self._existence = None if existence is None else ExistenceStep(existence, options.camera)
+        self._maps = ParticleMaps(m, None if existence is None else existence.log_odds_prior)
         padded = self._maps.padded  # particles come in blocks of lanes; the last block's surplus lanes mean nothing
         self._poses = aligned((k, 3, padded), np.float64)  # x_t^[m] of each robot, map frame
         self._starts = aligned((k, 3, padded), np.float64)  # where each robot started, map frame; spreads at a merge
@@ -259,6 +265,19 @@ class FastSlam:
             means, covariances, self._maps.descriptors[slots], counts.astype(np.int64), self._maps.ids[slots]
         )
 
+    def existence(self) -> tuple[IntArray, FloatArray]:
+        """Return the ids (n,) of the landmarks of `map()`, ascending, and the probability (n,) that each exists.
+
+        Raises:
+            ValueError: If the filter was built without `existence`.
+        """
+        if self._existence is None:
+            cure = "Build the filter with existence=ExistenceModel()."
+            raise bad_argument("existence", "a filter that keeps it", "one that does not", cure)
+        slots = self._maps.used_slots()
+        slots = slots[self._maps.of_particle(self.best_particle, slots)[1] > 0]
+        return self._maps.ids[slots], 1.0 / (1.0 + np.exp(-self._maps.odds_of_particle(self.best_particle, slots)))
+
     def _dense(self) -> tuple[IntArray, FloatArray, FloatArray, IntArray]:
         """Return ids (n,), means (n, 3, M), covariances (n, 6, M) and counts (n, M), 0 where a particle lacks it."""
         slots = self._maps.used_slots()
@@ -290,14 +309,16 @@ class FastSlam:
             ValueError: If an argument is ill-formed; the filter is then as before.
         """
         moves, frames, names, exact = check_step(
-            self.num_robots, self.descriptor_size, odometry, measurements, identities, poses
+            self.num_robots, self.descriptor_size, self.options.camera, odometry, measurements, identities, poses
         )
         buffers = self._buffers
         buffers.start(sum(0 if frame is None else len(frame) for frame in frames))
-        turns = [
-            self._take_turn(robot, moves[robot], frames[robot], names[robot], exact[robot])
-            for robot in range(len(frames))
-        ]
+        turns, deserted = [], []
+        for robot in range(len(frames)):
+            turns.append(self._take_turn(robot, moves[robot], frames[robot], names[robot], exact[robot]))
+            if self._existence is not None and frames[robot] is not None:
+                where, best = self._poses[robot], self.best_particle
+                deserted.append(self._existence.weigh(self._maps, where, best, turns[robot]))
         self._steps += 1
         ess = _kernels.weigh(buffers.log_likelihood, self._log_weights, self._path_log_weights, self._weights)
         self._estimates = [self._mixture(robot) for robot in range(len(frames))]
@@ -310,6 +331,8 @@ class FastSlam:
                     self._steps - 1, moves[robot], exact[robot], turn.points,
                     ids if len(turn.keep) == turn.size else ids[turn.keep], turn.noises if turn.given else None,
                 )  # fmt: skip
+        for slots in deserted:
+            self._maps.release(slots)
         if report.resampled:
             self._resample()
         return report
@@ -347,6 +370,7 @@ class FastSlam:
         if num:
             maps.make_room(num, used.descriptors.shape[1])
         buffers.make_room(len(candidates.slots))
+        maps.carry_odds(candidates.unique)
         starts, slots, squares, owners, same, unique = candidates
         named = used.names is not None
         store = (

@@ -191,7 +191,8 @@ class TeamSlam:
             ValueError: If an argument is ill-formed; the team is then as before.
         """
         touch = self._check_contacts(contacts)
-        check_step(self.num_robots, self._descriptor_size(), odometry, measurements, identities, poses)
+        camera = self._groups[0].filter.options.camera
+        check_step(self.num_robots, self._descriptor_size(), camera, odometry, measurements, identities, poses)
         associations: list[IntArray] = [np.empty(0, np.int64)] * self.num_robots
         created = list(associations)
         for group in self._groups:

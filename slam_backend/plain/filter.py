@@ -121,7 +121,7 @@ class PlainFastSlam:
     ) -> StepReport:
         """Move the robots, match what they see, weigh, update, and resample if needed; all as of `FastSlam.step`."""
         k = len(self.is_blind)
-        arguments = check_step(k, self._descriptor_size, odometry, measurements, identities, poses)
+        arguments = check_step(k, self._descriptor_size, self.options.camera, odometry, measurements, identities, poses)
         records = [self._step_robot(robot, *reading) for robot, reading in enumerate(zip(*arguments, strict=True))]
         for record in records:  # Algorithm 1, l. 9; Eqs. 3, 11, in logarithms; weights of before are kept
             for particle, value in zip(self.particles, record.log_likelihoods, strict=True):
