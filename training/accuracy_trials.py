@@ -188,7 +188,7 @@ def follow(run: StereoRun, slam: FastSlam) -> Answer:
         confirmed=held.counts >= CONFIRMED,
         extra={
             "ess_share": float(np.mean(ess)),
-            "nis": float(np.nanmean(nis)),
+            "nis": float(np.mean(values)) if len(values := np.array(nis)[np.isfinite(nis)]) else float("nan"),
             "wrong_match_share": wrong / max(matched, 1),
             "held_back_share": held_back / max(total, 1),
             "step_ms": 1e3 * float(np.median(times)),

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from slam_backend.errors import bad_argument
-from training.run_folder import CONFIG_FILE, RunFolder, plain, read_config
+from training.run_folder import CONFIG_FILE, RunFolder, installed_versions, plain, read_config
 
 SINGLE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
@@ -35,7 +35,7 @@ def open_folder(out: Path | None, command: str, config: Mapping[str, Any], seed:
         cure = f"Repeat the options in {str(out / CONFIG_FILE)!r}, or choose another folder."
         expected = f"a folder of this very {command.split()[0]}"
         raise bad_argument("out", expected, "a folder of one with other options", cure)
-    return RunFolder(out, command, values, seed, {})
+    return RunFolder(out, command, values, seed, installed_versions())
 
 
 def finished_trials(folder: RunFolder, name: str, kind: type[TrialT]) -> dict[TrialT, dict[str, Any]]:
