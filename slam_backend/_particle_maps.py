@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend import _kernels
+from slam_backend import _existence_kernels, _kernels
 from slam_backend._kernels import LANES
 from slam_backend.errors import FloatArray, IntArray
 
@@ -40,23 +40,27 @@ class ParticleMaps:
 
     Args:
         num_particles: M.
+        log_odds_prior: Of the existence of a new landmark; None: existence is not kept.
 
     Attributes:
         values: (rows * 9 * P,) float64, each row [block][x, y, z, Sxx, Sxy, Sxz, Syy, Syz, Szz][lane], map frame.
         counts: (rows, P) int32. How often the particle matched the landmark, its start included; 0: it lacks it.
         row_of, map_of: (slots,) int64.
         maps: (maps, P) int32. users: (maps,) int64, how many slots read by each.
+        odds: (slots, P) float64. Log-odds that the landmark exists, read through its map as a row is; (0, P) without.
         ids: (slots,) int64. Stable names of the landmarks, -1 = free slot.
         identities: (slots,) int64. The caller's own names, -1 = none.
         descriptors: (slots, d) float32. heads: (h, slots) every (d / h)-th component of them, `FAR` where free.
         free_rows, free_slots: Stacks; `tops` = (their heights, the name of the next landmark).
     """
 
-    def __init__(self, num_particles: int) -> None:
+    def __init__(self, num_particles: int, log_odds_prior: float | None = None) -> None:
         self.num_particles = num_particles
+        self.log_odds_prior = log_odds_prior
         self.padded = -(-num_particles // LANES) * LANES
         self.values: FloatArray = aligned((0,), np.float64)
         self.counts: NDArray[np.int32] = aligned((0, self.padded), np.int32)
+        self.odds: FloatArray = aligned((0, self.padded), np.float64)
         self.maps: NDArray[np.int32] = np.zeros((1, self.padded), dtype=np.int32)
         self.users: IntArray = np.zeros(1, dtype=np.int64)
         self.row_of: IntArray = np.zeros(0, dtype=np.int64)
@@ -80,9 +84,14 @@ class ParticleMaps:
         """Memory held [bytes]."""
         arrays = (
             self.values, self.counts, self.maps, self.users, self.row_of, self.map_of, self.ids, self.identities,
-            self.descriptors, self.heads, self.free_rows, self.free_slots,
+            self.descriptors, self.heads, self.free_rows, self.free_slots, self.odds,
         )  # fmt: skip
         return sum(array.nbytes for array in arrays)
+
+    @property
+    def blocks(self) -> FloatArray:
+        """`values` as (rows, blocks, 9, lanes). A view."""
+        return self.values.reshape(-1, self.padded // LANES, 9, LANES)
 
     def used_slots(self) -> IntArray:
         """Return the slots that hold a landmark of at least one particle, by ascending id."""
@@ -111,6 +120,10 @@ class ParticleMaps:
         if old and len(self.heads):
             heads[:, :old] = self.heads
         self.heads = heads
+        if self.log_odds_prior is not None:
+            odds = aligned((old + extra, self.padded), np.float64)
+            odds[:old] = self.odds
+            self.odds = odds
         top = int(self.tops[1])
         free = np.zeros(old + extra, dtype=np.int64)
         free[:extra] = np.arange(old + extra - 1, old - 1, -1)  # the lowest is taken first once the old ones are gone
@@ -168,8 +181,37 @@ class ParticleMaps:
         """Bring slots up to date: afterwards they are read in place."""
         if not self.tops[0]:
             self._grow_rows(64)
+        self.carry_odds(slots)
         _kernels.refresh(
             slots, self.values, self.counts, self.row_of, self.map_of, self.maps, self.users, self.free_rows, self.tops
+        )
+
+    # ------------------------------------------------------------------ existence
+
+    def carry_odds(self, slots: IntArray) -> None:
+        """Bring the log-odds of slots up to date, just before a kernel does so with all else that they hold."""
+        if self.log_odds_prior is not None:
+            _existence_kernels.carry_odds(slots, self.odds, self.map_of, self.maps)
+
+    def start_odds(self, new_slots: IntArray) -> None:
+        """Give landmarks that were just started their prior; -1 among `new_slots` stands for none."""
+        self.odds[new_slots[new_slots >= 0]] = self.log_odds_prior
+
+    def odds_of_particle(self, m: int, slots: IntArray) -> FloatArray:
+        """Return log-odds (n,) of one particle."""
+        return np.asarray(self.odds[slots, np.where(self.map_of[slots] > 0, self.maps[self.map_of[slots], m], m)])
+
+    def dense_odds(self, slots: IntArray) -> FloatArray | None:
+        """Return log-odds (n, M) of all particles, None where existence is not kept. A copy."""
+        if self.log_odds_prior is None:
+            return None
+        self.refresh(slots)
+        return self.odds[slots][:, : self.num_particles]
+
+    def release(self, slots: IntArray) -> None:
+        """Forget landmarks, up to date, that no particle holds."""
+        _existence_kernels.release(
+            slots, self.ids, self.row_of, self.heads, self.free_rows, self.free_slots, self.tops, _kernels.FAR
         )
 
     # ------------------------------------------------------------------ reading and writing whole maps
@@ -178,26 +220,29 @@ class ParticleMaps:
         """Return values (n, 9) and counts (n,) of one particle."""
         places = np.where(self.map_of[slots] > 0, self.maps[self.map_of[slots], m], m)
         rows = self.row_of[slots]
-        blocks = self.values.reshape(-1, self.padded // LANES, 9, LANES)
+        blocks = self.blocks
         return blocks[rows, places // LANES, :, places % LANES], self.counts[rows, places]
 
     def dense(self, slots: IntArray) -> tuple[FloatArray, NDArray[np.int32]]:
         """Return values (n, 9, M) and counts (n, M) of all particles. Copies."""
         self.refresh(slots)
         rows, m = self.row_of[slots], self.num_particles
-        blocks = self.values.reshape(-1, self.padded // LANES, 9, LANES)[rows]
+        blocks = self.blocks[rows]
         values = blocks.transpose(0, 2, 1, 3).reshape(len(rows), 9, self.padded)[:, :, :m]
         return np.ascontiguousarray(values), self.counts[rows, :m]
 
     def load(
         self, values: FloatArray, counts: NDArray[np.integer[Any]], descriptors: NDArray[np.float32], ids: IntArray,
-        identities: IntArray, next_id: int,
+        identities: IntArray, next_id: int, odds: FloatArray | None = None,
     ) -> None:  # fmt: skip
-        """Replace all landmarks by these: values (n, 9, M), counts (n, M), one row each of the others."""
+        """Replace all landmarks by these: values (n, 9, M), counts and odds (n, M), one row each of the others.
+
+        Where existence is kept and `odds` are not given, landmarks get the prior.
+        """
         keep = (counts > 0).any(axis=1)
         values, counts, descriptors = values[keep], counts[keep], descriptors[keep]
         n, m = len(values), self.num_particles
-        self.__init__(m)  # type: ignore[misc]
+        self.__init__(m, self.log_odds_prior)  # type: ignore[misc]
         self.tops[2] = next_id
         if not n:
             return
@@ -205,12 +250,14 @@ class ParticleMaps:
         slots, rows = np.arange(n), np.arange(n)
         padded = np.zeros((n, 9, self.padded))
         padded[:, :, :m] = values
-        blocks = self.values.reshape(-1, self.padded // LANES, 9, LANES)
+        blocks = self.blocks
         blocks[rows] = padded.reshape(n, 9, -1, LANES).transpose(0, 2, 1, 3)
         self.counts[rows, :m] = counts
         self.row_of[slots], self.map_of[slots] = rows, 0
         self.ids[slots], self.identities[slots] = ids[keep], identities[keep]
         self.descriptors[slots] = descriptors
+        if self.log_odds_prior is not None:
+            self.odds[slots, :m] = self.log_odds_prior if odds is None else odds[keep]
         self._set_heads(n)
         self.tops[0] -= n  # the lowest rows and slots lie on top of the stacks
         self.tops[1] -= n
@@ -219,10 +266,11 @@ class ParticleMaps:
         """Return maps of as many particles as there are ancestors (M',), each a copy of its ancestor's."""
         slots = self.used_slots()
         values, counts = self.dense(slots)
-        result = ParticleMaps(len(ancestors))
+        odds = self.dense_odds(slots)
+        result = ParticleMaps(len(ancestors), self.log_odds_prior)
         result.load(
             values[:, :, ancestors], counts[:, ancestors], self.descriptors[slots], self.ids[slots],
-            self.identities[slots], self.next_id,
+            self.identities[slots], self.next_id, None if odds is None else odds[:, ancestors],
         )  # fmt: skip
         return result
 
@@ -246,6 +294,7 @@ class ParticleMaps:
             "num_particles": self.num_particles,
             "values": np.take(self.values.reshape(-1, 9 * self.padded), rows, axis=0),
             "counts": np.take(self.counts, rows, axis=0),
+            "odds": None if self.log_odds_prior is None else np.take(self.odds, used, axis=0),
             "maps": np.take(self.maps, live, axis=0),
             "map_of": number[of],
             "ids": self.ids[used],
@@ -259,12 +308,14 @@ class ParticleMaps:
         n, m, maps = len(state["ids"]), int(state["num_particles"]), state["maps"]
         size = state["descriptors"].shape[1]
         if m != self.num_particles or len(self.counts) < n or len(self.ids) < n or self.descriptors.shape[1] != size:
-            self.__init__(m)  # type: ignore[misc]
+            self.__init__(m, self.log_odds_prior)  # type: ignore[misc]
             if n:
                 self.make_room(n, size)
         slots, rows = len(self.ids), len(self.counts)
         self.values.reshape(-1, 9 * self.padded)[:n] = state["values"]
         self.counts[:n] = state["counts"]
+        if self.log_odds_prior is not None:
+            self.odds[:n] = state["odds"]
         self.row_of[:n], self.map_of[:n] = np.arange(n), state["map_of"]
         for name, fill in (("ids", -1), ("identities", -1)):
             getattr(self, name)[:n] = state[name]

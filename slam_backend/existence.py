@@ -8,15 +8,14 @@ for it | it does not exist) = f,
 
     sighting: + log(d / f)          miss: + log((1 - d) / (1 - f)).
 
-Log-odds stop at a cap, so that a landmark that was seen a thousand times can still be found to be gone. The functions
-on scalars are plain arithmetic without branches: compiled into a filter's loop they vectorise over particles.
+Log-odds stop at a cap, so that a landmark that was seen a thousand times can still be found to be gone. The filter's
+loops over landmarks and particles are in `_existence_kernels.py`.
 """
 
 from dataclasses import dataclass
 from math import exp, floor, log
 from typing import NamedTuple
 
-from slam_backend._jit import inlined
 from slam_backend.camera import StereoCamera
 from slam_backend.errors import bad_argument, check_float, check_int
 
@@ -148,35 +147,3 @@ class View(NamedTuple):
 
 def _log_odds(probability: float) -> float:
     return log(probability / (1.0 - probability))
-
-
-@inlined
-def in_view(
-    depth: float, lateral: float, vertical: float, nearest: float, side: float, rise: float, reach_squared: float
-) -> bool:
-    """Tell whether a predicted point is expected in view: inside the image less its margin, and near enough.
-
-    Args:
-        depth, lateral, vertical: The point relative to the camera centre [m], robot axes (ahead, left, up).
-        nearest, side, rise, reach_squared: A `View`, one by one: scalars stay in registers over a loop.
-    """
-    return (
-        (depth > nearest)
-        & (abs(lateral) <= side * depth)
-        & (abs(vertical) <= rise * depth)
-        & (depth * depth + lateral * lateral + vertical * vertical <= reach_squared)
-    )
-
-
-@inlined
-def updated_log_odds(log_odds: float, seen: bool, expected: bool, sighting: float, miss: float, cap: float) -> float:
-    """Return a landmark's log-odds after a frame: Bayes' rule in logarithms, up to the cap.
-
-    Args:
-        log_odds: Before the frame.
-        seen: Whether it was matched.
-        expected: Whether it was expected in view.
-        sighting, miss: From `ExistenceModel.increments`.
-        cap: `ExistenceModel.log_odds_cap`.
-    """
-    return min(cap, log_odds + seen * sighting + (expected & (not seen)) * miss)

@@ -6,6 +6,7 @@ from typing import Literal
 from slam_backend.adaptation import AdaptiveParticles
 from slam_backend.camera import StereoCamera
 from slam_backend.errors import bad_argument, check_choice, check_float, check_int
+from slam_backend.existence import ExistenceModel
 from slam_backend.motion import OdometryModel
 from slam_backend.resampling import RESAMPLING
 
@@ -39,6 +40,8 @@ class FilterOptions:
         new_landmark_density: p0, density of measurements that match nothing [1/m^3].
         one_to_one: Match a landmark at most once in a frame; False: measurements choose independently, as in the paper.
         adaptive: How the number of particles follows the spread of the poses at each resampling; None: it stays.
+        existence: How the probability that a landmark exists follows from being seen and missed; particles delete
+            landmarks that are too improbable. None: what is once in a map stays there.
     """
 
     num_particles: int = 100
@@ -58,6 +61,7 @@ class FilterOptions:
     new_landmark_density: float = 0.01
     one_to_one: bool = True
     adaptive: AdaptiveParticles | None = None
+    existence: ExistenceModel | None = None
 
     def __post_init__(self) -> None:
         check_int("num_particles", self.num_particles, 1, "Use at least one particle; 100 is a good start.")
@@ -73,8 +77,11 @@ class FilterOptions:
         for name in ("dead_radius", "recovery_position", "recovery_heading"):
             check_float(name, getattr(self, name), "Use 0 to switch it off.", at_least=0.0)
         check_float("ambiguity", self.ambiguity, "Use 0 to hold nothing back.", at_least=0.0)
-        if self.adaptive is not None and not isinstance(self.adaptive, AdaptiveParticles):
-            cure = "Build one: AdaptiveParticles()."
-            raise bad_argument("adaptive", "AdaptiveParticles or None", self.adaptive, cure)
+        for name, model in (("adaptive", AdaptiveParticles), ("existence", ExistenceModel)):
+            value = getattr(self, name)
+            if value is not None and not isinstance(value, model):
+                raise bad_argument(name, f"{model.__name__} or None", value, f"Build one: {model.__name__}().")
+        if self.existence is not None:
+            self.existence.view(self.camera)  # raises if nothing is left of the view
         if not isinstance(self.one_to_one, bool):
             raise bad_argument("one_to_one", "a bool", self.one_to_one, "Say True or False.")

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from slam_backend._frame_buffers import UPPER
 from slam_backend.alignment import Alignment
 from slam_backend.errors import BoolArray, FloatArray, IntArray
+from slam_backend.existence import ExistenceModel
 from slam_backend.filter import UNPACK, FastSlam
 from slam_backend.fusion import fuse_descriptors, fuse_landmarks
 from slam_backend.geometry import compose, inverse, rotation
@@ -91,6 +92,8 @@ def merge_filters(
 
     values_a, counts_a = np.take(dense_a.values, from_a, axis=2), np.take(dense_a.counts, from_a, axis=1)
     values_b, counts_b = np.take(dense_b.values, from_b, axis=2), np.take(dense_b.counts, from_b, axis=1)
+    model = a.options.existence
+    odds_a, odds_b = _odds_of(dense_a, from_a, model), _odds_of(dense_b, from_b, model)
     values_a[:, 3:] *= scale
     values_b[:, 3:] *= scale
     _move_landmarks(values_b, motion)
@@ -102,6 +105,8 @@ def merge_filters(
         )
         names = identities[shared_a]
         identities[shared_a] = np.where(names < 0, dense_b.identities[shared_b], names)
+        if model is not None:
+            _fuse_odds(model, odds_a, counts_a, shared_a, odds_b, counts_b, shared_b)
         _fuse_rows((values_a, counts_a), shared_a, (values_b, counts_b), shared_b)
     own = np.setdiff1d(np.arange(len(dense_b.ids)), shared_b)  # b's landmarks that a does not have
     next_id = a._maps.next_id
@@ -113,6 +118,7 @@ def merge_filters(
         np.concatenate([dense_a.ids, new_ids]),
         np.concatenate([identities, dense_b.identities[own]]),
         next_id + len(own),
+        np.concatenate([odds_a, odds_b[own]]),
     )
     joint._steps = max(a._steps, b._steps)
     joint._estimates = [joint._mixture(robot) for robot in range(joint.num_robots)]
@@ -122,11 +128,15 @@ def merge_filters(
 
 
 class _Dense(NamedTuple):
-    """A filter's landmarks by ascending id: values (n, 9, M), counts (n, M), and one row each of the others."""
+    """A filter's landmarks by ascending id: values (n, 9, M), counts (n, M), and one row each of the others.
+
+    The log-odds of existence are (n, M), None where the filter does not keep them.
+    """
 
     ids: IntArray
     values: FloatArray
     counts: IntArray
+    odds: FloatArray | None
     descriptors: NDArray[np.float32]
     identities: IntArray
 
@@ -135,7 +145,17 @@ class _Dense(NamedTuple):
         maps = slam._maps
         slots = maps.used_slots()
         values, counts = maps.dense(slots)
-        return cls(maps.ids[slots], values, counts.astype(np.int64), maps.descriptors[slots], maps.identities[slots])
+        return cls(
+            maps.ids[slots], values, counts.astype(np.int64), maps.dense_odds(slots), maps.descriptors[slots],
+            maps.identities[slots],
+        )  # fmt: skip
+
+
+def _odds_of(dense: _Dense, chosen: IntArray, model: ExistenceModel | None) -> FloatArray:
+    """Return the log-odds of existence (n, M) that the chosen particles (M,) have: the prior, where they have none."""
+    if dense.odds is not None:
+        return np.take(dense.odds, chosen, axis=1)
+    return np.full((len(dense.ids), len(chosen)), 0.0 if model is None else model.log_odds_prior)
 
 
 def _join_poses(
@@ -227,6 +247,21 @@ def _fuse_rows(
     fused[row, particle] = np.concatenate([means, covariances[:, *UPPER]], axis=1)
     a[0][rows_a] = fused.transpose(0, 2, 1)
     a[1][rows_a] += b[1][rows_b]
+
+
+def _fuse_odds(
+    model: ExistenceModel, odds_a: FloatArray, counts_a: IntArray, rows_a: IntArray,
+    odds_b: FloatArray, counts_b: IntArray, rows_b: IntArray,
+) -> None:
+    """Fuse the log-odds of existence (n, M) of b's rows into a's, in place, like `_fuse_rows`, and before it.
+
+    What either filter saw is independent given whether the landmark exists: log-odds add up, and the prior that both
+    hold counts once.
+    """
+    in_a, in_b = counts_a[rows_a] > 0, counts_b[rows_b] > 0
+    one, two = odds_a[rows_a], odds_b[rows_b]
+    both = np.minimum(one + two - model.log_odds_prior, model.log_odds_cap)
+    odds_a[rows_a] = np.where(in_a & in_b, both, np.where(in_b, two, one))
 
 
 def _align_pairs(

@@ -6,6 +6,7 @@ import numpy as np
 
 from slam_backend.attempts import AttemptOptions
 from slam_backend.compilation import watch_compilation
+from slam_backend.existence import ExistenceModel
 from slam_backend.filter import FastSlam
 from slam_backend.measurements import Measurements
 from slam_backend.metrics.maps import map_error
@@ -42,6 +43,9 @@ def warm_up() -> float:
                     slam.step([move, None], [frame, frame])
                 slam.step([None, None], [frame, frame], [names, some], [still, None])
                 slam.step([move, move], [None, None])
+        watching = FastSlam(num_particles=4, existence=ExistenceModel(), resample_threshold=1.0)
+        for _ in range(STEPS):
+            watching.step([move], [plain])
         team = TeamSlam(2, num_particles=4, attempts=AttemptOptions(every=1))
         for _ in range(STEPS):
             team.step([None, None], [plain, plain])

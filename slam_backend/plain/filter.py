@@ -17,6 +17,7 @@ from slam_backend.geometry import compose
 from slam_backend.landmark_map import LandmarkMap
 from slam_backend.measurements import Measurements
 from slam_backend.plain.estimates import landmark_mixture, pose_mixture
+from slam_backend.plain.existence import weigh_existence
 from slam_backend.plain.fastslam1 import fastslam1_turn
 from slam_backend.plain.fastslam2 import fastslam2_turn
 from slam_backend.plain.frame import Frame
@@ -122,7 +123,13 @@ class PlainFastSlam:
         """Move the robots, match what they see, weigh, update, and resample if needed; all as of `FastSlam.step`."""
         k = len(self.is_blind)
         arguments = check_step(k, self._descriptor_size, self.options.camera, odometry, measurements, identities, poses)
-        records = [self._step_robot(robot, *reading) for robot, reading in enumerate(zip(*arguments, strict=True))]
+        records = []
+        for robot, reading in enumerate(zip(*arguments, strict=True)):
+            records.append(self._step_robot(robot, *reading))
+            if self.options.existence is not None and reading[1] is not None:
+                best = self.particles[self.best_particle]  # weights change once all robots have had their turns
+                model, camera = self.options.existence, self.options.camera
+                weigh_existence(self.particles, best, robot, records[robot], model, camera)
         for record in records:  # Algorithm 1, l. 9; Eqs. 3, 11, in logarithms; weights of before are kept
             for particle, value in zip(self.particles, record.log_likelihoods, strict=True):
                 particle.path_log_weight += value  # Eq. 12, along the ancestral line

@@ -22,11 +22,15 @@ LOG_2PI = float(np.log(2.0 * np.pi))
 
 @dataclass
 class Landmark:
-    """One EKF: mean (3,) [m] and covariance (3, 3) [m^2] in the map frame, and how often it was measured."""
+    """One EKF: mean (3,) [m] and covariance (3, 3) [m^2] in the map frame, and how often it was measured.
+
+    The log-odds that it exists mean something only where the filter has an existence model.
+    """
 
     mean: FloatArray
     covariance: FloatArray
     count: int = 1
+    log_odds: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from small_world import SmallWorld
 from stereo_world import EXACT_MOTION
 
 from slam_backend.errors import FloatArray, IntArray
+from slam_backend.existence import ExistenceModel
 from slam_backend.filter import FastSlam
 from slam_backend.filter_options import FilterOptions
 from slam_backend.geometry import wrap_angle
@@ -16,6 +17,7 @@ from slam_backend.landmark_map import LandmarkMap
 from slam_backend.measurements import Measurements
 from slam_backend.motion import OdometryModel
 from slam_backend.plain import PlainFastSlam, fastslam2
+from slam_backend.plain import filter as plain_filter
 from slam_backend.reports import StepReport
 from slam_backend.resampling import RESAMPLING
 
@@ -30,7 +32,17 @@ def assert_same_pose(found: FloatArray, expected: FloatArray, close: dict[str, f
 
 
 class WatchedPlainFastSlam(PlainFastSlam):
-    """A plain filter that knows what it would report if any of the equally probable particles were the best."""
+    """A plain filter that knows what it would report if any of the equally probable particles were the best.
+
+    Where several are the most probable up to rounding, it looks for landmarks from the one that `preferred` says.
+    """
+
+    preferred = 0
+
+    @property
+    def best_particle(self) -> int:
+        """One of the most probable particles."""
+        return self.preferred if self.preferred in self.equally_probable() else super().best_particle
 
     def equally_probable(self) -> IntArray:
         """Return the particles that are the most probable up to rounding, by which a best one may differ."""
@@ -81,6 +93,11 @@ def assert_same_particles(slam: FastSlam, plain: PlainFastSlam) -> None:
     held = (counts > 0)[:, None, :]
     np.testing.assert_allclose(np.where(held, means, 0.0), expected_means, **CLOSE)
     np.testing.assert_allclose(np.where(held, covariances, 0.0), expected_covariances, **CLOSE)
+    if slam.options.existence is not None:
+        log_odds = slam._maps.dense_odds(slam._maps.used_slots())
+        for m, particle in enumerate(plain.particles):
+            for name, landmark in particle.landmarks.items():
+                assert log_odds[rows[name], m] == pytest.approx(landmark.log_odds, abs=1e-9)
 
 
 def assert_same(slam: FastSlam, plain: PlainFastSlam) -> None:
@@ -115,7 +132,7 @@ def both(num_robots: int, seed: int, starts: Any = None, **choices: Any) -> tupl
 def happened(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
     """Count what the plain filter goes through, of what its answers do not show."""
     counts: Counter[str] = Counter()
-    is_lost, refine = fastslam2.is_lost, fastslam2.refine
+    is_lost, refine, weigh_existence = fastslam2.is_lost, fastslam2.refine, plain_filter.weigh_existence
 
     def counted_is_lost(*args: Any) -> bool:
         answer = is_lost(*args)
@@ -126,9 +143,32 @@ def happened(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
         counts["refined further"] += args[4] > 1
         return refine(*args)
 
+    def counted_weigh_existence(particles: Any, *args: Any) -> None:
+        before = sum(len(particle.landmarks) for particle in particles)
+        weigh_existence(particles, *args)
+        counts["given up"] += before - sum(len(particle.landmarks) for particle in particles)
+
+    monkeypatch.setattr(plain_filter, "weigh_existence", counted_weigh_existence)
     monkeypatch.setattr(fastslam2, "is_lost", counted_is_lost)
     monkeypatch.setattr(fastslam2, "refine", counted_refine)
     return counts
+
+
+def some_existence(seed: int) -> ExistenceModel | None:
+    """Return, for every fourth world, a model that gives landmarks up after a miss or a few."""
+    if seed % 4 != 3:
+        return None
+    rng = np.random.default_rng(seed)
+    return ExistenceModel(
+        detection=rng.uniform(0.5, 0.9),
+        prior=rng.uniform(0.3, 0.6),
+        delete_below=rng.uniform(0.05, 0.25),
+        cap=rng.uniform(0.8, 0.99),
+        margin_px=rng.uniform(0.0, 20.0),
+        range_share=rng.uniform(0.3, 1.0),
+        nearest=rng.uniform(0.0, 1.0),
+        frame_limit=None if rng.random() < 0.5 else int(rng.integers(1, 6)),
+    )
 
 
 def run_both(seed: int, num_particles: int, most: int, steps: int, proposal: str) -> Counter[str]:
@@ -152,11 +192,13 @@ def run_both(seed: int, num_particles: int, most: int, steps: int, proposal: str
         dead_radius=float(rng.choice([0.0, 0.4, 1.0])),
         recovery_position=float(rng.choice([0.0, 0.5])),
         one_to_one=bool(rng.random() < 0.6),
+        existence=some_existence(seed),
     )
     counts: Counter[str] = Counter()
     for _ in range(steps):
         readings = world.read()
         arguments = (readings.odometry, readings.frames, readings.names, readings.poses)
+        plain.preferred = slam.best_particle
         was_blind = [blind and frame is not None for blind, frame in zip(plain.is_blind, readings.frames, strict=True)]
         report = slam.step(*arguments)
         plain.step(*arguments)
@@ -184,7 +226,7 @@ def run_worlds(seeds: range, sizes: tuple[int, ...], most: int, steps: int) -> C
     return total
 
 
-KINDS = ("matched", "new", "rejected", "resampled", "sighted after blindness", "lost", "refined further")
+KINDS = ("matched", "new", "rejected", "resampled", "sighted after blindness", "lost", "refined further", "given up")
 
 
 def test_compiled_filter_equals_the_plain_one(happened: Counter[str]) -> None:

@@ -16,6 +16,7 @@ import sys
 import numpy as np
 from slam_backend import FastSlam, Measurements, TeamSlam
 from slam_backend.attempts import AttemptOptions
+from slam_backend.existence import ExistenceModel
 from slam_backend.metrics.maps import map_error
 from slam_backend.warming import warm_up
 
@@ -32,7 +33,8 @@ points = np.column_stack([rng.uniform(-2.0, 2.0, 30), rng.uniform(-1.0, 1.0, 30)
 looks = np.linalg.qr(rng.normal(size=(64, 64)))[0][:30].astype(np.float32)
 for proposal in ("fastslam1", "fastslam2"):
     for robots, particles, threshold in ((1, 5, 0.5), (3, 33, 1.0)):
-        slam = FastSlam(robots, particles, proposal=proposal, resample_threshold=threshold, one_to_one=robots > 1)
+        options = dict(one_to_one=robots > 1, existence=ExistenceModel() if robots > 1 else None)
+        slam = FastSlam(robots, particles, proposal=proposal, resample_threshold=threshold, **options)
         for size in (1, 30, 0, 2):
             seen = rng.permutation(30)[:size]
             frame = Measurements(points[seen], looks[seen])

@@ -1,0 +1,224 @@
+"""Compiled: what a robot's frame says of the existence of the landmarks around it, in all particles.
+
+Landmarks are stored as `ParticleMaps` has it; `odds[slot, particle]` are their log-odds of existence. Slots are brought
+up to date before they are written: then each particle's values stand at its own place.
+
+`values` come as (rows, blocks, 9, lanes), so that nothing that another module defines is compiled into these kernels:
+their cache would not notice a change of it.
+"""
+
+import numpy as np
+
+from slam_backend._jit import inlined, jit, lanes
+from slam_backend.errors import Float32Array, FloatArray, Int32Array, IntArray
+
+
+@inlined
+def in_view(
+    depth: float, lateral: float, vertical: float, nearest: float, side: float, rise: float, reach_squared: float
+) -> bool:
+    """Tell whether a predicted point is expected in view: inside the image less its margin, and near enough.
+
+    Args:
+        depth, lateral, vertical: The point relative to the camera centre [m], robot axes (ahead, left, up).
+        nearest, side, rise, reach_squared: A `View`, one by one: scalars stay in registers over a loop.
+    """
+    return (
+        (depth > nearest)
+        & (abs(lateral) <= side * depth)
+        & (abs(vertical) <= rise * depth)
+        & (depth * depth + lateral * lateral + vertical * vertical <= reach_squared)
+    )
+
+
+@inlined
+def updated_log_odds(log_odds: float, seen: bool, expected: bool, sighting: float, miss: float, cap: float) -> float:
+    """Return a landmark's log-odds after a frame: Bayes' rule in logarithms, up to the cap.
+
+    Args:
+        log_odds: Before the frame.
+        seen: Whether it was matched.
+        expected: Whether it was expected in view.
+        sighting, miss: From `ExistenceModel.increments`.
+        cap: `ExistenceModel.log_odds_cap`.
+    """
+    return min(cap, log_odds + seen * sighting + (expected & (not seen)) * miss)
+
+
+@jit
+def carry_odds(slots: IntArray, odds: FloatArray, map_of: IntArray, maps: Int32Array) -> None:
+    """Copy log-odds from where each particle's ancestor left them to its own place; `refresh` does the rest.
+
+    Args:
+        slots: Landmarks that are about to be brought up to date.
+        odds: (slots, P), changed.
+        map_of, maps: As yet of the old places, see `ParticleMaps`.
+    """
+    before = np.empty(odds.shape[1])
+    for k in range(len(slots)):
+        slot = slots[k]
+        if map_of[slot] == 0:
+            continue
+        own = maps[map_of[slot]]
+        for m in range(len(before)):
+            before[m] = odds[slot, own[m]]
+        for m in range(len(before)):
+            odds[slot, m] = before[m]
+
+
+@jit
+def landmarks_around(
+    ids: IntArray, row_of: IntArray, map_of: IntArray, maps: Int32Array, values: FloatArray, counts: Int32Array,
+    num_particles: int, best: int, x: float, y: float, reach: float, found: Int32Array, new_slots: IntArray,
+) -> IntArray:
+    """Return the slots of the landmarks that a frame may tell something about, without those that it started.
+
+    They are the landmarks that some particle has matched, and those near the robot.
+
+    Args:
+        ids, row_of, map_of, maps, values, counts: The store, see `ParticleMaps`; it need not be up to date.
+        num_particles: M.
+        best: The particle whose map says what is near; what it lacks is where the first particle that holds it says.
+        x, y: Where that particle has the robot [m].
+        reach: Farther landmarks [m, in the plane] are not near.
+        found: (n, P) slots to which the particles gave the measurements, negative = none.
+        new_slots: (n,) slots of the landmarks that the frame started, -1 = none.
+    """
+    lanes = values.shape[3]
+    matched = np.zeros(len(ids), dtype=np.bool_)
+    started = np.zeros(len(ids), dtype=np.bool_)
+    for b in range(len(new_slots)):
+        for m in range(num_particles):
+            if found[b, m] >= 0:
+                matched[found[b, m]] = True
+        if new_slots[b] >= 0:
+            started[new_slots[b]] = True
+    slots = np.empty(len(ids), dtype=np.int64)
+    num = 0
+    for slot in range(len(ids)):
+        if ids[slot] < 0 or started[slot]:
+            continue
+        is_near = False
+        if not matched[slot]:
+            row, e = row_of[slot], map_of[slot]
+            place = np.int64(maps[e, best]) if e > 0 else best
+            m = 0
+            while counts[row, place] == 0 and m < num_particles:
+                place = np.int64(maps[e, m]) if e > 0 else m
+                m += 1
+            if counts[row, place] > 0:
+                dx = values[row, place // lanes, 0, place % lanes] - x
+                dy = values[row, place // lanes, 1, place % lanes] - y
+                is_near = dx * dx + dy * dy <= reach * reach
+        if matched[slot] or is_near:
+            slots[num] = slot
+            num += 1
+    return slots[:num]
+
+
+@jit
+def count_expected(
+    slots: IntArray, row_of: IntArray, values: FloatArray, counts: Int32Array, m: int, pose: FloatArray,
+    mount: FloatArray, nearest: float, side: float, rise: float, reach_squared: float,
+) -> int:
+    """Return how many of the landmarks particle m holds and expects in view.
+
+    Args:
+        slots: The landmarks, up to date.
+        row_of, values, counts: The store, see `ParticleMaps`.
+        m: The particle.
+        pose: (3,) of the robot in it [m, m, rad], map frame.
+        mount: (3,) of the camera on the robot [m].
+        nearest, side, rise, reach_squared: A `View`.
+    """
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    block, lane = m // values.shape[3], m % values.shape[3]
+    num = 0
+    for k in range(len(slots)):
+        row = row_of[slots[k]]
+        if counts[row, m] > 0:
+            dx, dy = values[row, block, 0, lane] - pose[0], values[row, block, 1, lane] - pose[1]
+            depth, lateral = c * dx + s * dy - mount[0], c * dy - s * dx - mount[1]
+            vertical = values[row, block, 2, lane] - mount[2]
+            num += 1 if in_view(depth, lateral, vertical, nearest, side, rise, reach_squared) else 0
+    return num
+
+
+@jit
+def mark_seen(slots: IntArray, num_slots: int, found: Int32Array) -> Int32Array:
+    """Return (n, P) 1 where a particle matched landmark `slots[k]` with any measurement, else 0."""
+    seen = np.zeros((len(slots), found.shape[1]), dtype=np.int32)
+    rank = np.full(num_slots, -1, dtype=np.int64)
+    for k in range(len(slots)):
+        rank[slots[k]] = k
+    for b in range(found.shape[0]):
+        for m in range(found.shape[1]):
+            if found[b, m] >= 0 and rank[found[b, m]] >= 0:
+                seen[rank[found[b, m]], m] = 1
+    return seen
+
+
+@lanes
+def weigh_existence(
+    slots: IntArray, seen: Int32Array, odds: FloatArray, row_of: IntArray, values: FloatArray, counts: Int32Array,
+    poses: FloatArray, cosines: FloatArray, sines: FloatArray, mount: FloatArray, nearest: float, side: float,
+    rise: float, reach_squared: float, sighting: float, miss: float, floor: float, cap: float,
+) -> IntArray:
+    """Update the log-odds of landmarks in all particles that hold them, and drop those that have become improbable.
+
+    Args:
+        slots: (n,) the landmarks, up to date.
+        seen: (n, P) from `mark_seen`.
+        odds: (slots, P), updated.
+        row_of, values: The store, see `ParticleMaps`.
+        counts: (rows, P); 0 where a particle drops a landmark.
+        poses: (3, P) of the robot [m, m, rad], map frame, with the `cosines` and `sines` (P,) of its headings.
+        mount: (3,) of the camera on the robot [m].
+        nearest, side, rise, reach_squared: A `View`.
+        sighting, miss, floor, cap: Of an `ExistenceModel`.
+
+    Returns:
+        The slots that no particle holds any more.
+    """
+    m0, m1, m2 = mount[0], mount[1], mount[2]
+    size = values.shape[3]
+    deserted = np.empty(len(slots), dtype=np.int64)
+    num = 0
+    for k in range(len(slots)):
+        slot = slots[k]
+        row = row_of[slot]
+        holders = 0
+        for block in range(values.shape[1]):
+            first, last = block * size, (block + 1) * size
+            mean_x, mean_y, mean_z = values[row, block, 0], values[row, block, 1], values[row, block, 2]
+            held, own, hit = counts[row, first:last], odds[slot, first:last], seen[k, first:last]
+            x, y, c, s = poses[0, first:last], poses[1, first:last], cosines[first:last], sines[first:last]
+            for i in range(size):
+                dx, dy = mean_x[i] - x[i], mean_y[i] - y[i]
+                depth, lateral = c[i] * dx + s[i] * dy - m0, c[i] * dy - s[i] * dx - m1
+                expected = in_view(depth, lateral, mean_z[i] - m2, nearest, side, rise, reach_squared)
+                after = updated_log_odds(own[i], hit[i] > 0, expected, sighting, miss, cap)
+                after = after if held[i] > 0 else own[i]
+                own[i] = after
+                held[i] = 0 if after < floor else held[i]
+                holders += 1 if held[i] > 0 else 0
+        if holders == 0:
+            deserted[num] = slot
+            num += 1
+    return deserted[:num]
+
+
+@jit
+def release(
+    slots: IntArray, ids: IntArray, row_of: IntArray, heads: Float32Array, free_rows: IntArray, free_slots: IntArray,
+    tops: IntArray, far: np.float32,
+) -> None:
+    """Free slots, up to date, that no particle holds, and their rows; see `ParticleMaps`. Heads become `far`."""
+    for k in range(len(slots)):
+        ids[slots[k]] = -1
+        for j in range(heads.shape[0]):
+            heads[j, slots[k]] = far
+        free_rows[tops[0]] = row_of[slots[k]]
+        free_slots[tops[1]] = slots[k]
+        tops[0] += 1
+        tops[1] += 1

@@ -1,0 +1,56 @@
+"""What a filter does for the existence of landmarks: after each robot's frame it weighs those around the robot."""
+
+import numpy as np
+
+from slam_backend import _existence_kernels as kernels
+from slam_backend._frame_buffers import Turn
+from slam_backend._particle_maps import ParticleMaps
+from slam_backend.camera import StereoCamera
+from slam_backend.errors import FloatArray, IntArray
+from slam_backend.existence import ExistenceModel
+
+
+class ExistenceStep:
+    """An existence model together with the camera that sees the landmarks.
+
+    Args:
+        model: How likely landmarks are seen, and when they are given up.
+        camera: The filter's.
+    """
+
+    def __init__(self, model: ExistenceModel, camera: StereoCamera) -> None:
+        self._model = model
+        self._view = model.view(camera)
+        self._mount = np.array(camera.mount)
+        self._bounds = (model.log_odds_floor, model.log_odds_cap)
+        self._near = 2.0 * float(np.sqrt(self._view.reach_squared))
+
+    def weigh(self, maps: ParticleMaps, poses: FloatArray, best: int, turn: Turn) -> IntArray:
+        """Update the log-odds after one robot's frame, which may be empty; particles drop what is too improbable.
+
+        Args:
+            maps: Changed; the landmarks that the frame started begin at the prior.
+            poses: (3, P) the robot's sampled poses [m, m, rad], map frame.
+            best: The most probable particle before the step: what it has around the robot is looked at.
+            turn: What became of the frame.
+
+        Returns:
+            Slots that no particle holds any more. They are to be released once nobody asks for their ids.
+        """
+        maps.start_odds(turn.new_slots)
+        x, y = float(poses[0, best]), float(poses[1, best])
+        slots = kernels.landmarks_around(
+            maps.ids, maps.row_of, maps.map_of, maps.maps, maps.blocks, maps.counts, maps.num_particles, best,
+            x, y, self._near, turn.found, turn.new_slots,
+        )  # fmt: skip
+        if not len(slots):
+            return slots
+        maps.refresh(slots)
+        pose = np.ascontiguousarray(poses[:, best])
+        store = (maps.row_of, maps.blocks, maps.counts)
+        expected = kernels.count_expected(slots, *store, best, pose, self._mount, *self._view)
+        return kernels.weigh_existence(
+            slots, kernels.mark_seen(slots, len(maps.ids), turn.found), maps.odds, *store,
+            poses, np.cos(poses[2]), np.sin(poses[2]), self._mount, *self._view,
+            *self._model.increments(expected), *self._bounds,
+        )  # fmt: skip

@@ -1,0 +1,310 @@
+"""A filter with an existence model: what is not confirmed is forgotten, what exists stays, and nothing else changes."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from filter_contents import contents
+from same_bits import assert_same
+from scipy import stats
+from stereo_world import EXACT_MOTION, StereoWorld
+
+from slam_backend.adaptation import AdaptiveParticles
+from slam_backend.alignment import Alignment
+from slam_backend.errors import FloatArray
+from slam_backend.existence import ExistenceModel
+from slam_backend.filter import FastSlam
+from slam_backend.geometry import compose
+from slam_backend.measurements import Measurements
+from slam_backend.merging import merge_filters
+from slam_backend.team import TeamSlam
+
+PROPOSALS = pytest.mark.parametrize("proposal", ["fastslam2", "fastslam1"])
+MOVE = np.array([0.25, 0.02, 0.3])
+HARMLESS = ExistenceModel(delete_below=1e-300)  # keeps the books, and never deletes
+HASTY = ExistenceModel(delete_below=0.45)  # deletes what is not seen again at once
+POINTS = np.array([[0.2, 0.1, 3.0], [-0.5, 0.2, 2.5], [0.6, -0.3, 3.5]])  # camera frame, well in view of the origin
+
+
+def frame(*which: int) -> Measurements:
+    """Return a frame of some of `POINTS`, exactly measured."""
+    return Measurements(POINTS[list(which)], np.eye(3, dtype=np.float32)[list(which)])
+
+
+def standing(existence: ExistenceModel, robots: int = 1, particles: int = 5, **changes: Any) -> FastSlam:
+    """Return a filter of robots at the origin, whose odometry has no noise."""
+    return FastSlam(robots, particles, motion=EXACT_MOTION, existence=existence, seed=1, **changes)
+
+
+def circle(steps: int) -> list[tuple[list[FloatArray], list[Measurements]]]:
+    """Return noisy odometry and frames of a robot that drives in a circle, where each landmark is sometimes missed."""
+    world = StereoWorld(np.random.default_rng(5))
+    pose, result = np.zeros(3), []
+    for _ in range(steps):
+        pose = compose(pose, MOVE)
+        seen = world.visible(pose)
+        odometry = MOVE + world.rng.normal(0.0, [0.02, 0.01, 0.01])
+        result.append(([odometry], [world.measure(pose, seen[world.rng.random(len(seen)) < 0.8])]))
+    return result
+
+
+def in_circle(existence: ExistenceModel | None, **changes: Any) -> FastSlam:
+    """Return a filter for such a robot, before its first step."""
+    options: dict[str, Any] = {"num_particles": 37, "resample_threshold": 0.9, "seed": 3}
+    camera = StereoWorld(np.random.default_rng(5)).camera
+    return FastSlam(camera=camera, existence=existence, **(options | changes))
+
+
+def aligned() -> Alignment:
+    """Return the alignment of two maps that lie on each other."""
+    return Alignment(True, "", 0.0, 0.0, 0.0, 1e-6 * np.eye(3), np.empty((0, 2), np.int64), 0.0)
+
+
+# ------------------------------------------------------------------------------------------------- what is deleted
+
+
+@PROPOSALS
+@pytest.mark.parametrize("model", [ExistenceModel(), ExistenceModel(detection=0.4, false_alarm=0.1), HASTY])
+def test_a_landmark_that_is_never_confirmed_is_forgotten_after_so_many_misses(
+    model: ExistenceModel, proposal: Any
+) -> None:
+    """It is held through one miss less than the model says, and nothing remains of it after that miss."""
+    slam = standing(model, proposal=proposal, resample_threshold=0.0)
+    slam.step([None], [frame(0, 2)])
+    misses = model.misses_to_delete(model.log_odds_prior)
+    for _ in range(misses - 1):
+        slam.step([None], [frame(0)])
+    np.testing.assert_array_equal(slam.map().ids, [0, 1])
+    slam.step([None], [frame(0)])
+    np.testing.assert_array_equal(slam.map().ids, [0])
+    assert slam.num_landmarks == 1
+    assert slam.step([None], [frame(2)]).created[0].tolist() == [2]  # it may come back, under a new name
+
+
+def test_only_a_frame_in_which_a_landmark_is_expected_is_a_miss() -> None:
+    """A step without a frame, and frames in which it lies behind, beside or too far away, tell nothing of it."""
+    slam = standing(ExistenceModel())
+    slam.step([None], [frame(0)])
+    _, before = slam.existence()
+    for pose, seen in (([0.0, 0.0, 0.0], None), ([0.0, 0.0, 3.0], frame()), ([0.0, 0.0, 0.6], frame()),
+                       ([-5.0, 0.0, 0.0], frame()), ([2.8, 0.0, 0.0], frame())):  # fmt: skip
+        slam.step([None], [seen], poses=[pose])
+        np.testing.assert_array_equal(slam.existence()[1], before)
+    slam.step([None], [frame()], poses=[np.zeros(3)])
+    assert slam.existence()[1] < before
+
+
+def test_probabilities_of_existence_are_those_of_the_model() -> None:
+    """They belong to the ids of the map; a new landmark has the prior, and Bayes' rule and the cap do the rest."""
+    model = ExistenceModel(detection=0.7, false_alarm=0.1, prior=0.4, cap=0.98)
+    slam = standing(model)
+    odds = {0: model.log_odds_prior, 1: model.log_odds_prior}
+    slam.step([None], [frame(0, 1)])
+    sighting, miss = model.increments()
+    for seen in ([0], [0, 1], [0], [0], [0, 1], [0]):
+        ids, found = slam.existence()
+        np.testing.assert_array_equal(ids, slam.map().ids)
+        np.testing.assert_allclose(found, [1.0 / (1.0 + np.exp(-odds[landmark])) for landmark in ids.tolist()])
+        slam.step([None], [frame(*seen)])
+        for landmark in odds:
+            odds[landmark] = min(odds[landmark] + (sighting if landmark in seen else miss), model.log_odds_cap)
+    assert slam.existence()[1][0] == pytest.approx(model.cap)
+
+
+def test_a_sensor_that_reports_few_of_many_makes_a_miss_say_little() -> None:
+    """Of three landmarks a sensor reports one at a time: the model that knows keeps them, the other loses one."""
+    knows, does_not = standing(ExistenceModel(frame_limit=1)), standing(ExistenceModel())
+    for slam in (knows, does_not):
+        slam.step([None], [frame(0, 1, 2)])
+        for turn in range(30):
+            slam.step([None], [frame(turn % 2)] if turn < 4 else [frame(turn % 3)])
+    np.testing.assert_array_equal(knows.map().ids, [0, 1, 2])
+    assert 2 not in does_not.map().ids
+
+
+def test_a_landmark_given_up_within_a_step_keeps_its_name_in_the_report() -> None:
+    """The first robot starts a landmark, the second misses and the filter deletes it: the report is of what was."""
+    slam = standing(HASTY, robots=3)
+    report = slam.step([None] * 3, [frame(0), frame(), frame(1)])
+    assert [made.tolist() for made in report.created] == [[0], [], [1]]
+    assert [found.tolist() for found in report.associations] == [[0], [], [1]]
+    assert (report.num_new, report.num_matched, report.num_rejected) == (2, 0, 0)
+    np.testing.assert_array_equal(slam.map().ids, [1])
+
+
+@PROPOSALS
+def test_what_is_given_up_leaves_its_memory_to_others(proposal: Any) -> None:
+    """Two hundred landmarks, one after the other and each seen once, never need more room than a few."""
+    slam = standing(ExistenceModel(), proposal=proposal, resample_threshold=0.0)
+    looks = np.eye(200, dtype=np.float32)
+    held = []
+    for step in range(200):
+        slam.step([None], [Measurements(POINTS[step % 3 : step % 3 + 1], looks[step : step + 1])])
+        held.append(slam.num_landmarks)
+        if step == 20:
+            memory = slam._maps.nbytes
+    assert max(held) == ExistenceModel().misses_to_delete(0.0)
+    assert slam._maps.nbytes == memory
+    assert slam._maps.next_id == 200
+
+
+# ---------------------------------------------------------------------------------------------------- what stays
+
+
+@pytest.mark.parametrize("delete_below", [0.01, 0.05])
+def test_landmarks_that_exist_survive_as_the_model_promises(delete_below: float) -> None:
+    """Of right landmarks seen with probability d, no more are ever deleted than the bound's binomial law allows."""
+    model = ExistenceModel(delete_below=delete_below)
+    rng = np.random.default_rng(11)
+    looks, num = 150, 200
+    depths = rng.uniform(2.0, 6.0, num)
+    points = np.column_stack([rng.uniform(-0.4, 0.4, num) * depths, rng.uniform(-0.3, 0.3, num) * depths, depths])
+    names = np.arange(num)
+    slam = standing(model, particles=1, proposal="fastslam1")
+    descriptors = np.ones((num, 1), dtype=np.float32)
+    slam.step([None], [Measurements(points, descriptors)], [names])
+    alive = np.ones(num, dtype=bool)  # of those that were never deleted; who was comes back under a new name
+    for _ in range(looks):
+        seen = rng.random(num) < model.detection
+        slam.step([None], [Measurements(points[seen], descriptors[seen])], [names[seen]])
+        alive &= np.isin(names, slam.map().ids)
+    bound = model.deletion_bound(looks)
+    assert bound < 0.1
+    assert np.count_nonzero(~alive) <= stats.binom.ppf(1.0 - 1e-6, num, bound)
+
+
+@PROPOSALS
+def test_a_model_that_deletes_nothing_changes_nothing(proposal: Any) -> None:
+    """Without deletions a filter with a model holds and reports, bit for bit, what one without a model does."""
+    with_model, without = in_circle(HARMLESS, proposal=proposal), in_circle(None, proposal=proposal)
+    resampled = 0
+    for odometry, frames in circle(25):
+        report = without.step(odometry, frames)
+        assert_same(with_model.step(odometry, frames), report)
+        resampled += report.resampled
+    found, expected = contents(with_model), contents(without)
+    for state in (found, expected):
+        del state["options"], state["maps"]["odds"]
+    assert_same(found, expected)
+    assert resampled > 5
+
+
+# ------------------------------------------------------------------------- copies, snapshots, merges, and the team
+
+
+@PROPOSALS
+def test_a_restored_filter_weighs_existence_on_bit_for_bit(proposal: Any) -> None:
+    """From a snapshot the same inputs give the same bytes, log-odds included, in a new filter and in the old one."""
+    slam = in_circle(ExistenceModel(delete_below=0.2), proposal=proposal)
+    steps = circle(30)
+    for odometry, frames in steps[:12]:
+        slam.step(odometry, frames)
+    state = slam.get_state()
+    reports = [slam.step(odometry, frames) for odometry, frames in steps[12:]]
+    expected = slam.get_state()
+    assert slam._maps.next_id > slam.num_landmarks, "some were given up"
+    for restored in (slam, FastSlam(2, 3)):
+        restored.set_state(state)
+        assert_same([restored.step(odometry, frames) for odometry, frames in steps[12:]], reports)
+        assert_same(restored.get_state(), expected)
+
+
+def test_log_odds_follow_particles_whose_number_changes() -> None:
+    """Every new particle has the log-odds of the one that it is a copy of, and a filter that adapts keeps them all."""
+    slam = in_circle(ExistenceModel(delete_below=0.2), resample_threshold=0.0, proposal="fastslam1")
+    for odometry, frames in circle(12):
+        slam.step(odometry, frames)
+    ancestors = np.array([0, 3, 3, 20, 36])
+    slots = slam._maps.used_slots()
+    before, counts = slam._maps.dense_odds(slots), slam._dense()[3]
+    assert before is not None
+    assert len(np.unique(before[:, ancestors], axis=1).T) > 1, "particles differ"
+    slam._become(ancestors)
+    after = slam._maps.dense_odds(slam._maps.used_slots())
+    assert after is not None
+    kept = (counts[:, ancestors] > 0).any(axis=1)
+    np.testing.assert_array_equal(after, before[kept][:, ancestors])
+    adapting = in_circle(
+        ExistenceModel(), adaptive=AdaptiveParticles(min_particles=5, max_particles=90), resample_threshold=1.0
+    )
+    sizes = set()
+    for odometry, frames in circle(12):
+        adapting.step(odometry, frames)
+        sizes.add(adapting.num_particles)
+        ids, probabilities = adapting.existence()
+        np.testing.assert_array_equal(ids, adapting.map().ids)
+        assert ((probabilities >= 0.01) & (probabilities <= 0.9990001)).all()
+    assert len(sizes) > 1
+
+
+@pytest.mark.parametrize("particles", [(4, 4), (3, 40)])
+def test_a_merge_adds_what_both_filters_know_of_a_landmark(particles: tuple[int, int]) -> None:
+    """Log-odds of landmarks in common add up, their prior counting once, up to the cap; the others stay as they are."""
+    model = ExistenceModel(detection=0.6, false_alarm=0.2, prior=0.4)
+    a, b = (
+        standing(model, particles=count, proposal=proposal)
+        for count, proposal in zip(particles, ("fastslam2", "fastslam1"), strict=True)
+    )
+    for slam, first in ((a, frame(0, 1)), (b, frame(1, 2))):
+        slam.step([None], [first])
+        slam.step([None], [first])
+    b.step([None], [frame(2)])
+    sighting, miss = model.increments()
+    joint, _ = merge_filters(a, b, aligned(), np.array([[1, 0]]), np.random.default_rng(0))
+    ids, found = joint.existence()
+    np.testing.assert_array_equal(ids, [0, 1, 2])
+    log_odds = model.log_odds_prior + np.array([sighting, 2.0 * sighting + miss, 2.0 * sighting])
+    np.testing.assert_allclose(found, 1.0 / (1.0 + np.exp(-log_odds)))
+    for _ in range(20):
+        a.step([None], [frame(0, 1)])
+        b.step([None], [frame(1, 2)])
+    joint, _ = merge_filters(a, b, aligned(), np.array([[1, 0]]), np.random.default_rng(0))
+    np.testing.assert_allclose(joint.existence()[1], model.cap)
+
+
+def test_a_merge_with_a_filter_that_keeps_no_existence_starts_its_landmarks_at_the_prior() -> None:
+    """The joint filter has the options of the first: with a model, the second's landmarks get its prior; else none."""
+    model = ExistenceModel(prior=0.3)
+    a, b = standing(model), FastSlam(1, 5, motion=EXACT_MOTION, seed=2)
+    for slam, seen in ((a, frame(0, 1)), (b, frame(1, 2))):
+        slam.step([None], [seen])
+        slam.step([None], [seen])
+    seen_twice = a.existence()[1][0]
+    joint, _ = merge_filters(a, b, aligned(), np.array([[1, 0]]), np.random.default_rng(0))
+    np.testing.assert_allclose(joint.existence()[1], [seen_twice, seen_twice, 0.3])
+    joint, _ = merge_filters(b, a, aligned(), np.array([[0, 1]]), np.random.default_rng(0))
+    assert joint.options.existence is None
+    np.testing.assert_array_equal(joint.map().ids, [0, 1, 2])
+
+
+def test_a_team_passes_the_model_on_to_its_filters() -> None:
+    """What one robot of a team sees once, and then no more, leaves its map; the other robot's map is its own."""
+    team = TeamSlam(2, num_particles=5, motion=EXACT_MOTION, existence=ExistenceModel())
+    team.step([None, None], [frame(0, 1), frame(0, 1)])
+    for _ in range(3):
+        team.step([None, None], [frame(0), frame(0, 1)])
+    assert [len(team.map(robot)) for robot in (0, 1)] == [1, 2]
+
+
+# ------------------------------------------------------------------------------------------------------ bad input
+
+
+@pytest.mark.parametrize(
+    ("existence", "message"),
+    [
+        (0.5, r"existence: expected ExistenceModel or None, got 0\.5"),
+        (ExistenceModel(margin_px=120.0), r"existence\.margin_px: expected a number < 120, half of the image, got 120"),
+        (ExistenceModel(nearest=7.5), r"existence\.nearest: expected a number < 7\.2, the range, got 7\.5"),
+    ],
+)
+def test_models_that_do_not_fit_are_refused(existence: Any, message: str) -> None:
+    """The error names the argument, what it should be and what it was."""
+    for build in (lambda: FastSlam(existence=existence), lambda: TeamSlam(2, existence=existence)):
+        with pytest.raises(ValueError, match=message):
+            build()
+
+
+def test_a_filter_without_a_model_says_so() -> None:
+    """There are no probabilities of existence where none are kept; the error tells how to get them."""
+    with pytest.raises(ValueError, match=r"existence: expected a filter that keeps it.*existence=ExistenceModel\(\)"):
+        FastSlam().existence()
