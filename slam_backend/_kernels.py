@@ -54,7 +54,8 @@ CLUTTER = LANES * 48  # log-likelihood of the measurements that are not matched
 BEST, SECOND, CHOSEN, DEAD, LOG_BEST = (LANES * k for k in range(49, 54))  # of one measurement
 LOST, SURE, CONTRADICT, WIDE = (LANES * k for k in range(54, 58))
 TAKEN, C01 = LANES * 58, LANES * 59
-WORK_ROWS = 60
+KEPT00, KEPT10, KEPT11, KEPT20, KEPT21, KEPT22, KEPT01, KEPT_WIDE = (LANES * k for k in range(60, 68))  # of C
+WORK_ROWS = 68
 
 # Rows of one candidate's record.
 QJ00, QJ01, QJ02, QJ11, QJ12, QJ22, QG0, QG1, QG2 = (LANES * k for k in range(9))
@@ -508,15 +509,6 @@ def _factorise(work: FloatArray, i: int) -> None:
 
 
 @lanes
-def _judge_alone(work: FloatArray, record: FloatArray, gate: float) -> None:
-    """Count the verdict on the predicted pose of a measurement with one candidate."""
-    for i in range(LANES):
-        sure = record[Q_HELD + i] > 0.0
-        work[SURE + i] += 1.0 if sure else 0.0
-        work[CONTRADICT + i] += 1.0 if sure and not record[Q_D + i] <= gate else 0.0
-
-
-@lanes
 def _match_alone(record: FloatArray, match: FloatArray, q: float, named: bool, gate: float, weights: FloatArray) -> int:
     """Pass A for a measurement with one candidate: write its match and robust weight; return how many matched."""
     count = 0
@@ -656,53 +648,83 @@ def _mask_of(match: FloatArray, code: float, mask: FloatArray) -> int:
 
 
 @lanes
-def _count_contradictions(work: FloatArray, gate: float) -> None:
-    """Count one measurement's verdict on the predicted pose, from its first look-alikes (see `_look_alikes`)."""
+def _begin_judging(work: FloatArray) -> None:
     for i in range(LANES):
-        sure = work[CHOSEN + i] > 0.0
-        work[SURE + i] += 1.0 if sure else 0.0
-        work[CONTRADICT + i] += 1.0 if sure and not work[BEST + i] <= gate else 0.0
+        work[SURE + i] = 0.0
+        work[CONTRADICT + i] = 0.0
 
 
 @lanes
-def _look_alikes(work: FloatArray, record: FloatArray, look: float, ambiguity: float) -> None:
-    """Fold candidate after candidate: BEST = D of the first one held, SECOND = its look, CHOSEN = 1 while it is alone.
-
-    Candidates come by ascending look; a second one held whose look is within `ambiguity` makes the verdict unsure.
-    """
+def _nearest(work: FloatArray, record: FloatArray, begin: bool) -> None:
+    """Fold candidate after candidate: BEST = least D at hand of those held, SECOND = least of the D kept before."""
     for i in range(LANES):
         held = record[Q_HELD + i] > 0.0
-        first = held and work[SECOND + i] == np.inf
-        close = held and not first and work[DEAD + i] == 0.0
-        work[CHOSEN + i] = 1.0 if first else (
-            0.0 if close and look - work[SECOND + i] < ambiguity else work[CHOSEN + i]
-        )
-        work[DEAD + i] = 1.0 if close else work[DEAD + i]
-        work[BEST + i] = record[Q_D + i] if first else work[BEST + i]
-        work[SECOND + i] = look if first else work[SECOND + i]
+        now, before = record[Q_D + i] if held else np.inf, record[Q_FIRST_D + i] if held else np.inf
+        work[BEST + i] = now if begin or now < work[BEST + i] else work[BEST + i]
+        work[SECOND + i] = before if begin or before < work[SECOND + i] else work[SECOND + i]
+        work[CHOSEN + i] = 1.0 if held else (0.0 if begin else work[CHOSEN + i])
 
 
 @lanes
-def _widen_lost(work: FloatArray, recovery: FloatArray) -> int:
-    """Give lanes whose pose most matches contradict the factor T diag(recovery), T the turn by the predicted heading.
+def _count_unexplained(work: FloatArray, gate: float) -> None:
+    """Count a measurement that has candidates, none of which explains it at the predicted pose."""
+    for i in range(LANES):
+        work[CONTRADICT + i] += 1.0 if work[CHOSEN + i] > 0.0 and not work[BEST + i] <= gate else 0.0
+
+
+@lanes
+def _count_explained(work: FloatArray, gate: float) -> None:
+    """Count a measurement that the wide prior explains, and whether the narrow one did not."""
+    for i in range(LANES):
+        sure = work[BEST + i] <= gate
+        work[SURE + i] += 1.0 if sure else 0.0
+        work[CONTRADICT + i] += 1.0 if sure and not work[SECOND + i] <= gate else 0.0
+
+
+@lanes
+def _widen_suspects(work: FloatArray, recovery: FloatArray) -> int:
+    """Try the factor T diag(recovery), T the turn by the predicted heading, where enough is unexplained; keep the old.
 
     Returns:
-        How many lanes those are.
+        How many lanes try.
     """
     count = 0
     for i in range(LANES):
-        lost = work[CONTRADICT + i] >= MIN_CONTRADICTIONS and 2.0 * work[CONTRADICT + i] > work[SURE + i]
-        work[LOST + i] = 1.0 if lost else 0.0
-        work[WIDE + i] = 1.0 if lost else work[WIDE + i]
+        work[KEPT00 + i], work[KEPT01 + i] = work[C00 + i], work[C01 + i]
+        work[KEPT10 + i], work[KEPT11 + i] = work[C10 + i], work[C11 + i]
+        work[KEPT20 + i], work[KEPT21 + i], work[KEPT22 + i] = work[C20 + i], work[C21 + i], work[C22 + i]
+        work[KEPT_WIDE + i] = work[WIDE + i]
+        suspect = work[CONTRADICT + i] >= MIN_CONTRADICTIONS
         c, s = work[COS + i], work[SIN + i]
-        work[C00 + i] = c * recovery[0] if lost else work[C00 + i]
-        work[C01 + i] = -s * recovery[1] if lost else work[C01 + i]
-        work[C10 + i] = s * recovery[0] if lost else work[C10 + i]
-        work[C11 + i] = c * recovery[1] if lost else work[C11 + i]
-        work[C20 + i] = 0.0 if lost else work[C20 + i]
-        work[C21 + i] = 0.0 if lost else work[C21 + i]
-        work[C22 + i] = recovery[2] if lost else work[C22 + i]
-        count += 1 if lost else 0
+        work[LOST + i] = 1.0 if suspect else 0.0
+        work[WIDE + i] = 1.0 if suspect else work[WIDE + i]
+        work[C00 + i] = c * recovery[0] if suspect else work[C00 + i]
+        work[C01 + i] = -s * recovery[1] if suspect else work[C01 + i]
+        work[C10 + i] = s * recovery[0] if suspect else work[C10 + i]
+        work[C11 + i] = c * recovery[1] if suspect else work[C11 + i]
+        work[C20 + i] = 0.0 if suspect else work[C20 + i]
+        work[C21 + i] = 0.0 if suspect else work[C21 + i]
+        work[C22 + i] = recovery[2] if suspect else work[C22 + i]
+        count += 1 if suspect else 0
+    return count
+
+
+@lanes
+def _acquit(work: FloatArray) -> int:
+    """Give the kept factor back to suspects that are not lost after all; return how many those are."""
+    count = 0
+    for i in range(LANES):
+        lost = work[CONTRADICT + i] >= MIN_CONTRADICTIONS and 2.0 * work[CONTRADICT + i] > work[SURE + i]
+        back = work[LOST + i] > 0.0 and not lost
+        work[C00 + i] = work[KEPT00 + i] if back else work[C00 + i]
+        work[C01 + i] = work[KEPT01 + i] if back else work[C01 + i]
+        work[C10 + i] = work[KEPT10 + i] if back else work[C10 + i]
+        work[C11 + i] = work[KEPT11 + i] if back else work[C11 + i]
+        work[C20 + i] = work[KEPT20 + i] if back else work[C20 + i]
+        work[C21 + i] = work[KEPT21 + i] if back else work[C21 + i]
+        work[C22 + i] = work[KEPT22 + i] if back else work[C22 + i]
+        work[WIDE + i] = work[KEPT_WIDE + i] if back else work[WIDE + i]
+        count += 1 if back else 0
     return count
 
 
@@ -719,9 +741,6 @@ def _begin_pose(work: FloatArray) -> None:
         work[SPREAD11 + i] = 1.0
         work[SPREAD12 + i] = 0.0
         work[SPREAD22 + i] = 1.0
-        work[SURE + i] = 0.0
-        work[CONTRADICT + i] = 0.0
-        work[LOST + i] = 0.0
 
 
 @lanes
@@ -1266,9 +1285,9 @@ def update_fastslam2(
     """Integrate one robot's motion and frame, the measurements shaping the sampled pose (FastSLAM 2.0, Laplace form).
 
     Association takes two passes: unambiguous candidates first refine the pose robustly, then all decisions are taken at
-    the refined pose. A particle filter forgets how wrong its pose may be; where most of the measurements with one
-    look-alike in the map contradict the predicted pose, its stated uncertainty is not believed, and a wide one takes
-    its place. Written out, step by step, in `slam_backend.plain`.
+    the refined pose. A particle filter forgets how wrong its pose may be; where a wide prior explains three or more
+    measurements, and most of all it can explain, that the stated uncertainty does not, this is not believed, and the
+    wide prior takes its place. Written out, step by step, in `slam_backend.plain`.
 
     Args:
         poses: (3, P), the samples before the motion; replaced by the sampled ones.
@@ -1312,19 +1331,29 @@ def update_fastslam2(
             _innovate(work, tile, points, noises, owners[q], given, camera)
             _evaluate(work, tile, records[q])
         if recovery[0] > 0.0:
+            _begin_judging(work)
             for b in range(num):
-                if starts[b + 1] - starts[b] == 1:
-                    _judge_alone(work, records[starts[b]], position_gate)
-                elif starts[b + 1] > starts[b]:
-                    _begin_choice(work)
-                    for q in range(starts[b], starts[b + 1]):
-                        _look_alikes(work, records[q], looks[q], ambiguity)
-                    _count_contradictions(work, position_gate)
-            if _widen_lost(work, recovery) > 0:
+                for q in range(starts[b], starts[b + 1]):
+                    _nearest(work, records[q], q == starts[b])
+                if starts[b] < starts[b + 1]:
+                    _count_unexplained(work, position_gate)
+            if _widen_suspects(work, recovery) > 0:
                 for q in range(total):
+                    _keep_distance(records[q])
                     tile = _tile(values, padded, row_of[slots[q]], block)
                     _innovate(work, tile, points, noises, owners[q], given, camera)
                     _evaluate(work, tile, records[q])
+                _begin_judging(work)
+                for b in range(num):
+                    for q in range(starts[b], starts[b + 1]):
+                        _nearest(work, records[q], q == starts[b])
+                    if starts[b] < starts[b + 1]:
+                        _count_explained(work, position_gate)
+                if _acquit(work) > 0:
+                    for q in range(total):
+                        tile = _tile(values, padded, row_of[slots[q]], block)
+                        _innovate(work, tile, points, noises, owners[q], given, camera)
+                        _evaluate(work, tile, records[q])
         _clear_sums(work)
         for b in range(num):
             low, high = starts[b], starts[b + 1]
@@ -1562,7 +1591,7 @@ def name_new(
 @jit
 def summarise(
     found: Int32Array, distances: FloatArray, new_slots: IntArray, keep: IntArray, size: int, best: int, ids: IntArray
-) -> tuple[IntArray, IntArray, int, int, int, float]:
+) -> tuple[IntArray, IntArray, int, int, int, float, int]:
     """Tell what became of one robot's measurements.
 
     Args:
@@ -1577,11 +1606,11 @@ def summarise(
     Returns:
         The id to which the most probable particle gave each measurement (size,), -1 = rejected; the id of the landmark
         that it created in any particle (size,), -1 = none; how many the most probable particle started, matched and
-        rejected; and its sum of squared distances.
+        rejected; and the sum and number of its squared distances, without what it predicted behind the camera.
     """
     associations = np.full(size, REJECTED, dtype=np.int64)
     created = np.full(size, REJECTED, dtype=np.int64)
-    num_new, num_matched, squares = 0, 0, 0.0
+    num_new, num_matched, squares, judged = 0, 0, 0.0, 0
     for b in range(len(keep)):
         slot = found[b, best]
         if new_slots[b] >= 0:
@@ -1593,8 +1622,10 @@ def summarise(
             num_new += 1
         else:
             num_matched += 1
-            squares += distances[b, best]
-    return associations, created, num_new, num_matched, size - num_new - num_matched, squares
+            if distances[b, best] < np.inf:
+                squares += distances[b, best]
+                judged += 1
+    return associations, created, num_new, num_matched, size - num_new - num_matched, squares, judged
 
 
 # ------------------------------------------------------------------------------------------- lazy resampling

@@ -414,9 +414,9 @@ class FastSlam:
     def _report(self, turns: list[Turn], ess: float, resampled: bool) -> StepReport:
         best, ids = self.best_particle, self._maps.ids
         associations, created = [], []
-        num_new, num_matched, num_rejected, total = 0, 0, 0, 0.0
+        num_new, num_matched, num_rejected, total, num_judged = 0, 0, 0, 0.0, 0
         for turn in turns:
-            given_to, made, new, matched, rejected, squares = _kernels.summarise(
+            given_to, made, new, matched, rejected, squares, judged = _kernels.summarise(
                 turn.found, turn.distances, turn.new_slots, turn.keep, turn.size, best, ids
             )
             associations.append(given_to)
@@ -425,6 +425,7 @@ class FastSlam:
             num_matched += matched
             num_rejected += rejected
             total += squares
+            num_judged += judged
         return StepReport(
             associations=tuple(associations),
             created=tuple(created),
@@ -432,7 +433,7 @@ class FastSlam:
             num_matched=num_matched,
             num_rejected=num_rejected,
             ess=ess,
-            nis=total / num_matched if num_matched else float("nan"),
+            nis=total / num_judged if num_judged else float("nan"),
             resampled=resampled,
         )
 

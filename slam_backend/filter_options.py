@@ -30,8 +30,9 @@ class FilterOptions:
         dead_zone: Measurements whose nearest candidate lies between `position_gate` and this are neither matched nor
             new (`fastslam2`) [-].
         dead_radius: Nor is a measurement new within this distance of a landmark that looks like it (`fastslam2`) [m].
-        recovery_position: Where most matches contradict a particle's pose, its position is taken to be this uncertain
-            before they correct it (`fastslam2`) [m]; 0: its own uncertainty is always believed.
+        recovery_position: Where a pose this uncertain explains three or more measurements, and most of all that it can
+            explain, which a particle's stated uncertainty does not, the particle is lost and corrected from there
+            (`fastslam2`) [m]; 0: its own uncertainty is always believed.
         recovery_heading: Likewise its heading [rad].
         descriptor_sigma: L2 distance between descriptors that costs a match as much as one sigma of position
             (`fastslam2`) [-].

@@ -36,7 +36,7 @@ class StepReport:
         num_rejected: Measurements of which it made nothing: held back, in the dead zone, or named -1 by the caller.
         ess: Effective sample size after this step's weights, before resampling, in [1, M].
         nis: Mean of the squared Mahalanobis innovations (3 degrees of freedom, ideal 3) over the measurements that
-            the most probable particle matched; NaN if it matched none.
+            the most probable particle matched, without those it had predicted behind the camera; NaN if there is none.
         resampled: Whether the particles were resampled.
     """
 

@@ -42,10 +42,12 @@ def fastslam2_turn(
     predicted = WhitenedPose.of(prior)
     iterations = 1 + MORE_ITERATIONS * bool(prior.covariance[2, 2] > WIDE_HEADING**2)
     gates = gates_at(predicted, landmarks, frame, candidates)  # pass A
-    if options.recovery_position > 0.0 and not is_exact and is_lost(gates, candidates, options):
+    if options.recovery_position > 0.0 and not is_exact:
         doubt = np.diag([options.recovery_position, options.recovery_position, options.recovery_heading]) ** 2
-        predicted, iterations = WhitenedPose.of(PoseBelief(prior.mean, doubt)), 1 + MORE_ITERATIONS
-        gates = gates_at(predicted, landmarks, frame, candidates)
+        doubtful = WhitenedPose.of(PoseBelief(prior.mean, doubt))
+        wide_gates = gates_at(doubtful, landmarks, frame, candidates)
+        if is_lost(gates, wide_gates, candidates, options):
+            predicted, gates, iterations = doubtful, wide_gates, 1 + MORE_ITERATIONS
     tentative = beyond_doubt(gates, frame, candidates, options)
     refined = refine(predicted, landmarks, frame, tentative, iterations, options.position_gate)
     chosen, log_unmatched = decide(refined, landmarks, frame, candidates, options)  # pass B
@@ -75,14 +77,19 @@ def gates_at(here: WhitenedPose, landmarks: Landmarks, frame: Frame, candidates:
     return gates
 
 
-def is_lost(gates: Gates, candidates: Candidates, options: FilterOptions) -> bool:
-    """Tell whether three or more, and most, of the measurements with one look-alike contradict the prior."""
+def is_lost(gates: Gates, wide_gates: Gates, candidates: Candidates, options: FilterOptions) -> bool:
+    """Tell whether a wide prior explains three or more, and most, of what it can explain better than the pose's own.
+
+    A measurement that even the wide prior cannot explain says nothing about the pose: it may be of a new landmark.
+    """
     verdicts = []
     for b, possible in enumerate(candidates):
-        looks = [e / options.descriptor_sigma**2 for e, _ in possible]
-        if looks and (len(looks) == 1 or looks[1] - looks[0] >= options.ambiguity):
-            gate = gates.get((b, possible[0][1]))
-            verdicts.append(gate is None or gate.distance > options.position_gate)
+        own, wide = (
+            min((found[b, name].distance for _, name in possible if (b, name) in found), default=np.inf)
+            for found in (gates, wide_gates)
+        )
+        if wide <= options.position_gate:
+            verdicts.append(own > options.position_gate)
     return sum(verdicts) >= 3 and 2 * sum(verdicts) > len(verdicts)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from slam_backend._step_input import check_step
-from slam_backend.errors import FloatArray, IntArray, check_array, check_choice, check_int, check_seed
+from slam_backend.errors import FloatArray, IntArray, bad_argument, check_array, check_choice, check_int, check_seed
 from slam_backend.filter_options import FilterOptions
 from slam_backend.geometry import compose
 from slam_backend.landmark_map import LandmarkMap
@@ -55,6 +55,9 @@ class PlainFastSlam:
         initial_poses: ArrayLike | None = None,
     ) -> None:
         k = check_int("num_robots", num_robots, 1, "Use at least one robot.")
+        if options.adaptive is not None:
+            cure = "The plain filter keeps its number of particles: use FastSlam for one that adapts it."
+            raise bad_argument("options.adaptive", "None", options.adaptive, cure)
         given = np.zeros((k, 3)) if initial_poses is None else initial_poses
         starts = check_array("initial_poses", given, (k, 3), "Give one pose (x, y, theta) per robot.")
         poses = [wrapped(start) for start in starts]
@@ -263,7 +266,7 @@ class PlainFastSlam:
             num_matched=len(given) - num_new - num_rejected,
             num_rejected=num_rejected,
             ess=ess,
-            nis=float(distances.mean()) if len(distances) else float("nan"),
+            nis=float(distances[distances < np.inf].mean()) if (distances < np.inf).any() else float("nan"),
             resampled=measured and ess <= threshold,
         )
 
