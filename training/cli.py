@@ -8,6 +8,7 @@ from rich.markup import escape
 
 from training.bench_command import bench
 from training.bench_filter_command import bench_filter
+from training.paper_command import paper
 from training.replay_command import replay_mrclam
 from training.run import run
 
@@ -24,6 +25,7 @@ replay.command("mrclam")(replay_mrclam)
 app.add_typer(replay, name="replay")
 bench.command("filter")(bench_filter)
 app.add_typer(bench, name="bench")
+app.add_typer(paper, name="paper")
 
 
 def main() -> None:

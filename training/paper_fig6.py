@@ -1,0 +1,94 @@
+"""`Fig6Config`: all that decides the paper's Fig. 6; its trials in the order in which they run."""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, Self
+
+import numpy as np
+
+from slam_backend.errors import bad_argument, check_choice, check_int
+from training.paper_regimes import FEW, REGIMES
+from training.paper_trials import ErrorTrial, TimeTrial
+from training.stereo_office import start_crossings
+
+COMMAND = "paper fig6"
+ERRORS_FILE, TIMES_FILE = "errors.jsonl", "times.jsonl"
+PARTICLES = (1, 10, 50, 100, 200, 300, 400, 500, 1000, 1500, 2000)  # of the paper's figure
+QUICK: dict[str, Any] = {"particles": (1, 10, 100), "seeds": 3, "length": 25.0}
+FIXED_COST = 200  # a step costs about as much as that of so many particles, however few there are
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Fig6Config:
+    """All that decides the figure.
+
+    Attributes:
+        particles: Numbers M.
+        robots: Numbers K.
+        regimes: Keys of `REGIMES`.
+        length: Of each robot's path [m].
+        seeds: How many runs of each kind.
+        seed: The first of them.
+    """
+
+    particles: tuple[int, ...] = PARTICLES
+    robots: tuple[int, ...] = (1, 2, 3)
+    regimes: tuple[str, ...] = tuple(REGIMES)
+    length: float = 100.0
+    seeds: int = 20
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        check_int("seeds", self.seeds, 1, "Run at least one seed.")
+        check_int("seed", self.seed, 0, "Use 0 or a positive number.")
+        for name in ("particles", "robots", "regimes"):
+            values = tuple(getattr(self, name))
+            if not values or len(set(values)) < len(values):
+                raise bad_argument(name, "at least one value, each once", list(values), "Correct the list.")
+            object.__setattr__(self, name, values)
+        for regime in self.regimes:
+            check_choice("regimes", regime, tuple(REGIMES))
+        self.error_trials()  # refuses what no trial can be
+        self.time_trials()
+        start_crossings(max(self.robots), np.random.default_rng(0))  # each robot starts at one of its own
+
+    @classmethod
+    def from_mapping(cls, values: Mapping[str, Any]) -> Self:
+        """Build a config from plain values, as `to_mapping` gives them; unknown names are refused."""
+        known = list(cls.__dataclass_fields__)
+        for name in values:
+            if name not in known:
+                raise bad_argument("config", "one of " + ", ".join(known), name, "Correct the name in the file.")
+        return cls(**values)
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return the plain values that repeat this figure, the first seed apart."""
+        return {name: value for name, value in asdict(self).items() if name != "seed"}
+
+    def error_trials(self) -> list[ErrorTrial]:
+        """Return the trials of the map error, those on the same run in a row, seed by seed."""
+        return [
+            ErrorTrial(
+                regime=name, proposal=proposal, robots=robots, particles=particles, length=float(self.length), seed=seed
+            )
+            for seed in range(self.seed, self.seed + self.seeds)
+            for name in self.regimes
+            for robots in self.robots
+            for proposal in REGIMES[name].proposals
+            for particles in self.particles
+            if not REGIMES[name].few or particles in FEW
+        ]
+
+    def time_trials(self) -> list[TimeTrial]:
+        """Return the trials of the time per step, seed by seed; none without the paper's regime."""
+        return [
+            TimeTrial(robots=self.robots, particles=particles, length=float(self.length), seed=seed)
+            for seed in range(self.seed, self.seed + self.seeds)
+            for particles in self.particles
+            if "paper" in self.regimes
+        ]
+
+
+def cost(trial: ErrorTrial | TimeTrial) -> int:
+    """Return about how long a trial takes, in an arbitrary unit: what a progress bar counts."""
+    return (trial.particles + FIXED_COST) * (len(trial.robots) if isinstance(trial, TimeTrial) else 1)

@@ -1,0 +1,54 @@
+"""The conditions under which the paper's Fig. 6 is drawn: its own kind of noise, and what it leaves out."""
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from training.stereo_runs import RunSpec
+
+Proposal = Literal["fastslam1", "fastslam2"]
+
+FEW = (10, 100, 1000)  # particles, beside the paper's eleven numbers
+# Algorithm 1, l. 10: drawn at random in proportion to the weights, at every step. fastslam2 keeps the defaults.
+FILTER_OPTIONS: dict[Proposal, dict[str, Any]] = {
+    "fastslam1": {"resample_threshold": 1.0, "resampling": "multinomial"},
+    "fastslam2": {},
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Regime:
+    """Noise, looks of the landmarks, and the filters that are tried. Association is always unknown.
+
+    Attributes:
+        title: For tables and figures.
+        preset: Of the noise, a key of `stereo_runs.PRESETS`.
+        looks: Fields of `RunSpec` that say how landmarks are confused.
+        proposals: Of the filters.
+        few: Whether the numbers of particles in `FEW` are enough.
+    """
+
+    title: str
+    preset: str
+    looks: dict[str, Any]
+    proposals: tuple[Proposal, ...]
+    few: bool
+
+    def spec(self, robots: int, length: float) -> RunSpec:
+        """Return the run of K robots, each driving `length` [m]; all together measure B = 15 landmarks in a step."""
+        return RunSpec(preset=self.preset, association="unknown", robots=robots, length=length, **self.looks)
+
+
+# Sec. 5 speaks neither of look-alikes nor of false points.
+DISTINCT = {"look_alikes": 1, "outliers": 0.0, "wrong_descriptors": 0.0}
+REGIMES = {
+    "paper": Regime(
+        title="as in the paper", preset="paper", looks=DISTINCT, proposals=("fastslam1",), few=False
+    ),
+    "look_alikes": Regime(
+        title="with look-alikes and false points", preset="paper", looks={}, proposals=("fastslam1",),
+        few=True,
+    ),
+    "good": Regime(
+        title="good stereo", preset="good", looks=DISTINCT, proposals=("fastslam1", "fastslam2"), few=True
+    ),
+}  # fmt: skip
