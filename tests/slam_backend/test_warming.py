@@ -15,6 +15,8 @@ VARIED_USE = """
 import sys
 import numpy as np
 from slam_backend import FastSlam, Measurements, TeamSlam
+from slam_backend.adaptation import AdaptiveParticles
+from slam_backend.existence import ExistenceModel
 from slam_backend.attempts import AttemptOptions
 from slam_backend.existence import ExistenceModel
 from slam_backend.metrics.maps import map_error
@@ -44,9 +46,17 @@ for proposal in ("fastslam1", "fastslam2"):
             slam.step([np.array([0.0, 0.0, -0.02])] * robots, [None] * robots)
             slam.step([None] * robots, [frame] * robots, [np.where(seen < 5, -1, seen)] * robots)
             slam.step([None] * robots, [frame] * robots, poses=[np.zeros(3)] * robots)
+        columns = np.zeros((3, 2)).T  # neither contiguous nor to be written
+        columns.setflags(write=False)
+        slam.step([columns[0]] * robots, [frame] * robots, poses=[columns[1]] * robots)
         slam.set_state(slam.get_state())
         slam.map("mixture")
         slam.step([None] * robots, [frame] * robots)
+options = {"adaptive": AdaptiveParticles(min_particles=10, max_particles=40), "existence": ExistenceModel()}
+slam = FastSlam(1, 40, resample_threshold=1.0, **options)
+for size in (30, *(5 for _ in range(20))):
+    slam.step([np.zeros(3)], [Measurements(points[:size], looks[:size])])
+assert (slam.num_landmarks < 30, slam.num_particles < 40) == (True, True)  # landmarks given up, particles too
 team = TeamSlam(2, num_particles=7, attempts=AttemptOptions(every=1))
 for size in (1, 3, 9, 30, 30, 30):
     team.step([None, None], [Measurements(points[:size], looks[:size])] * 2)
