@@ -49,7 +49,7 @@ class SmallWorld:
         self.descriptors = looks / np.linalg.norm(looks, axis=1, keepdims=True)
         self.descriptors[num - 2] = self.descriptors[num - 1]  # two that no descriptor tells apart
         self.look_noise = float(rng.choice([0.0, 0.05]))
-        self.slips = float(rng.choice([0.0, 0.2]))
+        self.slips = float(rng.choice([0.0, 0.4]))
         self.poses = rng.uniform([-2.0, -2.0, -np.pi], [2.0, 2.0, np.pi], (num_robots, 3))
         self.start_poses = self.poses.copy()
         self.blind_for = np.zeros(num_robots, dtype=np.int64)
