@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import FixedLocator, NullFormatter, NullLocator, StrMethodFormatter
 
 from training.accuracy_tables import NAMES, conditions
 from training.accuracy_trials import FILTERS
@@ -38,7 +39,8 @@ def draw_accuracy(file: Path, lines: Sequence[Mapping[str, Any]]) -> None:
             for panel, (key, label) in zip(row, PANELS, strict=True):
                 _draw_panel(panel, own, key, label)
             row[0].set_title(title, loc="left")
-            row[0].legend(fontsize=7, framealpha=0.8)
+        handles, labels = axes[0][0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), frameon=False)
         figure.savefig(file, dpi=110)
 
 
@@ -63,6 +65,14 @@ def _draw_panel(ax: Axes, lines: Sequence[Mapping[str, Any]], key: str, label: s
             ax.axhspan(low[0], high[0], color=colour, alpha=0.12, lw=0)
     ax.set_xscale("log")
     ax.set_yscale("log")
+    ticks = sorted({line["particles"] for line in lines if line["method"] in FILTERS})
+    ax.xaxis.set_major_locator(FixedLocator(ticks))
+    ax.xaxis.set_minor_locator(NullLocator())
+    ax.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    bottom, top = ax.get_ylim()
+    if top < 1e3 * bottom:  # else powers of ten are easier to read
+        ax.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        ax.yaxis.set_minor_formatter(NullFormatter() if top > 30.0 * bottom else StrMethodFormatter("{x:g}"))
     ax.set_xlabel("particles M")
     ax.set_ylabel(label)
     ax.grid(alpha=0.2, which="both")
