@@ -12,6 +12,8 @@ import numpy as np
 from slam_backend._jit import inlined, jit, lanes
 from slam_backend.errors import Float32Array, FloatArray, Int32Array, IntArray
 
+ROUNDED = 1.0 + 1e-9  # no rounding decides what is looked at in detail
+
 
 @inlined
 def in_view(
@@ -67,20 +69,24 @@ def carry_odds(slots: IntArray, odds: FloatArray, map_of: IntArray, maps: Int32A
 
 
 @jit
-def landmarks_around(
+def landmarks_told_of(
     ids: IntArray, row_of: IntArray, map_of: IntArray, maps: Int32Array, values: FloatArray, counts: Int32Array,
-    num_particles: int, best: int, x: float, y: float, reach: float, found: Int32Array, new_slots: IntArray,
+    num_particles: int, best: int, poses: FloatArray, cosines: FloatArray, sines: FloatArray, mount: FloatArray,
+    near: float, nearest: float, side: float, reach_squared: float, found: Int32Array, new_slots: IntArray,
 ) -> IntArray:
-    """Return the slots of the landmarks that a frame may tell something about, without those that it started.
+    """Return the slots of the landmarks that a frame may tell something of, without those that it started.
 
-    They are the landmarks that some particle has matched, and those near the robot.
+    They are those that some particle has matched, and of those near the robot the ones that some particle expects in
+    view, heights apart.
 
     Args:
         ids, row_of, map_of, maps, values, counts: The store, see `ParticleMaps`; it need not be up to date.
         num_particles: M.
         best: The particle whose map says what is near; what it lacks is where the first particle that holds it says.
-        x, y: Where that particle has the robot [m].
-        reach: Farther landmarks [m, in the plane] are not near.
+        poses: (3, P) of the robot [m, m, rad], map frame, with the `cosines` and `sines` (P,) of its headings.
+        mount: (3,) of the camera on the robot [m].
+        near: Landmarks farther from the robot than this [m, in the plane] are not near.
+        nearest, side, reach_squared: Of a `View`.
         found: (n, P) slots to which the particles gave the measurements, negative = none.
         new_slots: (n,) slots of the landmarks that the frame started, -1 = none.
     """
@@ -93,27 +99,63 @@ def landmarks_around(
                 matched[found[b, m]] = True
         if new_slots[b] >= 0:
             started[new_slots[b]] = True
+    in_place = np.arange(counts.shape[1]).astype(np.int32)
     slots = np.empty(len(ids), dtype=np.int64)
     num = 0
     for slot in range(len(ids)):
         if ids[slot] < 0 or started[slot]:
             continue
-        is_near = False
-        if not matched[slot]:
-            row, e = row_of[slot], map_of[slot]
-            place = np.int64(maps[e, best]) if e > 0 else best
-            m = 0
+        is_told = matched[slot]
+        if not is_told:
+            row = row_of[slot]
+            places = maps[map_of[slot]] if map_of[slot] > 0 else in_place
+            place, m = np.int64(places[best]), 0
             while counts[row, place] == 0 and m < num_particles:
-                place = np.int64(maps[e, m]) if e > 0 else m
+                place = np.int64(places[m])
                 m += 1
             if counts[row, place] > 0:
-                dx = values[row, place // lanes, 0, place % lanes] - x
-                dy = values[row, place // lanes, 1, place % lanes] - y
-                is_near = dx * dx + dy * dy <= reach * reach
-        if matched[slot] or is_near:
+                dx = values[row, place // lanes, 0, place % lanes] - poses[0, best]
+                dy = values[row, place // lanes, 1, place % lanes] - poses[1, best]
+                is_told = dx * dx + dy * dy <= near * near and _is_expected(
+                    places[:num_particles], values[row], counts[row], poses, cosines, sines, mount, nearest, side,
+                    reach_squared,
+                )
+        if is_told:
             slots[num] = slot
             num += 1
     return slots[:num]
+
+
+@lanes
+def _is_expected(
+    places: Int32Array, values: FloatArray, counts: Int32Array, poses: FloatArray, cosines: FloatArray,
+    sines: FloatArray, mount: FloatArray, nearest: float, side: float, reach_squared: float,
+) -> bool:
+    """Tell whether some particle may expect a landmark in view, heights apart.
+
+    Args:
+        places: (M,) where each particle's values stand in the landmark's row.
+        values, counts: (blocks, 9, lanes) and (P,) that row.
+        poses and the following: See `landmarks_told_of`.
+    """
+    size = values.shape[2]  # a power of two
+    shift = 0
+    while 1 << shift < size:
+        shift += 1
+    m0, m1 = mount[0], mount[1]
+    nearest, side, reach_squared = nearest / ROUNDED, side * ROUNDED, reach_squared * ROUNDED
+    for first in range(0, len(places), size):
+        num = 0
+        for m in range(first, min(first + size, len(places))):
+            place = np.int64(places[m])
+            block, lane = place >> shift, place & (size - 1)
+            dx, dy = values[block, 0, lane] - poses[0, m], values[block, 1, lane] - poses[1, m]
+            depth, lateral = cosines[m] * dx + sines[m] * dy - m0, cosines[m] * dy - sines[m] * dx - m1
+            seen = in_view(depth, lateral, 0.0, nearest, side, 0.0, reach_squared)
+            num += 1 if seen and counts[place] > 0 else 0
+        if num > 0:
+            return True
+    return False
 
 
 @jit
@@ -182,6 +224,7 @@ def weigh_existence(
     """
     m0, m1, m2 = mount[0], mount[1], mount[2]
     size = values.shape[3]
+    expected = np.empty(size, dtype=np.bool_)
     deserted = np.empty(len(slots), dtype=np.int64)
     num = 0
     for k in range(len(slots)):
@@ -190,14 +233,15 @@ def weigh_existence(
         holders = 0
         for block in range(values.shape[1]):
             first, last = block * size, (block + 1) * size
-            mean_x, mean_y, mean_z = values[row, block, 0], values[row, block, 1], values[row, block, 2]
-            held, own, hit = counts[row, first:last], odds[slot, first:last], seen[k, first:last]
             x, y, c, s = poses[0, first:last], poses[1, first:last], cosines[first:last], sines[first:last]
+            mean = values[row, block]
             for i in range(size):
-                dx, dy = mean_x[i] - x[i], mean_y[i] - y[i]
+                dx, dy = mean[0, i] - x[i], mean[1, i] - y[i]
                 depth, lateral = c[i] * dx + s[i] * dy - m0, c[i] * dy - s[i] * dx - m1
-                expected = in_view(depth, lateral, mean_z[i] - m2, nearest, side, rise, reach_squared)
-                after = updated_log_odds(own[i], hit[i] > 0, expected, sighting, miss, cap)
+                expected[i] = in_view(depth, lateral, mean[2, i] - m2, nearest, side, rise, reach_squared)
+            held, own, hit = counts[row, first:last], odds[slot, first:last], seen[k, first:last]
+            for i in range(size):
+                after = updated_log_odds(own[i], hit[i] > 0, expected[i], sighting, miss, cap)
                 after = after if held[i] > 0 else own[i]
                 own[i] = after
                 held[i] = 0 if after < floor else held[i]

@@ -38,19 +38,19 @@ class ExistenceStep:
             Slots that no particle holds any more. They are to be released once nobody asks for their ids.
         """
         maps.start_odds(turn.new_slots)
-        x, y = float(poses[0, best]), float(poses[1, best])
-        slots = kernels.landmarks_around(
+        view = self._view
+        seen_from = (poses, np.cos(poses[2]), np.sin(poses[2]), self._mount)
+        slots = kernels.landmarks_told_of(
             maps.ids, maps.row_of, maps.map_of, maps.maps, maps.blocks, maps.counts, maps.num_particles, best,
-            x, y, self._near, turn.found, turn.new_slots,
+            *seen_from, self._near, view.nearest, view.side, view.reach_squared, turn.found, turn.new_slots,
         )  # fmt: skip
         if not len(slots):
             return slots
         maps.refresh(slots)
         pose = np.ascontiguousarray(poses[:, best])
         store = (maps.row_of, maps.blocks, maps.counts)
-        expected = kernels.count_expected(slots, *store, best, pose, self._mount, *self._view)
+        expected = kernels.count_expected(slots, *store, best, pose, self._mount, *view)
         return kernels.weigh_existence(
             slots, kernels.mark_seen(slots, len(maps.ids), turn.found), maps.odds, *store,
-            poses, np.cos(poses[2]), np.sin(poses[2]), self._mount, *self._view,
-            *self._model.increments(expected), *self._bounds,
+            *seen_from, *view, *self._model.increments(expected), *self._bounds,
         )  # fmt: skip

@@ -256,11 +256,11 @@ def _fuse_odds(
     """Fuse the log-odds of existence (n, M) of b's rows into a's, in place, like `_fuse_rows`, and before it.
 
     What either filter saw is independent given whether the landmark exists: log-odds add up, and the prior that both
-    hold counts once.
+    hold counts once. What then lies below the floor is given one more chance: it stays there until the next miss.
     """
     in_a, in_b = counts_a[rows_a] > 0, counts_b[rows_b] > 0
     one, two = odds_a[rows_a], odds_b[rows_b]
-    both = np.minimum(one + two - model.log_odds_prior, model.log_odds_cap)
+    both = np.clip(one + two - model.log_odds_prior, model.log_odds_floor, model.log_odds_cap)
     odds_a[rows_a] = np.where(in_a & in_b, both, np.where(in_b, two, one))
 
 

@@ -262,6 +262,21 @@ def test_a_merge_adds_what_both_filters_know_of_a_landmark(particles: tuple[int,
     np.testing.assert_allclose(joint.existence()[1], model.cap)
 
 
+def test_what_two_filters_together_doubt_goes_with_the_next_miss_after_their_merge() -> None:
+    """A merge deletes nothing, as its ids are handed on: what both have missed is left with the least probability."""
+    model = ExistenceModel()
+    a, b = standing(model), standing(model)
+    for slam in (a, b):
+        slam.step([None], [frame(0, 1)])
+        for _ in range(model.misses_to_delete(0.0) - 1):
+            slam.step([None], [frame(0)])
+    joint, _ = merge_filters(a, b, aligned(), np.array([[0, 0], [1, 1]]), np.random.default_rng(0))
+    np.testing.assert_array_equal(joint.map().ids, [0, 1])
+    assert joint.existence()[1][1] == pytest.approx(model.delete_below)
+    joint.step([None, None], [frame(0), None])
+    np.testing.assert_array_equal(joint.map().ids, [0])
+
+
 def test_a_merge_with_a_filter_that_keeps_no_existence_starts_its_landmarks_at_the_prior() -> None:
     """The joint filter has the options of the first: with a model, the second's landmarks get its prior; else none."""
     model = ExistenceModel(prior=0.3)
