@@ -72,8 +72,14 @@ def map_once(
 
 def names_of(slam: FastSlam) -> dict[int, int]:
     """Return the true name of each landmark that a filter holds, by its id."""
-    held = slam._ids >= 0
-    return dict(zip(slam._ids[held].tolist(), slam._identities[held].tolist(), strict=True))
+    maps = slam._maps
+    slots = maps.used_slots()
+    return dict(zip(maps.ids[slots].tolist(), maps.identities[slots].tolist(), strict=True))
+
+
+def starts_of(slam: FastSlam, robot: int) -> FloatArray:
+    """Return (M, 3) where a robot started in each particle, map frame."""
+    return compose(slam.particles(robot)[0], inverse(slam.particles_from_start(robot)))
 
 
 def common_landmarks(a: FastSlam, b: FastSlam) -> IntArray:

@@ -1,41 +1,58 @@
 """What happens to particles and their accumulated weights when they are resampled, and snapshots."""
 
+import copy
 import pickle
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
+from filter_contents import arrays_of, contents, map_of
 from same_bits import assert_same
 from stereo_world import StereoWorld
 
-from slam_backend import _kernels
+from slam_backend.errors import IntArray
 from slam_backend.filter import FastSlam
 from slam_backend.geometry import compose
 from slam_backend.measurements import Measurements
 from slam_backend.resampling import RESAMPLING
 
 MOVE = np.array([0.25, 0.02, 0.3])
+CAMERA = StereoWorld(np.random.default_rng(0)).camera
 PROPOSALS = pytest.mark.parametrize("proposal", ["fastslam2", "fastslam1"])
 
 
-def inputs(steps: int, seed: int = 0) -> list[tuple[Any, Any]]:
-    """Return noisy odometry and frames of one robot that drives in a circle."""
+def inputs(steps: int, seed: int = 0, noise: float = 1.0) -> list[tuple[Any, Any]]:
+    """Return noisy odometry and frames, with `noise` times the camera's, of one robot that drives in a circle."""
     world = StereoWorld(np.random.default_rng(seed))
     pose, result = np.zeros(3), []
     for _ in range(steps):
         pose = compose(pose, MOVE)
         odometry = MOVE + world.rng.normal(0.0, [0.02, 0.01, 0.01])
-        result.append(([odometry], [world.measure(pose, world.visible(pose))]))
+        result.append(([odometry], [world.measure(pose, world.visible(pose), noise)]))
     return result
 
 
-def filter_after(steps: int, **changes: Any) -> FastSlam:
+def filter_after(steps: int, num_particles: int = 11, **changes: Any) -> FastSlam:
     """Return a filter that has lived through some steps."""
-    slam = FastSlam(num_particles=11, seed=3, camera=StereoWorld(np.random.default_rng(0)).camera, **changes)
+    slam = FastSlam(num_particles=num_particles, seed=3, camera=CAMERA, **changes)
     for odometry, frames in inputs(steps):
         slam.step(odometry, frames)
     return slam
+
+
+def without_resampling(state: dict[str, Any]) -> FastSlam:
+    """Return a filter that goes on from a snapshot but never resamples."""
+    slam = FastSlam()
+    slam.set_state(state | {"options": replace(state["options"], resample_threshold=0.0)})
+    return slam
+
+
+def parents_of(slam: FastSlam, twin: FastSlam) -> IntArray:
+    """Return (M,) which particle of a twin that has not resampled each particle of a filter is a copy of."""
+    same = (slam.particles()[0][:, None] == twin.particles()[0]).all(axis=2)
+    np.testing.assert_array_equal(same.sum(axis=1), 1)
+    return same.argmax(axis=1)
 
 
 @PROPOSALS
@@ -43,18 +60,76 @@ def test_accumulated_weights_follow_the_ancestral_line(proposal: Any) -> None:
     """Eq. 12: a resampled particle carries its ancestor's accumulated log-weight, not that of its index."""
     slam = filter_after(3, proposal=proposal, resample_threshold=1.0)
     strangers = 0
-    for odometry, frames in inputs(12)[3:]:
-        twin = FastSlam()
-        state = slam.get_state()
-        twin.set_state(state | {"options": replace(slam.options, resample_threshold=0.0)})
+    for odometry, frames in inputs(30)[3:]:
+        twin = without_resampling(slam.get_state())
         twin.step(odometry, frames)
         slam.step(odometry, frames)
-        line = {tuple(pose): weight for pose, weight in zip(twin.particles()[0], twin._path_log_weights, strict=True)}
-        expected = [line[tuple(pose)] for pose in slam.particles()[0]]
-        np.testing.assert_array_equal(slam._path_log_weights, expected)
+        parents = parents_of(slam, twin)
+        np.testing.assert_array_equal(slam._path_log_weights, twin._path_log_weights[parents])
         np.testing.assert_allclose(slam.weights, 1.0 / 11.0)
         strangers += int(np.sum(slam._path_log_weights != twin._path_log_weights))
     assert strangers > 10, "the indices have changed their meaning many times"
+
+
+@pytest.mark.parametrize("scheme", list(RESAMPLING))
+def test_a_resampled_particle_brings_along_all_that_its_parent_holds(scheme: str) -> None:
+    """Poses, starts, N(x^, P^), maps and counts are those of one and the same parent, in blocks of particles or not.
+
+    Robot 1 sees nothing: its Gaussians are not sampled, and go along too.
+    """
+    slam = FastSlam(2, 70, CAMERA, resampling=scheme, resample_threshold=1.0)
+    slam._starts[1, :2, :70] += np.random.default_rng(1).normal(size=(2, 70))  # as after a merge
+    copies = 0
+    for odometry, frames in inputs(12, seed=2):
+        twin = without_resampling(slam.get_state())
+        for each in (twin, slam):
+            each.step([*odometry, MOVE], [*frames, None])
+        parents = parents_of(slam, twin)
+        resampled, before = contents(slam), contents(twin)
+        for name in ("_poses", "_starts", "_means", "_covariances"):
+            np.testing.assert_array_equal(resampled[name], before[name][..., parents], err_msg=name)
+        resampled, before = resampled["maps"], before["maps"]
+        kept = np.isin(before["ids"], resampled["ids"])
+        for name in ("means", "covariances", "counts"):
+            np.testing.assert_array_equal(resampled[name], before[name][kept][..., parents], err_msg=name)
+        assert not before["counts"][~kept][:, parents].any()
+        copies += 70 - len(np.unique(parents))
+    assert copies > 70
+
+
+@PROPOSALS
+@pytest.mark.parametrize("scheme", list(RESAMPLING))
+def test_landmarks_out_of_view_follow_every_resampling(proposal: Any, scheme: str) -> None:
+    """A filter whose maps are read after each resampling, and one left alone over many, hold the same in the end."""
+    options: Any = {"proposal": proposal, "resampling": scheme, "resample_threshold": 1.0}
+    read, alone = (FastSlam(1, 70, CAMERA, **options) for _ in range(2))
+    unseen = 0
+    for odometry, frames in inputs(16, noise=2.0):
+        for slam in (read, alone):
+            report = slam.step(odometry, frames)
+        contents(read)
+        unseen += alone.map_size - len(frames[0])
+        assert report.resampled
+    assert unseen > 70
+    assert len(np.unique(alone._maps.map_of)) > 4, "landmarks last seen before one, two, three and more resamplings"
+    assert_same(contents(alone), contents(read))
+
+
+@pytest.mark.parametrize("scheme", list(RESAMPLING))
+def test_survivors_keep_their_places(scheme: str) -> None:
+    """A particle with a copy stays; surplus copies, by ascending parent, fill the places of the dead, ascending."""
+    slam = filter_after(3, 70, resampling=scheme, resample_threshold=1.0, proposal="fastslam1")
+    moves = 0
+    for odometry, frames in inputs(10)[3:]:
+        twin = without_resampling(slam.get_state())
+        twin.step(odometry, frames)
+        slam.step(odometry, frames)
+        parents, places = parents_of(slam, twin), np.arange(70)
+        survivors = np.isin(places, parents)
+        np.testing.assert_array_equal(parents[survivors], places[survivors])
+        assert (np.diff(parents[~survivors]) >= 0).all()
+        moves += np.count_nonzero(~survivors)
+    assert moves > 70
 
 
 def test_weights_are_kept_until_the_particles_are_resampled() -> None:
@@ -68,38 +143,57 @@ def test_weights_are_kept_until_the_particles_are_resampled() -> None:
     np.testing.assert_allclose(slam.particles()[1], expected - np.logaddexp.reduce(expected), atol=1e-12)
 
 
+@PROPOSALS
 @pytest.mark.parametrize("scheme", list(RESAMPLING))
-def test_particles_share_no_memory(scheme: str) -> None:
-    """Writing to one particle leaves its siblings and earlier snapshots alone."""
-    slam = filter_after(8, resampling=scheme, resample_threshold=1.0, proposal="fastslam1")
-    state = slam.get_state()
-    landmarks, poses = slam._landmarks.copy(), slam._poses.copy()
-    slam._landmarks[:, :, 4] += 1.0
-    slam._poses[:, 4] += 1.0
-    others = np.arange(11) != 4
-    np.testing.assert_array_equal(slam._landmarks[:, :, others], landmarks[:, :, others])
-    np.testing.assert_array_equal(slam._poses[:, others], poses[:, others])
-    np.testing.assert_array_equal(state["_landmarks"], landmarks)
-    np.testing.assert_array_equal(state["_poses"], poses)
+@pytest.mark.parametrize("num_particles", [11, 70])
+def test_what_a_particle_writes_reaches_no_other(proposal: Any, scheme: str, num_particles: int) -> None:
+    """Where one of two siblings stands elsewhere, a step changes that particle alone, and no snapshot."""
+    slam = filter_after(8, num_particles, resampling=scheme, resample_threshold=1.0, proposal=proposal)
+    poses = slam.particles()[0]
+    siblings = (poses[:, None] == poses).all(axis=2).sum(axis=1) > 1
+    writer = int(np.flatnonzero(siblings)[0])
+    before, state = contents(slam), slam.get_state()
+    kept, other = copy.deepcopy(state), copy.deepcopy(state)
+    other["_poses"][0, :, writer] += [0.3, -0.2, 0.1]
+    odometry, frames = inputs(9)[8]
+    twins = [without_resampling(start) for start in (state, other)]
+    for twin in twins:
+        twin.step(odometry, frames)
+    one, two = twins
+    for m in range(num_particles):
+        assert np.array_equal(one.particles()[0][m], two.particles()[0][m]) == (m != writer)
+        assert np.array_equal(map_of(one, m), map_of(two, m)) == (m != writer)
+    assert_same(state, kept)
+    assert_same(contents(slam), before)
 
 
-def test_the_kernel_updates_a_landmark_in_its_own_particle_only() -> None:
-    """Where one particle alone holds a landmark, its update leaves all that the slot keeps for others alone."""
-    slam = filter_after(8, resample_threshold=1.0)
-    slot = int(np.argmax(np.where(slam._present.all(axis=1), slam._ids, -1)))  # the newest lies ahead of the robot
-    free = int(np.flatnonzero(slam._ids < 0)[0])
-    before = slam._landmarks.copy()
-    slam._present[slot] = np.arange(11) == 4
-    _kernels.update_fastslam1(
-        slam._poses[0], slam._landmarks, slam._present, slam._counts, np.array([[3.0, 0.1, 0.2]]), np.zeros((1, 6)),
-        False, slam._camera, np.array([0, 1]), np.array([slot]), np.array([True]), np.array([free]), 11.34, 0.0, True,
-        np.zeros((1, 11), dtype=np.int64), np.zeros((1, 11)), np.zeros(11),
-    )  # fmt: skip
-    changed = (slam._landmarks != before).any(axis=1)
-    expected = np.zeros_like(changed)
-    expected[slot, 4] = True
-    expected[free] = np.arange(11) != 4
-    np.testing.assert_array_equal(changed, expected)
+@PROPOSALS
+@pytest.mark.parametrize("num_particles", [11, 70])
+def test_a_landmark_is_updated_in_the_particle_that_holds_it_only(proposal: Any, num_particles: int) -> None:
+    """Where one particle alone holds a landmark, its update leaves all that is kept for the others alone."""
+    slam = filter_after(8, num_particles, resample_threshold=1.0, proposal=proposal)
+    maps = slam._maps
+    slots = maps.used_slots()
+    values, counts = maps.dense(slots)
+    row = int(np.flatnonzero((counts > 0).all(axis=1))[-1])  # the newest lies ahead of the robot
+    holder = np.arange(num_particles) == 4
+    counts[row] = 7 * holder
+    names = np.where(np.arange(len(slots)) == row, 5, -1)
+    maps.load(values, counts, maps.descriptors[slots], maps.ids[slots], names, maps.next_id)
+    slam = without_resampling(slam.get_state())
+    ids, means, covariances, counts = slam._dense()
+    poses = slam.particles()[0]
+    look = slam._maps.descriptors[slam._maps.used_slots()[row]][None]
+    report = slam.step([None], [Measurements([[-0.1, -0.2, 3.0]], look)], identities=[[5]])
+    now_ids, now_means, now_covariances, now_counts = slam._dense()
+    np.testing.assert_array_equal(now_ids, [*ids, report.created[0][0]])
+    expected = np.zeros(counts.shape, dtype=bool)
+    expected[row, 4] = True
+    np.testing.assert_array_equal((now_means[:-1] != means).any(axis=1), expected)
+    np.testing.assert_array_equal((now_covariances[:-1] != covariances).any(axis=1), expected)
+    np.testing.assert_array_equal(now_counts[:-1] - counts, expected)
+    np.testing.assert_array_equal(now_counts[-1], ~holder)
+    np.testing.assert_array_equal(slam.particles()[0], poses)
 
 
 def test_what_is_handed_out_is_the_callers() -> None:
@@ -121,14 +215,82 @@ def test_a_restored_filter_goes_on_bit_for_bit(proposal: Any, scheme: str) -> No
     state = slam.get_state()
     pickled = pickle.dumps(state)
     later = inputs(12)[5:]
-    for odometry, frames in later:
-        slam.step(odometry, frames)
-    expected = slam.get_state()
+    reports = [slam.step(odometry, frames) for odometry, frames in later]
+    expected, expected_state = contents(slam), slam.get_state()
     for snapshot, restored in ((state, slam), (pickle.loads(pickled), FastSlam(3, 2))):
         restored.set_state(snapshot)
-        for odometry, frames in later:
-            restored.step(odometry, frames)
-        assert_same(restored.get_state(), expected)
+        assert_same([restored.step(odometry, frames) for odometry, frames in later], reports)
+        assert_same(contents(restored), expected)
+        assert_same(restored.get_state(), expected_state)
+
+
+@PROPOSALS
+def test_a_filter_goes_on_bit_for_bit_through_many_snapshots(proposal: Any) -> None:
+    """Restored at each step, and asked for its maps, a filter does what one does that is left alone.
+
+    Noise beyond the gates lets landmarks come and go in several blocks of particles, one robot is blind at times and
+    names are given at times, so that places are freed and used again in another order.
+    """
+    options: Any = {"proposal": proposal, "dead_zone": 11.34, "dead_radius": 0.0, "resample_threshold": 0.9}
+    slam, looks = FastSlam(2, 70, CAMERA, seed=3, **options), StereoWorld(np.random.default_rng(1)).descriptors
+    restored = FastSlam()
+    restored.set_state(slam.get_state())
+    for step, (odometry, frames) in enumerate(inputs(40, seed=1, noise=3.0)):
+        names = None if step % 3 else [(frames[0].descriptors @ looks.T).argmax(axis=1), None]
+        arguments = ([*odometry, MOVE], [*frames, frames[0] if step % 4 == 0 else None], names)
+        assert_same(restored.step(*arguments), slam.step(*arguments))
+        state = restored.get_state()
+        restored = FastSlam(1 + step % 2, 70)
+        restored.set_state(state)
+        if step % 2:
+            restored.map("mixture")
+    assert slam._maps.next_id - slam.num_landmarks > 10, "landmarks have been forgotten"
+    assert_same(restored.map("mixture"), slam.map("mixture"))
+    assert_same(contents(restored), contents(slam))
+
+
+def arrays_in(nest: Any) -> list[Any]:
+    """Return all arrays in nested dicts, sequences and records."""
+    if isinstance(nest, np.ndarray):
+        return [nest]
+    if isinstance(nest, dict):
+        nest = list(nest.values())
+    elif hasattr(nest, "__dataclass_fields__"):
+        nest = [getattr(nest, name) for name in nest.__dataclass_fields__]
+    return [array for item in nest for array in arrays_in(item)] if isinstance(nest, (list, tuple)) else []
+
+
+@PROPOSALS
+def test_a_snapshot_shares_nothing_that_can_be_written(proposal: Any) -> None:
+    """Neither steps of the filter or of one restored from it, nor writing to what they hand out, reach a snapshot."""
+    slam, other = filter_after(5, proposal=proposal), FastSlam()
+    state = slam.get_state()
+    kept = copy.deepcopy(state)
+    other.set_state(state)
+    in_use = [array for each in (slam, other) for array in [*arrays_of(each).values(), *arrays_in(each.pose())]]
+    for array in arrays_in(state):
+        assert not any(held.flags.writeable and np.shares_memory(array, held) for held in in_use)
+    for odometry, frames in inputs(8)[5:]:
+        slam.step(odometry, frames)
+        other.step(odometry, frames)
+    assert_same(state, kept)
+
+
+@pytest.mark.parametrize("stream", [np.random.PCG64, np.random.MT19937])
+def test_a_restored_filter_draws_from_a_stream_of_its_own(stream: Any) -> None:
+    """Restoring neither rewinds the generator that was given as a seed, nor lets draws of others disturb the filter."""
+    rng = np.random.Generator(stream(7))
+    slam = FastSlam(seed=rng)
+    state = slam.get_state()
+    slam.step([MOVE], [None])
+    expected, drawn = contents(slam), copy.deepcopy(rng.bit_generator.state)
+    for restored in (slam, FastSlam()):
+        restored.set_state(state)
+        assert_same(rng.bit_generator.state, drawn)
+        rng.random()
+        drawn = copy.deepcopy(rng.bit_generator.state)
+        restored.step([MOVE], [None])
+        assert_same(contents(restored), expected)
 
 
 def test_the_seed_decides_everything() -> None:
@@ -148,8 +310,10 @@ def test_the_seed_decides_everything() -> None:
 def test_landmarks_that_no_survivor_holds_are_forgotten() -> None:
     """Ids are never used twice, and only landmarks that a particle holds are counted."""
     slam = filter_after(20, proposal="fastslam1", resample_threshold=1.0)
-    held = slam._ids[slam._present.any(axis=1)]
-    assert np.all(held >= 0)
+    held, _, _, counts = slam._dense()
+    assert (held >= 0).all()
+    assert (counts > 0).any(axis=1).all()
     assert len(np.unique(held)) == len(held) == slam.num_landmarks
     report = slam.step([None], [Measurements([[0.0, 0.0, 2.0]], -np.eye(1, 17))])
     assert report.created[0][0] > held.max()
+    assert report.created[0][0] > len(held), "some had been forgotten"

@@ -2,7 +2,17 @@
 
 import numpy as np
 import pytest
-from mapped_once import A_FROM_B, LANDMARKS, NAMES_A, NAMES_B, common_landmarks, known_alignment, map_once, names_of
+from mapped_once import (
+    A_FROM_B,
+    LANDMARKS,
+    NAMES_A,
+    NAMES_B,
+    common_landmarks,
+    known_alignment,
+    map_once,
+    names_of,
+    starts_of,
+)
 from scipy import integrate, stats
 
 from slam_backend.alignment import Alignment
@@ -38,7 +48,7 @@ def mean_nees(landmarks: LandmarkMap, rows: list[int]) -> float:
 def merged_nees(a: FastSlam, b: FastSlam, rng: np.random.Generator) -> tuple[float, float]:
     """Return the NEES of b's start in a's frame, and that of b's own landmarks, after a particle-level merge."""
     joint, _ = merge_filters(a, b, known_alignment(), common_landmarks(a, b), rng)
-    offsets = motion_error(joint._start_poses[1])
+    offsets = motion_error(starts_of(joint, 1))
     merged, names = joint.map("mixture"), names_of(joint)
     held = [names[landmark] for landmark in merged.ids.tolist()]
     return nees(offsets.mean(axis=0), np.cov(offsets.T)), mean_nees(merged, [held.index(name) for name in OWN_OF_B])

@@ -3,7 +3,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from mapped_once import LANDMARKS, frame_of
+from mapped_once import LANDMARKS, frame_of, starts_of
 from simulated_team import ASSUMED_CAMERA, MOTION, SimulatedTeam
 from standing_team import SIGMA, STARTS, hand_made, standing_team
 
@@ -91,15 +91,24 @@ def test_a_renaming_names_every_landmark_of_b_s_map() -> None:
         assert looks[landmark] == look
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
-def test_own_start_frames_do_not_jump_at_a_merge(seed: int) -> None:
+def test_own_start_frames_do_not_jump_at_a_merge() -> None:
     """Seen in its own start frame, a robot's pose and map move by no more than their uncertainty.
 
-    Poses: five standard deviations of the pose before and of the start's spread after. Maps: the median landmark
-    by one deviation, every landmark by six.
+    Poses: four standard deviations of the pose before and of the start's spread after. Maps: the median landmark
+    by one deviation on average over three runs and by two in each, every landmark by five. (The most probable
+    particles before and after are two draws of one posterior, which differ by sqrt(2) deviations if they are
+    independent.) Particles are many, because few of them run out of pasts and understate these deviations.
     """
+    medians = [median for seed in (1, 2, 3) for median in jumps_at_a_merge(seed)]
+    assert np.mean(medians) < 1.0
+    assert max(medians) < 2.0
+
+
+def jumps_at_a_merge(seed: int) -> list[float]:
+    """Check one run, and return by how many deviations the median landmark of each robot moved."""
+    medians = []
     simulation = SimulatedTeam(seed=seed)
-    team = simulation.build()
+    team = simulation.build(num_particles=300)
     simulation.run(team, 100, ALONE)
     poses = [team.pose(robot) for robot in range(2)]
     own = [compose(team.start_from_group(robot), poses[robot].mean) for robot in range(2)]
@@ -108,11 +117,11 @@ def test_own_start_frames_do_not_jump_at_a_merge(seed: int) -> None:
     alignment = align_maps(*mixtures)
     assert alignment.success
     new_ids = [{}, dict(team.merge(0, 1, alignment).ids_b.tolist())]
-    spread = np.cov(team._find(1)[0].filter._start_poses[1].T)
+    spread = np.cov(starts_of(team._find(1)[0].filter, 1).T)
     for robot in range(2):
         jump = compose(team.start_from_group(robot), team.pose(robot).mean) - own[robot]
         jump[2] = wrap_angle(jump[2])
-        assert (np.abs(jump) < 5.0 * np.sqrt(np.diag(poses[robot].covariance + spread))).all()
+        assert (np.abs(jump) < 4.0 * np.sqrt(np.diag(poses[robot].covariance + spread))).all()
         joint = team.map(robot).moved(team.start_from_group(robot))
         row_of = {landmark: row for row, landmark in enumerate(joint.ids.tolist())}
         moved = []
@@ -122,8 +131,9 @@ def test_own_start_frames_do_not_jump_at_a_merge(seed: int) -> None:
                 distance = np.linalg.norm(joint.means[after] - maps[robot].means[row])
                 moved.append(distance / np.sqrt(np.trace(mixtures[robot].covariances[row])))
         assert len(moved) > 0.8 * len(maps[robot])
-        assert np.median(moved) < 1.0
-        assert max(moved) < 6.0
+        medians.append(float(np.median(moved)))
+        assert max(moved) < 5.0
+    return medians
 
 
 # ---------------------------------------------------------------------- robots without contact, robots together

@@ -1,0 +1,48 @@
+"""What a filter holds, told apart from where in memory it lies."""
+
+from typing import Any
+
+import numpy as np
+
+from slam_backend.errors import FloatArray
+from slam_backend.filter import FastSlam
+
+
+def contents(slam: FastSlam) -> dict[str, Any]:
+    """Return all of a snapshot, landmarks by ascending id, each at its particle's own place, zeros where it is lacking.
+
+    Places beyond the last particle, which mean nothing, are left out.
+    """
+    ids, means, covariances, counts = slam._dense()  # brings all landmarks to their places
+    state, count, held = slam.get_state(), slam.num_particles, counts > 0
+    maps = state["maps"]
+    np.testing.assert_array_equal(maps["ids"], ids)
+    np.testing.assert_array_equal(maps["map_of"], 0)
+    for name in ("values", "map_of", "maps"):
+        del maps[name]
+    maps["counts"] = counts
+    maps["means"], maps["covariances"] = (np.where(held[:, None], values, 0.0) for values in (means, covariances))
+    if maps.get("odds") is not None:
+        maps["odds"] = np.where(held, maps["odds"][:, :count], 0.0)
+    for name in ("_poses", "_starts", "_means", "_covariances"):
+        state[name] = state[name][:, :, :count]
+    return state
+
+
+def map_of(slam: FastSlam, particle: int) -> FloatArray:
+    """Return (n, 10) what one particle knows of the landmarks it holds: mean, covariance (upper triangle) and count."""
+    _, means, covariances, counts = slam._dense()
+    held = counts[:, particle] > 0
+    columns = (means[held, :, particle], covariances[held, :, particle], counts[held, particle, None])
+    return np.concatenate(columns, axis=1)
+
+
+def arrays_of(slam: FastSlam) -> dict[str, Any]:
+    """Return all arrays that a filter works with, by owner and name: not copies."""
+    owners = {"filter": slam, "maps": slam._maps, "buffers": slam._buffers}
+    return {
+        f"{owner}.{name}": value
+        for owner, holder in owners.items()
+        for name, value in vars(holder).items()
+        if isinstance(value, np.ndarray)
+    }
