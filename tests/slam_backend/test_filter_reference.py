@@ -295,3 +295,16 @@ def test_a_robot_without_sight_is_predicted_alike_in_a_degenerate_way(turn: floa
         step_both(slam, plain, [np.array([0.0, 0.0, -turn])], [None])
     farther = points + np.array([0.0, 0.0, 0.02])
     step_both(slam, plain, [None], [Measurements(farther, np.eye(3))])
+
+
+@pytest.mark.parametrize(("num_displaced", "is_lost"), [(2, False), (3, False), (4, True)])
+def test_half_of_the_measurements_do_not_make_a_robot_lost(
+    happened: Counter[str], num_displaced: int, is_lost: bool
+) -> None:
+    """Of six landmarks, more than half have to lie elsewhere, all by the same motion, before a pose is doubted."""
+    slam, plain = both(1, 3, num_particles=2)
+    points = np.array([[x, 0.1 * x, 2.0] for x in (-0.9, -0.5, -0.2, 0.2, 0.5, 0.9)])
+    step_both(slam, plain, [None], [Measurements(points, np.eye(6))])
+    points[:num_displaced, 2] += 0.15
+    step_both(slam, plain, [None], [Measurements(points, np.eye(6))])
+    assert happened["lost"] == (2 if is_lost else 0)
