@@ -32,6 +32,7 @@ REJECTED = -1
 MIN_DEPTH = 0.05  # [m]; nothing is predicted nearer to the camera plane than this
 MIN_CONTRADICTIONS = 3.0  # three points fix a pose with one to spare
 WIDE_HEADING = 0.03  # [rad]; where the heading is less sure, one step of Gauss-Newton is not enough
+YOUNG = 4  # a landmark seen up to so many times is updated by the iterated EKF: its depth is still vague
 ZERO_PIVOT = 1e-12  # relative to the variance: below it a direction is taken to be exact
 FAR = np.float32(1e18)  # no descriptor comes near a free slot's
 LOG_2PI = math.log(2.0 * math.pi)
@@ -1175,6 +1176,28 @@ def _record_matches(chosen: FloatArray, seen: Int32Array, q: float, mask: FloatA
 
 
 @lanes
+def _find_young(seen: Int32Array, mask: FloatArray, young: FloatArray) -> int:
+    """Write 1 where a matched landmark was seen a few times only; return how many those are."""
+    count = 0
+    for i in range(len(seen)):
+        on = mask[i] > 0.0 and seen[i] <= YOUNG
+        young[i] = 1.0 if on else 0.0
+        count += 1 if on else 0
+    return count
+
+
+@lanes
+def _relinearise(work: FloatArray, tile: FloatArray, before: FloatArray) -> None:
+    """Refer the innovation, taken at the means in `tile`, to those in `before`, which come back (iterated EKF)."""
+    for i in range(LANES):
+        work[R0 + i] += tile[i] - before[i]
+        work[R1 + i] += tile[LANES + i] - before[LANES + i]
+        work[R2 + i] += tile[2 * LANES + i] - before[2 * LANES + i]
+    for j in range(TILE):
+        tile[j] = before[j]
+
+
+@lanes
 def _count_matches(seen: Int32Array, mask: FloatArray) -> None:
     for i in range(len(seen)):
         seen[i] += np.int32(1) if mask[i] > 0.0 else np.int32(0)
@@ -1306,7 +1329,7 @@ def update_fastslam2(
     new_rows = np.empty(num, dtype=np.int64)
     log_clutter = np.empty(num)
     match = np.empty((num, LANES))
-    mask = np.empty(LANES)
+    mask, young, before = np.empty(LANES), np.empty(LANES), np.empty(TILE)
     mean, covariance, draws, out = np.empty(3 * LANES), np.empty(6 * LANES), np.zeros(3 * LANES), np.empty(12 * LANES)
     for b in range(num):
         new_slots[b] = REJECTED
@@ -1447,8 +1470,15 @@ def update_fastslam2(
                 if _mask_of(match[b], float(q), mask) > 0:
                     row = row_of[slots[q]]
                     tile = _tile(values, padded, row, block)
-                    _count_matches(counts[row, first : first + LANES], mask)
+                    seen = counts[row, first : first + LANES]
+                    num_young = _find_young(seen, mask, young)
+                    _count_matches(seen, mask)
                     _innovate(work, tile, points, noises, b, given, camera)
+                    if num_young > 0:
+                        before[:] = tile
+                        _gate_and_update(work, tile, records[q], young, np.inf)
+                        _innovate(work, tile, points, noises, b, given, camera)
+                        _relinearise(work, tile, before)
                     _gate_and_update(work, tile, records[q], mask, np.inf)
             if _mask_of(match[b], -2.0, mask) > 0:
                 if new_slots[b] == REJECTED:

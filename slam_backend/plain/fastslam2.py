@@ -15,6 +15,7 @@ from slam_backend.plain.turn import NEW, REJECTED, Candidates, Landmarks, Turn
 
 WIDE_HEADING = 0.03  # [rad]; a predicted heading less certain than this asks for more iterations
 MORE_ITERATIONS = 3
+YOUNG = 4  # a landmark seen up to so many times is updated by the iterated EKF: its depth is still vague
 
 Gates = dict[tuple[int, int], Innovation]  # by measurement and landmark, for the candidates that can be seen
 
@@ -56,7 +57,7 @@ def fastslam2_turn(
     pose = posterior.sample(normals)
     for b, name in enumerate(chosen):
         if name >= 0:
-            frame.update(pose, landmarks[name], b)
+            frame.update(pose, landmarks[name], b, iterations=2 if landmarks[name].count <= YOUNG else 1)
         elif name != REJECTED:
             landmarks[name] = frame.new_landmark(pose, b)
     distances = [np.nan] * len(frame)

@@ -170,16 +170,23 @@ class Frame:
         to_map = turn @ ROBOT_FROM_CAMERA
         return Landmark(mean, to_map @ noise @ to_map.T)
 
-    def update(self, pose: FloatArray, landmark: Landmark, b: int) -> None:
-        """Improve a landmark by its measurement at a known pose (EKF); one that cannot be seen is only counted."""
+    def update(self, pose: FloatArray, landmark: Landmark, b: int, iterations: int = 1) -> None:
+        """Improve a landmark by its measurement at a known pose (iterated EKF); what cannot be seen is only counted.
+
+        From the second iteration on the model is linearised where the one before has led.
+        """
         landmark.count += 1
-        prediction = self.predict(pose, landmark.mean)
-        if prediction is None:
-            return
-        z_hat, g, _ = prediction
-        sigma = landmark.covariance
-        s = g @ sigma @ g.T + self.noises[b]  # Eq. 7
-        gain = np.linalg.solve(s, g @ sigma).T  # Eq. 8
-        landmark.mean = landmark.mean + gain @ (self.z[b] - z_hat)  # Eq. 9
-        keep = np.eye(3) - gain @ g
-        landmark.covariance = keep @ sigma @ keep.T + gain @ self.noises[b] @ gain.T  # Eq. 10, Joseph's form
+        mean, sigma = landmark.mean, landmark.covariance
+        here = mean
+        for iteration in range(iterations):
+            prediction = self.predict(pose, here)
+            if prediction is None:
+                return
+            z_hat, g, _ = prediction
+            s = g @ sigma @ g.T + self.noises[b]  # Eq. 7
+            gain = np.linalg.solve(s, g @ sigma).T  # Eq. 8
+            here = mean + gain @ (self.z[b] - z_hat - g @ (mean - here))  # Eq. 9
+            if iteration == iterations - 1:
+                keep = np.eye(3) - gain @ g
+                landmark.mean = here
+                landmark.covariance = keep @ sigma @ keep.T + gain @ self.noises[b] @ gain.T  # Eq. 10, Joseph's form
