@@ -167,6 +167,24 @@ def test_what_k_robots_see_together_is_what_one_sees(proposal: Any) -> None:
     np.testing.assert_allclose(a.covariances[order_a], b.covariances[order_b], atol=1e-12)
 
 
+@PROPOSALS
+def test_points_without_appearance_may_be_told_by_names_or_by_place_alone(proposal: Any) -> None:
+    """Descriptors of length 0 all look alike: a filter maps each point once, in bounded memory."""
+    camera = StereoCamera()
+    points = np.array([[0.0, 0.0, 2.0], [1.5, 0.2, 3.0]])
+    frame = Measurements(points, np.empty((2, 0), dtype=np.float32))
+    for names in (None, [[4, 5]]):
+        slam = FastSlam(1, 5, camera, proposal=proposal)
+        slam.step([None], [frame], names)
+        start = slam.nbytes
+        for _ in range(20):
+            report = slam.step([None], [frame], names)
+            np.testing.assert_array_equal(report.associations[0], [0, 1])
+        assert slam.num_landmarks == 2
+        assert slam.map().counts.tolist() == [21, 21]
+        assert slam.nbytes < 2 * start
+
+
 def least_eigenvalue(matrices: FloatArray) -> float:
     """Return the smallest eigenvalue of symmetric matrices (n, 3, 3)."""
     return float(np.linalg.eigvalsh(matrices).min())
