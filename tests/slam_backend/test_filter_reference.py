@@ -21,7 +21,7 @@ from slam_backend.plain import filter as plain_filter
 from slam_backend.reports import StepReport
 from slam_backend.resampling import RESAMPLING
 
-CLOSE = {"rtol": 1e-9, "atol": 1e-9}
+CLOSE = {"rtol": 1e-8, "atol": 1e-8}  # ill-conditioned updates amplify the rounding of either
 UPPER = np.triu_indices(3)
 
 
@@ -230,7 +230,7 @@ KINDS = ("matched", "new", "rejected", "resampled", "sighted after blindness", "
 
 
 def test_compiled_filter_equals_the_plain_one(happened: Counter[str]) -> None:
-    """In small random worlds every decision of every particle is the same, and every number to 1e-9."""
+    """In small random worlds every decision of every particle is the same, and every number to 1e-8."""
     happened.update(run_worlds(range(1000, 1030), (1, 2, 3, 5, 7), 7, 8))
     assert min(happened[kind] for kind in KINDS) > 5, happened
 
