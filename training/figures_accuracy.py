@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, NullFormatter, NullLocator, StrMethodFormatter
+from matplotlib.ticker import FixedLocator, LogLocator, NullFormatter, NullLocator, StrMethodFormatter
 
 from training.accuracy_tables import NAMES, conditions
 from training.accuracy_trials import FILTERS
@@ -71,8 +71,9 @@ def _draw_panel(ax: Axes, lines: Sequence[Mapping[str, Any]], key: str, label: s
     ax.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
     bottom, top = ax.get_ylim()
     if top < 1e3 * bottom:  # else powers of ten are easier to read
+        ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         ax.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-        ax.yaxis.set_minor_formatter(NullFormatter() if top > 30.0 * bottom else StrMethodFormatter("{x:g}"))
+        ax.yaxis.set_minor_formatter(NullFormatter())
     ax.set_xlabel("particles M")
     ax.set_ylabel(label)
     ax.grid(alpha=0.2, which="both")
