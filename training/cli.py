@@ -10,6 +10,7 @@ from training.bench_command import bench
 from training.bench_filter_command import bench_filter
 from training.paper_command import paper
 from training.replay_command import replay_mrclam
+from training.replay_one_command import replay_kitti, replay_victoria
 from training.run import run
 
 app = typer.Typer(
@@ -22,6 +23,8 @@ app = typer.Typer(
 app.command("run")(run)
 replay = typer.Typer(help="Run the backend on the log of real robots.", no_args_is_help=True)
 replay.command("mrclam")(replay_mrclam)
+replay.command("victoria")(replay_victoria)
+replay.command("kitti")(replay_kitti)
 app.add_typer(replay, name="replay")
 bench.command("filter")(bench_filter)
 app.add_typer(bench, name="bench")

@@ -1,4 +1,4 @@
-"""The picture of a replay: paths and maps against the truth, one panel per robot and one for each group's map."""
+"""The picture of a replay: paths and maps against the truth, one panel per robot and one for each joint map."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -32,7 +32,8 @@ def draw_replay(file: Path, log: MrclamLog, replay: Replay, paths: Sequence[Path
         replay: What was estimated.
         paths: Scores of `score_path`, per robot; None where the truth is not known.
     """
-    panels = len(log.robots) + len(replay.groups)
+    joint = [group for group in replay.groups if len(group) > 1]
+    panels = len(log.robots) + len(joint)
     rows = -(-panels // COLUMNS)
     with mpl.rc_context({"font.size": 9, "axes.titlesize": 10}):
         figure = Figure(figsize=(4.6 * COLUMNS, 6.4 * rows), layout="constrained")
@@ -40,7 +41,7 @@ def draw_replay(file: Path, log: MrclamLog, replay: Replay, paths: Sequence[Path
         axes = figure.subplots(rows, COLUMNS, squeeze=False).ravel()
         for robot, ax in enumerate(axes[: len(log.robots)]):
             _draw_robot(ax, log, replay, paths[robot], robot)
-        for group, ax in zip(replay.groups, axes[len(log.robots) : panels], strict=True):
+        for group, ax in zip(joint, axes[len(log.robots) : panels], strict=True):
             _draw_group(ax, log, replay, paths, group)
         for ax in axes[panels:]:
             ax.set_axis_off()
@@ -57,7 +58,7 @@ def _draw_robot(ax: Axes, log: MrclamLog, replay: Replay, path: PathScore | None
         ax.plot(*reckoned.T, color=colour, alpha=0.6, lw=0.9, ls=":", label=f"odometry {path.reckoned_aligned:.2f} m")
         estimated = transform_points(path.world_from_path, replay.paths[robot][:, :2])
         ax.plot(*estimated.T, color=colour, lw=1.0, label=f"estimate {path.ate_aligned:.2f} m")
-    fitted = align_to_truth(replay.maps[robot], log)
+    fitted = align_to_truth(replay.maps[robot], replay.claims[robot], log)
     if fitted is not None:
         _draw_landmarks(ax, fitted.landmarks, colour)
         title += f": map {fitted.score.rmse:.2f} m, {fitted.score.recall:.0%} of landmarks"
@@ -67,10 +68,10 @@ def _draw_robot(ax: Axes, log: MrclamLog, replay: Replay, path: PathScore | None
 def _draw_group(
     ax: Axes, log: MrclamLog, replay: Replay, paths: Sequence[PathScore | None], group: tuple[int, ...]
 ) -> None:
-    """Draw a group's map and its robots' paths, all moved by one fit of the map to the true landmarks."""
+    """Draw the map of several robots and their paths, all moved by one fit of the map to the true landmarks."""
     names = ", ".join(str(log.robots[robot].robot) for robot in group)
     first = group[0]
-    fitted = align_to_truth(replay.maps[first], log)
+    fitted = align_to_truth(replay.maps[first], replay.claims[first], log)
     if fitted is not None:
         for robot in group:
             # The map hangs in the first robot's start frame; the others' start frames follow through the group's.
@@ -82,7 +83,7 @@ def _draw_group(
             label = f"robot {log.robots[robot].robot}"
             ax.plot(*points.T, color=COLOURS[robot % len(COLOURS)], lw=0.7, alpha=0.85, label=label)
         _draw_landmarks(ax, fitted.landmarks, "black")
-    _finish(ax, log, f"joint map of {names}, one fit for all" if len(group) > 1 else f"alone: {names}")
+    _finish(ax, log, f"joint map of {names}, one fit for all")
 
 
 def _draw_landmarks(ax: Axes, landmarks: LandmarkMap, colour: str) -> None:

@@ -1,6 +1,5 @@
 """The command `vslam replay mrclam`: options, live progress, a table, and the run folder."""
 
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -9,7 +8,9 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
+from training.command_options import Config, Duration, Estimator, Json, Out, Seed, finish, gather
 from training.compiling import prepare
+from training.replay_paths import default_path
 
 if TYPE_CHECKING:  # what computes is imported when the command runs, so that --help answers at once
     from slam_backend.readers.mrclam import MrclamLog
@@ -27,48 +28,48 @@ def replay_mrclam(
     robots: Annotated[
         str | None, typer.Option(help="Numbers with commas, e.g. 1,2,5.", show_default="all")
     ] = None,
-    duration: Annotated[
-        float | None, typer.Option(help="Seconds to replay.", show_default="all")
+    truth: Annotated[
+        Path | None, typer.Option(help="File of the true poses of the one robot named.", show_default="the folder's")
+    ] = None,
+    duration: Duration = None,
+    identities: Annotated[
+        str | None, typer.Option(help="given: barcodes are read. hidden: positions alone.", show_default="given")
+    ] = None,
+    alone: Annotated[
+        bool | None, typer.Option("--alone/--team", help="Each robot by itself, or maps merge.", show_default="team")
     ] = None,
     particles: Annotated[
-        int | None, typer.Option(help="Particles per filter.", show_default="100")
+        int | None, typer.Option(help="Particles per filter.", show_default="100 for each robot of a team")
     ] = None,
-    estimator: Annotated[
-        str | None, typer.Option(help="fastslam2 or fastslam1.", show_default="fastslam2")
-    ] = None,
-    seed: Annotated[int | None, typer.Option(help="Of all random draws.", show_default="0")] = None,
-    out: Annotated[
-        Path | None, typer.Option(help="New run folder.", show_default="the next runs/replay-mrclam-*")
-    ] = None,
-    json: Annotated[Path | None, typer.Option(help="Write the metrics to this file too.", show_default=False)] = None,
-    config: Annotated[
-        Path | None,
-        typer.Option(help="config.toml of an earlier run to repeat; other options override it.", show_default=False),
-    ] = None,
+    estimator: Estimator = None,
+    seed: Seed = None,
+    out: Out = None,
+    json: Json = None,
+    config: Config = None,
 ) -> None:
     """Five real robots with unknown starts: a filter each, maps aligned and merged, one team in the end."""
     from slam_backend.readers.mrclam import load_mrclam
     from training.figures_replay import draw_replay
     from training.replay_mrclam import ReplayConfig, replay
     from training.replay_scores import score_path, summarise
-    from training.run_folder import RunFolder, check_writable, plain, read_config, to_json, write_whole
+    from training.run_folder import RunFolder, plain, to_json
 
-    if json is not None and json.parent != out:  # the run's own folder does not exist yet
-        check_writable(json, "json")
-    values: dict[str, Any] = {}
-    if config is not None:
-        values, values["seed"] = read_config(config, COMMAND)
     given = {
-        "path": None if path is None else str(path.resolve()),  # so that the config repeats from any folder
+        "path": path,
         "robots": None if robots is None else parse_numbers(robots),
+        "truth": truth,
         "duration": duration,
+        "identities": identities,
+        "alone": alone,
         "particles": particles,
         "estimator": estimator,
         "seed": seed,
     }
-    values |= {name: value for name, value in given.items() if value is not None}
-    chosen = ReplayConfig.from_mapping({"path": str(default_path()), **values} if "path" not in values else values)
-    log = load_mrclam(chosen.path, chosen.robots, chosen.duration)
+    values = gather(COMMAND, given, config, json, out)
+    if "path" not in values:
+        values["path"] = default_path(DATASET, "the MR.CLAM log")
+    chosen = ReplayConfig.from_mapping(values)
+    log = load_mrclam(chosen.path, chosen.robots, chosen.duration, chosen.truth)
     folder = RunFolder.create(out, COMMAND, chosen.to_mapping(), chosen.seed)
     prepare()
     console = Console()
@@ -76,12 +77,12 @@ def replay_mrclam(
     paths = [score_path(result, robot, own.truth) for robot, own in enumerate(log.robots)]
     scores = plain(summarise(result, log, paths))
     _print_tables(console, scores)
-    metrics = folder.write_metrics(scores)
+    speed = float(result.times[-1] - result.times[0]) / result.seconds
+    console.print(f"The filters took {result.seconds:.1f} s: {speed:.0f} times real time.", highlight=False)
     _write_paths(folder, log, result)
+    folder.write_text("timing.json", to_json({"seconds": result.seconds, "times_real_time": speed}))
     draw_replay(folder.path / "replay.png", log, result, paths)
-    if json is not None:
-        write_whole(json, to_json(metrics), "json")
-    console.print(f"Run folder: {folder.path}", soft_wrap=True, highlight=False)
+    finish(console, folder, folder.write_metrics(scores), json)
 
 
 def parse_numbers(text: str) -> tuple[int, ...]:
@@ -96,20 +97,6 @@ def parse_numbers(text: str) -> tuple[int, ...]:
     if not all(word.strip().isdecimal() for word in words):
         raise bad_argument("robots", "numbers with commas between", repr(text), "Write them like 1,2,5.")
     return tuple(int(word) for word in words)
-
-
-def default_path() -> Path:
-    """Return the folder of the log below the one that the variable VSLAM_DATA names.
-
-    Raises:
-        ValueError: If the variable is not set.
-    """
-    from slam_backend.errors import bad_argument
-
-    data = os.environ.get("VSLAM_DATA")
-    if not data:
-        raise bad_argument("path", "a folder of the MR.CLAM log", "no --path", "Name it, or set VSLAM_DATA.")
-    return Path(data).resolve() / DATASET
 
 
 def _replay_live(console: Console, log: "MrclamLog", config: "ReplayConfig", replay: Any) -> "Replay":

@@ -45,10 +45,10 @@ class PathScore:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AlignedMap:
-    """A map fitted to the true landmarks by their barcodes.
+    """A map fitted to the true landmarks that its own claim to be.
 
     Attributes:
-        world_from_map: (3,) float64 [m, m, rad]. The fit, over one landmark per barcode: the one seen most.
+        world_from_map: (3,) float64 [m, m, rad]. The fit, over one landmark per true one: the one seen most.
         landmarks: The map in the world frame.
         claims: (N,) int64. Row in `MrclamLog.positions` of each landmark.
         score: RMS error, recall and precision after the fit, in the plane.
@@ -85,9 +85,12 @@ def score_path(replay: Replay, robot: int, truth: Trajectory | None) -> PathScor
     )
 
 
-def align_to_truth(landmarks: LandmarkMap, log: MrclamLog) -> AlignedMap | None:
-    """Fit a map to the true landmarks; None if it holds fewer than two different barcodes."""
-    claims = landmarks.descriptors.argmax(axis=1) if len(landmarks) else np.empty(0, dtype=np.int64)
+def align_to_truth(landmarks: LandmarkMap, claims: IntArray, log: MrclamLog) -> AlignedMap | None:
+    """Fit a map with claims (N,), rows of `MrclamLog.positions`, to the true landmarks.
+
+    Returns:
+        The fitted map; None if it claims fewer than two different landmarks.
+    """
     by_count = np.argsort(-landmarks.counts, kind="stable")
     barcodes, first = np.unique(claims[by_count], return_index=True)
     if len(barcodes) < 2:
@@ -95,8 +98,7 @@ def align_to_truth(landmarks: LandmarkMap, log: MrclamLog) -> AlignedMap | None:
     most_seen = by_count[first]
     fit = align_se2(log.positions[barcodes], landmarks.means[most_seen, :2])
     moved = landmarks.moved(fit)
-    score = map_rmse(_flat(moved.means), _flat(log.positions), claims.astype(np.int64))
-    return AlignedMap(fit, moved, claims.astype(np.int64), score)
+    return AlignedMap(fit, moved, claims, map_rmse(_flat(moved.means), _flat(log.positions), claims))
 
 
 def merge_error(merge: Merge, log: MrclamLog) -> tuple[float, float] | None:
@@ -105,7 +107,8 @@ def merge_error(merge: Merge, log: MrclamLog) -> tuple[float, float] | None:
     The true motion between two maps is that between their fits to the true landmarks. The true start poses do not
     give it, because each map is turned about its start by what its first steps got wrong.
     """
-    fit_a, fit_b = align_to_truth(merge.map_a, log), align_to_truth(merge.map_b, log)
+    fit_a = align_to_truth(merge.map_a, merge.claims_a, log)
+    fit_b = align_to_truth(merge.map_b, merge.claims_b, log)
     if fit_a is None or fit_b is None:
         return None
     true = between(fit_a.world_from_map, fit_b.world_from_map)
@@ -127,8 +130,9 @@ def summarise(replay: Replay, log: MrclamLog, paths: Sequence[PathScore | None])
     nan = float("nan")
     robots = []
     for robot, path in enumerate(paths):
-        aligned = align_to_truth(replay.maps[robot], log)
-        start_error, start_rmse = _start_frame_errors(replay.maps[robot], path, log) if path else (nan, nan)
+        own_map, claims = replay.maps[robot], replay.claims[robot]
+        aligned = align_to_truth(own_map, claims, log)
+        start_error, start_rmse = _start_frame_errors(own_map, claims, path, log) if path else (nan, nan)
         robots.append(
             {
                 "robot": numbers[robot],
@@ -165,9 +169,10 @@ def summarise(replay: Replay, log: MrclamLog, paths: Sequence[PathScore | None])
     }  # fmt: skip
 
 
-def _start_frame_errors(landmarks: LandmarkMap, path: PathScore, log: MrclamLog) -> tuple[float, float]:
+def _start_frame_errors(
+    landmarks: LandmarkMap, claims: IntArray, path: PathScore, log: MrclamLog
+) -> tuple[float, float]:
     """Return map error and RMSE [m] with the start frame at the true start pose, without any fitting."""
-    claims = landmarks.descriptors.argmax(axis=1).astype(np.int64) if len(landmarks) else np.empty(0, dtype=np.int64)
     means, truths = _flat(landmarks.moved(path.world_from_start).means), _flat(log.positions)
     return map_error(means, claims, truths), map_rmse(means, truths, claims).rmse
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
+from training.command_options import Config, Json, Out, Particles, Seed, finish, gather
 from training.compiling import prepare
 
 if TYPE_CHECKING:  # what computes is imported when the command runs, so that --help answers at once
@@ -25,33 +26,25 @@ def run(
     policy: Annotated[
         str | None, typer.Option(help="frontier, random_goals or random_walk.", show_default="frontier")
     ] = None,
-    seed: Annotated[int | None, typer.Option(help="Of all random draws.", show_default="0")] = None,
+    seed: Seed = None,
     action_type: Annotated[
         str | None, typer.Option(help="continuous, discrete or goal.", show_default="continuous")
     ] = None,
     max_cycles: Annotated[int | None, typer.Option(help="Steps of the episode.", show_default="180 s worth")] = None,
-    particles: Annotated[int | None, typer.Option(help="Particles per filter.", show_default="100")] = None,
+    particles: Particles = None,
     preset: Annotated[str | None, typer.Option(help="easy, standard or hard noise.", show_default="standard")] = None,
-    out: Annotated[Path | None, typer.Option(help="New run folder.", show_default="the next runs/run-*")] = None,
-    json: Annotated[Path | None, typer.Option(help="Write the metrics to this file too.", show_default=False)] = None,
+    out: Out = None,
+    json: Json = None,
     video: Annotated[bool, typer.Option(help="Whether to film the run.")] = True,
-    config: Annotated[
-        Path | None,
-        typer.Option(help="config.toml of an earlier run to repeat; other options override it.", show_default=False),
-    ] = None,
+    config: Config = None,
 ) -> None:
     """Robots that do not know where they start explore a building, map it, and join their maps."""
     from training.episode_scores import score_episode
     from training.figures import draw_errors, draw_maps
     from training.run_config import RunConfig
-    from training.run_folder import RunFolder, check_writable, plain, read_config, to_json, write_whole
+    from training.run_folder import RunFolder, plain
     from training.run_tables import print_tables
 
-    if json is not None and json.parent != out:  # the run's own folder does not exist yet
-        check_writable(json, "json")
-    values: dict[str, Any] = {}
-    if config is not None:
-        values, values["seed"] = read_config(config, COMMAND)
     given = {
         "world": world,
         "robots": robots,
@@ -62,7 +55,7 @@ def run(
         "particles": particles,
         "preset": preset,
     }
-    chosen = RunConfig.from_mapping(values | {name: value for name, value in given.items() if value is not None})
+    chosen = RunConfig.from_mapping(gather(COMMAND, given, config, json, out))
     env = chosen.make_env()
     policies = chosen.make_policies(env)
     prepare(lambda: _first_steps(env, policies, chosen.seed))  # a bad world shows before there is a folder
@@ -76,9 +69,7 @@ def run(
     _write_paths(folder, record)
     draw_maps(record, folder.path / "map.png")
     draw_errors(record, folder.path / "error.png")
-    if json is not None:
-        write_whole(json, to_json(metrics), "json")
-    console.print(f"Run folder: {folder.path}", soft_wrap=True, highlight=False)
+    finish(console, folder, metrics, json)
 
 
 def _first_steps(env: Any, policies: Any, seed: int) -> None:

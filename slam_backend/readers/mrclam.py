@@ -45,7 +45,12 @@ class MrclamLog:
     positions: FloatArray
 
 
-def load_mrclam(path: str | Path, robots: Sequence[int] | None = None, duration: float | None = None) -> MrclamLog:
+def load_mrclam(
+    path: str | Path,
+    robots: Sequence[int] | None = None,
+    duration: float | None = None,
+    truth: str | Path | None = None,
+) -> MrclamLog:
     """Read a folder such as `MRCLAM_Dataset7`.
 
     Args:
@@ -53,13 +58,15 @@ def load_mrclam(path: str | Path, robots: Sequence[int] | None = None, duration:
             `Robot<i>_Measurement.dat` and, where known, `Robot<i>_Groundtruth.dat`.
         robots: Numbers of the robots to read, 1 to 5, each once. None: all whose odometry is there.
         duration: Keep this many seconds from the earliest command on [s]. None: all.
+        truth: A file of the true poses of the one robot that is read, for folders that lack it: rows of time, x, y and
+            heading, with blanks or commas between, perhaps below a line of names. None: the folder's own, where known.
 
     Returns:
         The log. True poses are kept whole, so that any time of the kept readings can be looked up.
 
     Raises:
         ValueError: If the folder or a file is missing, a line is malformed (the text names file and line), times go
-            back, a robot is unknown, or a sighted landmark has no true position.
+            back, a robot is unknown, a sighted landmark has no true position, or `truth` is given for several robots.
     """
     folder = Path(path)
     if not folder.is_dir():
@@ -77,7 +84,13 @@ def load_mrclam(path: str | Path, robots: Sequence[int] | None = None, duration:
             f"Add it to {folder / 'Landmark_Groundtruth.dat'}.",
         )  # fmt: skip
     positions = np.array([place_of[int(subject)] for subject in subjects]).reshape(-1, 2)
-    logs = [_read_robot(folder, robot, subject_of) for robot in numbers]
+    if truth is not None and len(numbers) != 1:
+        cure = "Name the robot whose poses these are with robots."
+        raise bad_argument("truth", "a file of one robot's poses", f"a log of robots {numbers}", cure)
+    if truth is not None and not Path(truth).is_file():
+        raise bad_argument("truth", "a file of true poses", "no such file", f"Check {str(truth)!r}.")
+    truths = {numbers[0]: Path(truth)} if truth is not None else {}
+    logs = [_read_robot(folder, robot, subject_of, truths.get(robot)) for robot in numbers]
     if duration is not None:
         seconds = check_float("duration", duration, "Give seconds, or None for the whole log.", above=0.0)
         start = min(log.commands[0, 0] for log in logs)
@@ -102,15 +115,15 @@ def _check_robots(folder: Path, robots: Sequence[int] | None) -> tuple[int, ...]
     return numbers
 
 
-def _read_robot(folder: Path, robot: int, subject_of: dict[int, int]) -> RobotLog:
+def _read_robot(folder: Path, robot: int, subject_of: dict[int, int], truth_file: Path | None) -> RobotLog:
     commands = _read_table(folder / f"Robot{robot}_Odometry.dat", ("time", "velocity", "angular_velocity"))
     rows = _read_table(folder / f"Robot{robot}_Measurement.dat", ("time", "barcode", "range", "bearing"), empty=True)
     seen = np.array([subject_of.get(int(barcode), 0) for barcode in rows[:, 1]], dtype=np.float64)
     sightings = np.column_stack([rows[:, 0], seen, rows[:, 2:]])[seen > max(ROBOTS)]
-    truth_file = folder / f"Robot{robot}_Groundtruth.dat"
+    own = folder / f"Robot{robot}_Groundtruth.dat"
     truth = None
-    if truth_file.is_file():
-        poses = _read_table(truth_file, ("time", "x", "y", "theta"))
+    if truth_file is not None or own.is_file():
+        poses = _read_table(own if truth_file is None else truth_file, ("time", "x", "y", "theta"))
         fresh = np.diff(poses[:, 0], prepend=-np.inf) > 0.0  # a repeated stamp says nothing new
         truth = Trajectory(poses[fresh, 0], poses[fresh, 1:])
     return RobotLog(robot, commands, sightings, truth)
@@ -125,7 +138,9 @@ def _cut(log: RobotLog, end: float) -> RobotLog:
 
 
 def _read_table(file: Path, columns: tuple[str, ...], empty: bool = False) -> FloatArray:
-    """Return the rows (n, columns) of a file of numbers; comments after `#` and empty lines are skipped.
+    """Return the rows (n, columns) of a file of numbers, with blanks or commas between.
+
+    Comments after `#`, empty lines and a first line of names are skipped.
 
     Raises:
         ValueError: If the file is missing or, unless `empty` says otherwise, has no rows; if a line does not hold one
@@ -138,7 +153,7 @@ def _read_table(file: Path, columns: tuple[str, ...], empty: bool = False) -> Fl
     numbers: list[int] = []
     for number, line in enumerate(lines, start=1):
         body = line.partition("#")[0]
-        if body.strip():
+        if body.strip() and not (number == 1 and _names(body)):
             row = _parse(body)
             if row is None or len(row) != len(columns):
                 raise _bad_line(file, number, line, columns, "")
@@ -166,12 +181,17 @@ def _faults(table: FloatArray, columns: tuple[str, ...]) -> Iterator[tuple[str, 
             yield "a time not before that of the line above", np.diff(column, prepend=-np.inf) < 0.0
 
 
+def _names(body: str) -> bool:
+    """Tell whether a line holds words with commas between, none of which spells a number."""
+    return "," in body and all(_parse(word) is None for word in body.split(","))
+
+
 def _parse(body: str) -> list[float] | None:
     """Return the numbers that a line spells, or None if a word spells none."""
     if "_" in body:  # Python reads 1_000 as a number, a log that holds it is damaged
         return None
     try:
-        return [float(word) for word in body.split()]
+        return [float(word) for word in (body.split(",") if "," in body else body.split())]
     except ValueError:
         return None
 

@@ -10,7 +10,8 @@ from slam_backend.camera import StereoCamera
 from slam_backend.geometry import between, compose
 from slam_backend.metrics import ate
 from slam_backend.readers.mrclam import MrclamLog, RobotLog, load_mrclam
-from slam_backend.readers.mrclam_steps import HOLD, SightingNoise, integrate_commands, steps
+from slam_backend.readers.mrclam_steps import SightingNoise, steps
+from slam_backend.readers.velocities import HOLD, integrate_commands
 from slam_backend.trajectory import dead_reckoning
 
 FILES = {

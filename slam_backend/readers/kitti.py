@@ -1,0 +1,162 @@
+"""Tracked stereo features of a KITTI drive with its velocities: strict reading of the archive and of the true poses.
+
+The archive is that of UCSD's course ECE 276A: an extract of KITTI raw data (Geiger et al., IJRR 2013) whose features
+were tracked from frame to frame, so that a track's number is a landmark's identity. A track that ends never comes back.
+"""
+
+import zipfile
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from slam_backend.errors import FloatArray, IntArray, bad_argument, check_float
+from slam_backend.trajectory import Trajectory
+
+KEYS = ("time_stamps", "features", "linear_velocity", "rotational_velocity", "K", "b", "cam_T_imu")
+UNREADABLE = (OSError, ValueError, KeyError, EOFError, TypeError, RuntimeError, zipfile.BadZipFile, zlib.error)
+ABSENT = -1.0  # fills the four pixels of a track in frames that do not show it
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KittiLog:
+    """What a car with a stereo pair and an inertial unit recorded. The arrays are read-only.
+
+    Attributes:
+        times: (T,) float64 [s]. Of the frames, strictly increasing.
+        velocities: (T, 6) float64 [m/s, rad/s]. Linear, then angular velocity, axes of the unit: ahead, left, up.
+        tracks: T arrays (n,) int64. Numbers of the tracks that a frame shows.
+        pixels: T arrays (n, 4) float64 [px]. Their column and row in the left image, then in the right one.
+        focal_px: Focal length [px]; pixels are square.
+        centre_px: (2,) float64 [px]. Column and row of the optical axis.
+        baseline: Distance between the two eyes [m].
+        unit_from_camera: (3, 3) float64. Rotation from the camera's axes (right, down, ahead) to the unit's.
+        mount: (3,) float64 [m]. Where the left camera is, axes of the unit.
+        truth: Poses of the left camera in the plane of its first one, x ahead, y left; None where not known.
+    """
+
+    times: FloatArray
+    velocities: FloatArray
+    tracks: tuple[IntArray, ...]
+    pixels: tuple[FloatArray, ...]
+    focal_px: float
+    centre_px: FloatArray
+    baseline: float
+    unit_from_camera: FloatArray
+    mount: FloatArray
+    truth: Trajectory | None
+
+
+def load_kitti(path: str | Path, truth: str | Path | None = None, duration: float | None = None) -> KittiLog:
+    """Read an archive such as `0027.npz`.
+
+    The translation in `cam_T_imu` is read as the camera's place in the axes of the unit, (1.14, -0.31, 0.73) m in
+    `0027.npz`: that is where KITTI's cars carry it, and how it moves in turns; read as the name suggests it would lie
+    behind the unit.
+
+    Args:
+        path: The archive, or a folder with just one.
+        truth: File of the true poses, one per frame: rows of a 3 x 4 matrix, perhaps after a time. None: that in the
+            folder `poses` beside the archive if there is just one, else unknown.
+        duration: Keep this many seconds [s]. None: all.
+
+    Raises:
+        ValueError: If a file is missing or cannot be read, an array is missing, has another shape or impossible
+            numbers, or times go back; the text names the file.
+    """
+    file = _find(Path(path))
+    content = _read(file)
+    times = np.asarray(content["time_stamps"], dtype=np.float64).ravel()
+    _check(file, "time_stamps", len(times) > 1 and bool((np.diff(times) > 0.0).all()), "two or more rising times")
+    end = times[-1] if duration is None else times[0] + check_float("duration", duration, "Give seconds.", above=0.0)
+    count = len(times)
+    features = content["features"]
+    shaped = features.ndim == 3 and features.shape[0] == 4 and features.shape[2] == count
+    _check(file, "features", shaped, f"an array (4, n, {count}), four pixels of each track in each frame")
+    for name in ("linear_velocity", "rotational_velocity"):
+        _check(file, name, content[name].shape == (3, count), f"an array (3, {count})")
+    intrinsics, baseline, camera = content["K"], content["b"], content["cam_T_imu"]
+    square = intrinsics.shape == (3, 3) and np.isclose(intrinsics[0, 0], intrinsics[1, 1], rtol=0.01)
+    _check(file, "K", square and intrinsics[0, 0] > 0.0, "a 3 x 3 matrix of square pixels")
+    _check(file, "b", baseline.size == 1 and float(baseline.ravel()[0]) > 0.0, "a positive distance")
+    rigid = camera.shape == (4, 4) and np.allclose(camera[:3, :3] @ camera[:3, :3].T, np.eye(3), atol=1e-3)
+    _check(file, "cam_T_imu", rigid, "a 4 x 4 rigid motion")
+    keep = int(np.searchsorted(times, end, side="right"))
+    shown = [np.flatnonzero((features[:, :, k] != ABSENT).all(axis=0)) for k in range(keep)]
+    velocities = np.concatenate([content["linear_velocity"], content["rotational_velocity"]]).T[:keep].copy()
+    pixels = [features[:, rows, k].T.copy() for k, rows in enumerate(shown)]
+    for array in (times, velocities, *shown, *pixels):
+        array.setflags(write=False)
+    return KittiLog(
+        times=times[:keep],
+        velocities=velocities,
+        tracks=tuple(shown),
+        pixels=tuple(pixels),
+        focal_px=float(intrinsics[0, 0]),
+        centre_px=intrinsics[:2, 2].copy(),
+        baseline=float(baseline.ravel()[0]),
+        unit_from_camera=camera[:3, :3].T.copy(),
+        mount=camera[:3, 3].copy(),
+        truth=_read_truth(_find_truth(file, truth), times),
+    )
+
+
+def _find(path: Path) -> Path:
+    """Return the archive that a path names, or the only one in a folder."""
+    found = sorted(path.glob("*.npz")) if path.is_dir() else [path]
+    if len(found) != 1 or not found[0].is_file():
+        got = f"a folder with {len(found)} of them" if path.is_dir() else "no such file"
+        expected = "an archive (.npz) of KITTI features, or a folder with one"
+        raise bad_argument("path", expected, got, f"Check {str(path)!r}.")
+    return found[0]
+
+
+def _find_truth(file: Path, truth: str | Path | None) -> Path | None:
+    """Return the file of true poses, if there is one."""
+    if truth is None:
+        found = sorted((file.parent / "poses").glob("*.txt"))
+        return found[0] if len(found) == 1 else None
+    if not Path(truth).is_file():
+        raise bad_argument("truth", "a file of true poses", "no such file", f"Check {str(truth)!r}.")
+    return Path(truth)
+
+
+def _read(file: Path) -> dict[str, FloatArray]:
+    """Return the arrays of the archive; all are finite numbers."""
+    try:
+        with np.load(file, allow_pickle=False) as archive:
+            missing = [key for key in KEYS if key not in archive]
+            content = {} if missing else {key: np.asarray(archive[key], dtype=np.float64) for key in KEYS}
+    except UNREADABLE as error:
+        raise bad_argument("path", "a numpy archive", "a broken file", f"Get {str(file)!r} again.") from error
+    if missing:
+        expected = f"{file.name} with the arrays {', '.join(KEYS)}"
+        raise bad_argument("path", expected, f"no array {missing[0]!r}", f"Get {str(file)!r} again.")
+    for key, values in content.items():
+        _check(file, key, bool(np.isfinite(values).all()), "finite numbers")
+    return content
+
+
+def _read_truth(file: Path | None, times: FloatArray) -> Trajectory | None:
+    """Return the true path in the plane: KITTI's z is ahead, its x to the right, its heading that of the z axis."""
+    if file is None:
+        return None
+    expected = f"{file.name} with rows of 12 numbers, or 13 with a time, one for each frame"
+    cure = f"Correct {str(file)!r}."
+    try:
+        rows = np.array([[float(w) for w in line.split()] for line in file.read_text("utf-8").splitlines() if line])
+    except ValueError as error:
+        raise bad_argument("truth", expected, "a row that is no such", cure) from error
+    shaped = rows.ndim == 2 and rows.shape[1] in (12, 13) and 1 < len(rows) <= len(times)
+    if not shaped or not np.isfinite(rows).all():
+        raise bad_argument("truth", expected, f"an array {rows.shape} for {len(times)} frames", cure)
+    matrices = rows[:, -12:].reshape(-1, 3, 4)
+    heading = np.arctan2(-matrices[:, 0, 2], matrices[:, 2, 2])
+    return Trajectory(times[: len(rows)], np.stack([matrices[:, 2, 3], -matrices[:, 0, 3], heading], axis=-1))
+
+
+def _check(file: Path, key: str, fine: bool, expected: str) -> None:
+    if not fine:
+        cure = f"Get {str(file)!r} again."
+        raise bad_argument("path", f"{file.name} with {expected} in {key!r}", "another content", cure)

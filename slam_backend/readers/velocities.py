@@ -1,0 +1,45 @@
+"""Velocities over time become poses: exact arcs, each held until the next reading."""
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from slam_backend.errors import FloatArray, bad_argument, check_array
+from slam_backend.geometry import compose, rotation
+
+HOLD = 1.5  # [s] a velocity older than this no longer moves the robot
+
+
+def integrate_commands(commands: ArrayLike, times: ArrayLike, hold: float = HOLD) -> FloatArray:
+    """Follow velocities exactly along their arcs; one holds until the next, but no longer than `hold`.
+
+    Args:
+        commands: (n, 3) float64 [s, m/s, rad/s]. Time, forward and angular velocity, ordered by time, n >= 1.
+        times: (T,) float64 [s], any order. Before the first command the robot stands.
+        hold: Longest time that a command moves the robot [s].
+
+    Returns:
+        (T, 3) poses at these times in the robot's start frame.
+
+    >>> integrate_commands([[0.0, 1.0, 0.0], [2.0, 0.0, 1.0]], [1.0, 5.0], hold=3.0).tolist()
+    [[1.0, 0.0, 0.0], [2.0, 0.0, 3.0]]
+    """
+    table: FloatArray = check_array("commands", commands, (None, 3), "Give rows (time, velocity, angular velocity).")
+    wanted: FloatArray = check_array("times", times, (None,), "Give times in seconds.")
+    if not len(table):
+        raise bad_argument("commands", "at least one row", "no row", "Give the robot's first command.")
+    held = np.minimum(np.diff(table[:, 0]), hold)
+    headings = np.concatenate([[0.0], np.cumsum(table[:-1, 2] * held)])
+    chords = arc(table[:-1, 1], table[:-1, 2], held)
+    moved = (rotation(headings[:-1]) @ chords[:, :2, None])[..., 0]
+    knots = np.column_stack([np.concatenate([np.zeros((1, 2)), np.cumsum(moved, axis=0)]), headings])
+    last = np.searchsorted(table[:, 0], wanted, side="right") - 1
+    row = np.maximum(last, 0)
+    since = np.where(last < 0, 0.0, np.minimum(wanted - table[row, 0], hold))
+    return compose(knots[row], arc(table[row, 1], table[row, 2], since))
+
+
+def arc(velocity: FloatArray, angular_velocity: FloatArray, duration: FloatArray) -> FloatArray:
+    """Return the motions (n, 3) of a unicycle at constant velocities (n,) [m/s, rad/s] during (n,) seconds."""
+    turn = angular_velocity * duration
+    chord = velocity * duration * np.sinc(turn / (2.0 * np.pi))  # numpy's sinc is sin(pi x) / (pi x)
+    return np.stack([chord * np.cos(0.5 * turn), chord * np.sin(0.5 * turn), turn], axis=-1)

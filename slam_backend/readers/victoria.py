@@ -1,0 +1,141 @@
+"""The log of the vehicle in Victoria Park: strict reading of its controls, the trees it saw, and its GPS fixes.
+
+J. Guivant and E. Nebot, Australian Centre for Field Robotics, University of Sydney; the files and what they hold are
+described in the data set's `info.txt`.
+"""
+
+import warnings
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.io import loadmat
+
+from slam_backend.errors import FloatArray, bad_argument, check_float
+
+CONTROLS_FILE = "aa3_dr.mat"
+TREES_FILE = "VictoriaParkSinSincronizar.mat"
+GPS_FILE = "aa3_gpsx.mat"
+MAX_STEERING = 1.0  # [rad], more than any car's wheels turn
+MILLISECONDS = 1e-3  # [s], the unit of time of the files of controls and GPS; that of trees counts seconds
+# What scipy raises on files that are truncated, damaged, of another kind, or of MATLAB's HDF5 format.
+UNREADABLE = (OSError, ValueError, KeyError, EOFError, TypeError, IndexError, NotImplementedError, zlib.error)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class VictoriaLog:
+    """What a car-like vehicle recorded among trees. The arrays are read-only; times never go back, and share a clock.
+
+    Attributes:
+        controls: (n, 3) float64 [s, m/s, rad]. Time, speed of the rear left wheel, steering angle (positive left).
+        scan_times: (T,) float64 [s]. One for each laser scan.
+        scans: T arrays (k, 3) float64 [m, rad, m]: range, bearing and diameter of each tree that was made out;
+            bearings are positive to the left of straight ahead.
+        gps: (g, 3) float64 [s, m, m]. Time, east, north of each fix; there are holes between them.
+    """
+
+    controls: FloatArray
+    scan_times: FloatArray
+    scans: tuple[FloatArray, ...]
+    gps: FloatArray
+
+
+def load_victoria(path: str | Path, duration: float | None = None) -> VictoriaLog:
+    """Read a folder such as that of the Victoria Park data set.
+
+    Args:
+        path: Folder with `aa3_dr.mat` (`time` [ms], `speed`, `steering`), `VictoriaParkSinSincronizar.mat` (`TLsr` [s],
+            `zt`: per scan rows of range, bearing from the right hand side, diameter) and `aa3_gpsx.mat` (`timeGps`
+            [ms], `Lo_m`, `La_m`).
+        duration: Keep this many seconds from the first control on [s]. None: all.
+
+    Raises:
+        ValueError: If the folder, a file or a variable in it is missing, a file cannot be read, numbers are not finite
+            or impossible, lengths disagree or times go back; the text names the file.
+    """
+    folder = Path(path)
+    if not folder.is_dir():
+        raise bad_argument("path", "a folder of the Victoria Park log", "no such folder", f"Check {str(path)!r}.")
+    end = np.inf
+    driven = _read(folder / CONTROLS_FILE, ("time", "speed", "steering"))
+    controls = _table(folder / CONTROLS_FILE, driven, ("time", "speed", "steering"), MILLISECONDS)
+    if np.abs(controls[:, 2]).max() > MAX_STEERING:
+        raise _bad(folder / CONTROLS_FILE, f"steering angles within +-{MAX_STEERING:g} rad", "a larger one")
+    if duration is not None:
+        end = controls[0, 0] + check_float("duration", duration, "Give seconds, or None for the whole log.", above=0.0)
+    found = _read(folder / TREES_FILE, ("TLsr", "zt"))
+    times = _table(folder / TREES_FILE, found, ("TLsr",), 1.0)[:, 0]
+    cells = found["zt"].ravel()
+    if found["zt"].dtype != object or len(cells) != len(times):
+        raise _bad(folder / TREES_FILE, f"a cell array zt with one cell for each of {len(times)} times", "another")
+    scans = [_trees(folder / TREES_FILE, number, cell) for number, cell in enumerate(cells)]
+    fixes = _read(folder / GPS_FILE, ("timeGps", "Lo_m", "La_m"))
+    gps = _table(folder / GPS_FILE, fixes, ("timeGps", "Lo_m", "La_m"), MILLISECONDS)
+    kept = int(np.searchsorted(times, end, side="right"))
+    if not kept:
+        raise bad_argument("duration", "long enough for a scan", duration, f"The first one is at {times[0]:.1f} s.")
+    controls, times = controls[controls[:, 0] <= end], times[:kept]
+    for array in (controls, times, gps, *scans):
+        array.setflags(write=False)
+    return VictoriaLog(controls, times, tuple(scans[:kept]), gps)
+
+
+def _read(file: Path, names: tuple[str, ...]) -> dict[str, Any]:
+    """Return the named variables of a MATLAB file."""
+    if not file.is_file():
+        raise bad_argument("path", f"a folder with {file.name}", "no such file", f"Check {str(file)!r}.")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # scipy warns of what it cannot make out
+            content = loadmat(file, variable_names=names)
+    except (*UNREADABLE, Warning) as error:
+        raise _bad(file, "a MATLAB file of version 5 to 7.2", "a broken file") from error
+    missing = [name for name in names if name not in content]
+    if missing:
+        raise _bad(file, "variables " + ", ".join(names), f"no variable {missing[0]!r}")
+    return {name: content[name] for name in names}
+
+
+def _table(file: Path, content: dict[str, Any], names: tuple[str, ...], unit: float) -> FloatArray:
+    """Return variables as columns (n, names), the first one being times in `unit` seconds."""
+    columns = []
+    for name in names:
+        values = content[name]
+        if values.dtype.kind not in "iuf" or values.size != max(values.shape) or not values.size:
+            raise _bad(file, f"a row or column of numbers {name}", f"an array {values.dtype} {values.shape}")
+        columns.append(values.ravel().astype(np.float64))
+    if len({len(column) for column in columns}) > 1:
+        lengths = ", ".join(f"{len(column)} {name}" for name, column in zip(names, columns, strict=True))
+        raise _bad(file, "as many values of each variable", f"'{lengths}'")
+    table = np.stack(columns, axis=-1)
+    if not np.isfinite(table).all():
+        raise _bad(file, "finite numbers", f"NaN or infinity in {names[int(np.argwhere(~np.isfinite(table))[0][1])]}")
+    table[:, 0] *= unit
+    backwards = np.flatnonzero(np.diff(table[:, 0]) < 0.0)
+    if len(backwards):
+        later = int(backwards[0]) + 1
+        got = f"a time {table[later, 0]:.3f} s after {table[later - 1, 0]:.3f} s at index {later}"
+        raise _bad(file, f"times {names[0]} that never go back", got)
+    return table
+
+
+def _trees(file: Path, number: int, cell: Any) -> FloatArray:
+    """Return the trees (k, 3) of a scan, bearings positive to the left of straight ahead."""
+    if cell.size == 0:
+        return np.empty((0, 3))
+    if cell.ndim != 2 or cell.shape[0] != 3 or cell.dtype.kind not in "iuf":
+        got = f"an array {cell.dtype} {cell.shape} in cell {number}"
+        raise _bad(file, "rows of range, bearing and diameter in each cell of zt", got)
+    trees: FloatArray = cell.T.astype(np.float64)
+    if not np.isfinite(trees).all() or (trees[:, 0] <= 0.0).any() or (trees[:, 2] < 0.0).any():
+        raise _bad(file, "finite numbers, ranges > 0 and diameters >= 0 in zt", f"a row that is not in cell {number}")
+    if (trees[:, 1] < 0.0).any() or (trees[:, 1] > np.pi).any():
+        raise _bad(file, "bearings from 0 to pi in zt", f"a bearing outside in cell {number}")
+    trees[:, 1] -= 0.5 * np.pi
+    return trees
+
+
+def _bad(file: Path, expected: str, got: str) -> ValueError:
+    return bad_argument("path", f"{file.name} with {expected}", got, f"Get {str(file)!r} again.")

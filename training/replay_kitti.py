@@ -1,0 +1,166 @@
+"""The replay of a KITTI drive: tracked stereo features, whose tracks are the landmarks, in the plane."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal, Self
+
+import numpy as np
+
+from slam_backend.errors import FloatArray, check_float
+from slam_backend.filter import FastSlam
+from slam_backend.filter_options import FilterOptions
+from slam_backend.geometry import between, compose, inverse
+from slam_backend.readers.kitti import KittiLog
+from slam_backend.readers.kitti_steps import make_camera, motion_noise, steps
+from training.replay_config import check_common, from_plain, to_plain
+from training.replay_one import PLANAR_GATE, OneReplay, PositionScore, replay_one, score_positions
+
+# A track has its number for a descriptor, so that none is taken for another, and unlike a given identity leaves the
+# gate in force: tracks on other cars are refused, and a refused track never starts a second landmark.
+OWN_TRACK = 0.5
+DEAD_ZONE = 1e9
+# Other cars can outvote what stands: the pose is not widened because most tracks contradict it.
+RECOVERY_POSITION = 0.0
+LOOP_AFTER = 100.0  # [m] driven before a place counts as seen again
+LOOP_WITHIN = 10.0  # [m] between two poses of one place
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class KittiConfig:
+    """All that decides a replay of such a drive; the noise of its velocities is read off the log itself.
+
+    Attributes:
+        path: The archive, or the folder with it.
+        truth: File of the true poses, or None for that beside the archive.
+        duration: Seconds to replay [s], or None for all.
+        particles: Of the filter.
+        estimator: Its proposal.
+        seed: Of all random draws.
+        sigma_px: Assumed standard deviation of a feature's column [px]: features creep along while they are tracked.
+        sigma_disparity_px: Assumed standard deviation of its disparity [px]. The rows of both images, which should
+            agree, differ by 0.38 px in `0027.npz`.
+    """
+
+    path: str
+    truth: str | None = None
+    duration: float | None = None
+    particles: int = 100
+    estimator: Literal["fastslam2", "fastslam1"] = "fastslam2"
+    seed: int = 0
+    sigma_px: float = 1.0
+    sigma_disparity_px: float = 0.5
+
+    def __post_init__(self) -> None:
+        check_common(self.particles, self.estimator, self.seed, self.duration)
+        for name in ("sigma_px", "sigma_disparity_px"):
+            check_float(name, getattr(self, name), "Give pixels.", above=0.0)
+
+    @classmethod
+    def from_mapping(cls, values: Mapping[str, Any]) -> Self:
+        """Build a config from plain values, as `to_mapping` gives them; unknown names are refused."""
+        return from_plain(cls, values, {})
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return the plain values that repeat this replay, the seed apart."""
+        return to_plain(self)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KittiScore:
+    """Paths of the left camera against the true one, in the plane.
+
+    Attributes:
+        truth: (n, 3) float64 [m, m, rad]. At the first n steps.
+        path: (T, 3) float64 [m, m, rad], start frame. Where the estimate puts the camera at each step.
+        reckoned: (T, 3) float64 [m, m, rad], start frame. Likewise dead reckoning.
+        estimate: Score of the estimate.
+        odometry: Score of dead reckoning.
+        loop: Steps (earlier, later) at which the car was at one place again, nearest of all; None if it never was.
+        loop_error: Error [m] of the estimated motion between these two steps; NaN if there are none.
+    """
+
+    truth: FloatArray
+    path: FloatArray
+    reckoned: FloatArray
+    estimate: PositionScore
+    odometry: PositionScore
+    loop: tuple[int, int] | None
+    loop_error: float
+
+
+def replay(log: KittiLog, config: KittiConfig, on_step: Callable[[float], None] = lambda done: None) -> OneReplay:
+    """Let a filter live through a drive; poses are those of the inertial unit.
+
+    Args:
+        log: What `load_kitti` returned.
+        config: Assumptions and sizes.
+        on_step: Called after each step with the share of the drive that is done, in (0, 1].
+    """
+    camera = make_camera(log, config.sigma_px, config.sigma_disparity_px)
+    readings = steps(log, camera)
+    options = FilterOptions(
+        num_particles=config.particles,
+        camera=camera,
+        motion=motion_noise(log),
+        proposal=config.estimator,
+        position_gate=PLANAR_GATE,
+        dead_zone=DEAD_ZONE,
+        recovery_position=RECOVERY_POSITION,
+        descriptor_gate=OWN_TRACK,
+    )
+    slam = FastSlam.from_options(1, options, config.seed)
+    return replay_one(slam, readings.times, readings.odometry, readings.measurements, on_step)
+
+
+def score(result: OneReplay, log: KittiLog) -> KittiScore | None:
+    """Score a replay against the true path of the camera; None if that is not known."""
+    if log.truth is None:
+        return None
+    truth = log.truth.poses[: len(result.times)]
+    paths = [compose(poses, np.array([*log.mount[:2], 0.0])) for poses in (result.path, result.reckoned)]
+    scores = [
+        score_positions(path[: len(truth), :2], truth[:, :2], compose(truth[0], inverse(path[0]))) for path in paths
+    ]
+    loop = find_loop(truth)
+    error = float("nan")
+    if loop is not None:
+        motions = [between(path[loop[0]], path[loop[1]]) for path in (paths[0], truth)]
+        error = float(np.hypot(*(motions[0] - motions[1])[:2]))
+    return KittiScore(truth, paths[0], paths[1], scores[0], scores[1], loop, error)
+
+
+def find_loop(truth: FloatArray) -> tuple[int, int] | None:
+    """Return the two nearest poses among (n, 3), a way apart, as (earlier, later); None if the car never came back."""
+    driven = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(truth[:, :2], axis=0).T))])
+    apart = np.hypot(*(truth[:, None, :2] - truth[None, :, :2]).transpose(2, 0, 1))
+    apart[driven[None, :] - driven[:, None] < LOOP_AFTER] = np.inf
+    earlier, later = np.unravel_index(int(np.argmin(apart)), apart.shape)
+    return (int(earlier), int(later)) if apart[earlier, later] <= LOOP_WITHIN else None
+
+
+def summarise(result: OneReplay, scored: KittiScore | None) -> dict[str, Any]:
+    """Return the content of `metrics.json`; what cannot be known is NaN, as are errors of the map."""
+    nan = float("nan")
+    return {
+        "robots": [
+            {
+                "ate_aligned_m": scored.estimate.aligned if scored else nan,
+                "ate_start_m": scored.estimate.start if scored else nan,
+                "dead_reckoning_ate_aligned_m": scored.odometry.aligned if scored else nan,
+                "dead_reckoning_ate_start_m": scored.odometry.start if scored else nan,
+                "map_rmse_m": nan,
+                "map_recall": nan,
+                "map_precision": nan,
+                "map_error": nan,
+                "path_m": float(np.hypot(*np.diff(result.path[:, :2], axis=0).T).sum()),
+                "true_path_m": float(np.hypot(*np.diff(scored.truth[:, :2], axis=0).T).sum()) if scored else nan,
+                "loop_error_m": scored.loop_error if scored else nan,
+            }
+        ],
+        "landmarks": len(result.landmarks),
+        "measurements": {"matched": result.matched, "created": result.created, "rejected": result.rejected},
+        "merges": [],
+        "groups": [[1]],
+        "coverage": nan,
+        "duration_s": float(result.times[-1] - result.times[0]),
+    }
