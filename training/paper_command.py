@@ -7,6 +7,7 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from training.command_options import Config, Json, Out, Seed, finish, gather
 from training.compiling import prepare
 
 if TYPE_CHECKING:  # what computes is imported when the command runs, so that --help answers at once
@@ -14,12 +15,6 @@ if TYPE_CHECKING:  # what computes is imported when the command runs, so that --
     from training.run_folder import RunFolder
 
 paper = typer.Typer(help="Compute figures of the paper anew.", no_args_is_help=True)
-
-Json = Annotated[Path | None, typer.Option(help="Write all figures to this file too.", show_default=False)]
-Config = Annotated[
-    Path | None,
-    typer.Option(help="config.toml of an earlier run to repeat; other options override it.", show_default=False),
-]
 
 
 class _Part(NamedTuple):
@@ -42,6 +37,9 @@ def fig6(
     ] = None,
     robots: Annotated[str | None, typer.Option(help="Numbers K.", show_default="1,2,3")] = None,
     regimes: Annotated[str | None, typer.Option(help="paper, look_alikes, good.", show_default="all")] = None,
+    measurements: Annotated[
+        int | None, typer.Option(help="Number B in a step, of all robots together.", show_default="15")
+    ] = None,
     length: Annotated[float | None, typer.Option(help="Metres that each robot drives.", show_default="100")] = None,
     quick: Annotated[bool, typer.Option("--quick", help="3 seeds, M = 1, 10, 100, and 25 m.")] = False,
     jobs: Annotated[int, typer.Option(help="Processes for the map errors; times are measured in one.")] = 1,
@@ -53,7 +51,7 @@ def fig6(
     json: Json = None,
     config: Config = None,
 ) -> None:
-    """Fig. 6: time of a step, and map error, of one to three robots that share B = 15 measurements.
+    """Fig. 6: time of a step, and map error, of one to three robots that share B measurements.
 
     The filter is the paper's (`fastslam1`, unknown association, resampling at random at every step), the noise large
     against the odometry; beside it look-alikes with false points, and good stereo with both proposals, for
@@ -68,24 +66,20 @@ def fig6(
     from training.paper_fig6 import COMMAND, QUICK, Fig6Config
     from training.paper_summary import summarise, to_csv
     from training.paper_tables import print_result
-    from training.run_folder import check_writable, plain, read_config, to_json, write_whole
+    from training.run_folder import plain
 
-    if json is not None and json.parent != out:  # the run's own folder may not exist yet
-        check_writable(json, "json")
     check_int("jobs", jobs, 1, "Use one process or more.")
-    values: dict[str, Any] = {}
-    if config is not None:
-        values, values["seed"] = read_config(config, COMMAND)
     given = {
         "particles": None if particles is None else parse_counts("particles", particles),
         "robots": None if robots is None else parse_counts("robots", robots),
         "regimes": None if regimes is None else tuple(word.strip() for word in regimes.split(",")),
+        "measurements": measurements,
         "length": length,
         "seeds": seeds,
         "seed": first_seed,
     }
-    values |= QUICK if quick else {}
-    chosen = Fig6Config.from_mapping(values | {name: value for name, value in given.items() if value is not None})
+    told = (QUICK if quick else {}) | {name: value for name, value in given.items() if value is not None}
+    chosen = Fig6Config.from_mapping(gather(COMMAND, told, config, json, out))
     folder = open_folder(out, COMMAND, chosen.to_mapping(), chosen.seed)
     prepare()
     console = Console()
@@ -97,9 +91,7 @@ def fig6(
     folder.write_text("fig6.csv", to_csv(lines))
     if lines:
         draw_fig6(folder.path / "fig6.png", lines)
-    if json is not None:
-        write_whole(json, to_json(metrics), "json")
-    console.print(f"Run folder: {folder.path}", soft_wrap=True, highlight=False)
+    finish(console, folder, metrics, json)
     if check and not (claims and all(claim.holds for claim in claims)):
         raise typer.Exit(1)
 
@@ -153,27 +145,22 @@ def _run_live(
 
 @paper.command("fig1")
 def fig1(
-    seed: Annotated[int | None, typer.Option(help="Of the run and the filters.", show_default="0")] = None,
+    seed: Seed = None,
     robots: Annotated[int | None, typer.Option(help="How many.", show_default="3")] = None,
     particles: Annotated[int | None, typer.Option(help="Of each cloud.", show_default="400")] = None,
     length: Annotated[float | None, typer.Option(help="Metres that each robot drives.", show_default="30")] = None,
     every: Annotated[float | None, typer.Option(help="Metres between two clouds.", show_default="5")] = None,
-    out: Annotated[Path | None, typer.Option(help="New run folder.", show_default="the next in runs")] = None,
+    out: Out = None,
     json: Json = None,
     config: Config = None,
 ) -> None:
     """Fig. 1: clouds of particles along the paths of three robots, by odometry alone and with what they see."""
     from training.figures_fig1 import draw_fig1
     from training.paper_fig1 import COMMAND, Fig1Config, draw_clouds, figures_of, simulate_fig1
-    from training.run_folder import RunFolder, check_writable, read_config, to_json, write_whole
+    from training.run_folder import RunFolder
 
-    if json is not None and json.parent != out:  # the run's own folder does not exist yet
-        check_writable(json, "json")
-    values: dict[str, Any] = {}
-    if config is not None:
-        values, values["seed"] = read_config(config, COMMAND)
     given = {"seed": seed, "robots": robots, "particles": particles, "length": length, "every": every}
-    chosen = Fig1Config.from_mapping(values | {name: value for name, value in given.items() if value is not None})
+    chosen = Fig1Config.from_mapping(gather(COMMAND, given, config, json, out))
     folder = RunFolder.create(out, COMMAND, chosen.to_mapping(), chosen.seed)
     prepare()
     console = Console()
@@ -187,6 +174,4 @@ def fig1(
             text = f"robot {robot}, {name}: path RMS {row['path_rms_m']:.2f} m, at the end off by"
             console.print(f"{text} {row['end_error_m']:.2f} m, spread {row['end_spread_m']:.2f} m", highlight=False)
     metrics = folder.write_metrics(found)
-    if json is not None:
-        write_whole(json, to_json(metrics), "json")
-    console.print(f"Run folder: {folder.path}", soft_wrap=True, highlight=False)
+    finish(console, folder, metrics, json)

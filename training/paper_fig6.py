@@ -26,6 +26,7 @@ class Fig6Config:
         particles: Numbers M.
         robots: Numbers K.
         regimes: Keys of `REGIMES`.
+        measurements: B, of all robots together.
         length: Of each robot's path [m].
         seeds: How many runs of each kind.
         seed: The first of them.
@@ -34,6 +35,7 @@ class Fig6Config:
     particles: tuple[int, ...] = PARTICLES
     robots: tuple[int, ...] = (1, 2, 3)
     regimes: tuple[str, ...] = tuple(REGIMES)
+    measurements: int = 15
     length: float = 100.0
     seeds: int = 20
     seed: int = 0
@@ -69,7 +71,8 @@ class Fig6Config:
         """Return the trials of the map error, those on the same run in a row, seed by seed."""
         return [
             ErrorTrial(
-                regime=name, proposal=proposal, robots=robots, particles=particles, length=float(self.length), seed=seed
+                regime=name, proposal=proposal, robots=robots, particles=particles, measurements=self.measurements,
+                length=float(self.length), seed=seed,
             )
             for seed in range(self.seed, self.seed + self.seeds)
             for name in self.regimes
@@ -82,7 +85,10 @@ class Fig6Config:
     def time_trials(self) -> list[TimeTrial]:
         """Return the trials of the time per step, seed by seed; none without the paper's regime."""
         return [
-            TimeTrial(robots=self.robots, particles=particles, length=float(self.length), seed=seed)
+            TimeTrial(
+                robots=self.robots, particles=particles, measurements=self.measurements, length=float(self.length),
+                seed=seed,
+            )
             for seed in range(self.seed, self.seed + self.seeds)
             for particles in self.particles
             if "paper" in self.regimes

@@ -33,9 +33,12 @@ class Regime:
     proposals: tuple[Proposal, ...]
     few: bool
 
-    def spec(self, robots: int, length: float) -> RunSpec:
-        """Return the run of K robots, each driving `length` [m]; all together measure B = 15 landmarks in a step."""
-        return RunSpec(preset=self.preset, association="unknown", robots=robots, length=length, **self.looks)
+    def spec(self, robots: int, length: float, measurements: int = 15) -> RunSpec:
+        """Return the run of K robots, each driving `length` [m]; all together measure at most B landmarks in a step."""
+        return RunSpec(
+            preset=self.preset, association="unknown", robots=robots, length=length, measurements=measurements,
+            **self.looks,
+        )  # fmt: skip
 
 
 # Sec. 5 speaks neither of look-alikes nor of false points.

@@ -13,7 +13,7 @@ from training.accuracy_summary import CONFIDENCE, interval
 from training.paper_trials import FIGURES
 
 POINT = ("regime", "proposal", "robots", "particles")
-TIMES = ("median_ms", "all_median_ms", "all_mean_ms", "measurements")
+TIMES = ("median_ms", "all_median_ms", "all_mean_ms", "measured")
 LEAST = 1e-12  # [m, ms]; the logarithm of 0 is none
 
 Rows = Iterable[Mapping[str, Any]]

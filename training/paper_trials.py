@@ -30,6 +30,7 @@ class ErrorTrial:
         proposal: Of the filter.
         robots: K.
         particles: M.
+        measurements: B, of all robots together.
         length: Of each robot's path [m].
         seed: Of the run, and of the filter's draws.
     """
@@ -38,6 +39,7 @@ class ErrorTrial:
     proposal: Proposal
     robots: int
     particles: int
+    measurements: int
     length: float
     seed: int
 
@@ -51,7 +53,7 @@ class ErrorTrial:
     @property
     def spec(self) -> RunSpec:
         """The run that is simulated."""
-        return REGIMES[self.regime].spec(self.robots, self.length)
+        return REGIMES[self.regime].spec(self.robots, self.length, self.measurements)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,12 +63,14 @@ class TimeTrial:
     Attributes:
         robots: Numbers K.
         particles: M.
+        measurements: B, of all robots together.
         length: Of each robot's path [m].
         seed: Of the runs, and of the filters' draws.
     """
 
     robots: tuple[int, ...]
     particles: int
+    measurements: int
     length: float
     seed: int
 
@@ -76,9 +80,14 @@ class TimeTrial:
             raise bad_argument("robots", "at least one number, each once", list(self.robots), "Correct the list.")
         for robots in self.robots:
             ErrorTrial(
-                regime="paper", proposal="fastslam1", robots=robots, particles=self.particles, length=self.length,
-                seed=self.seed,
+                regime="paper", proposal="fastslam1", robots=robots, particles=self.particles,
+                measurements=self.measurements, length=self.length, seed=self.seed,
             )  # fmt: skip
+
+    @property
+    def specs(self) -> list[RunSpec]:
+        """The runs that are simulated, one for each number of robots."""
+        return [REGIMES["paper"].spec(robots, self.length, self.measurements) for robots in self.robots]
 
 
 def play_error(trial: ErrorTrial) -> dict[str, Any]:
@@ -108,20 +117,20 @@ def play_time(trial: TimeTrial) -> dict[str, Any]:
 
     Returns:
         The trial's own fields, and per number of robots: `median_ms`, of the steps with as many measurements as were
-        asked for, `all_median_ms` and `all_mean_ms`, of all steps, and `measurements`, the mean number in a step.
+        asked for, `all_median_ms` and `all_mean_ms`, of all steps, and `measured`, the mean number in a step.
         Times are processor time of the one thread that a filter uses, which what else is running does not prolong
         but by the caches it takes.
     """
-    runs = [_run_of(REGIMES["paper"].spec(robots, trial.length), trial.seed) for robots in trial.robots]
+    runs = [_run_of(spec, trial.seed) for spec in trial.specs]
     filters = [_build(run, "fastslam1", trial.particles, trial.seed) for run in runs]
     times = time_in_turns(filters, runs)
-    found: dict[str, list[float]] = {"median_ms": [], "all_median_ms": [], "all_mean_ms": [], "measurements": []}
+    found: dict[str, list[float]] = {"median_ms": [], "all_median_ms": [], "all_mean_ms": [], "measured": []}
     for run, own in zip(runs, times, strict=True):
         full = full_steps(run)
         found["median_ms"].append(float(np.median(own[full])) if full.any() else float("nan"))
         found["all_median_ms"].append(float(np.median(own)))
         found["all_mean_ms"].append(float(own.mean()))
-        found["measurements"].append(float(_measured(run).mean()))
+        found["measured"].append(float(_measured(run).mean()))
     return asdict(trial) | found
 
 

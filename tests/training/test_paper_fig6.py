@@ -3,6 +3,7 @@
 import csv
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -58,14 +59,15 @@ def _call(arguments: list[str]) -> int:
 
 def _error(seed: int, robots: int, particles: int, value: float) -> dict[str, Any]:
     """Return a row of `play_error` in the paper's regime."""
-    trial = {"regime": "paper", "proposal": "fastslam1", "robots": robots, "particles": particles, "length": 100.0}
+    trial: dict[str, Any] = {"regime": "paper", "proposal": "fastslam1", "robots": robots, "particles": particles}
+    trial |= {"measurements": 15, "length": 100.0}
     return trial | {"seed": seed} | dict.fromkeys(FIGURES, 1.0) | {"map_rmse_m": value}
 
 
 def _time(seed: int, particles: int, ratio: float) -> dict[str, Any]:
     """Return a row of `play_time`: three robots take `ratio` times as long as one."""
     values: dict[str, Any] = {name: [1.0, ratio] for name in TIMES}
-    return {"robots": [1, 3], "particles": particles, "length": 100.0, "seed": seed} | values
+    return {"robots": [1, 3], "particles": particles, "measurements": 15, "length": 100.0, "seed": seed} | values
 
 
 def test_the_figure_is_the_papers() -> None:
@@ -78,7 +80,7 @@ def test_the_figure_is_the_papers() -> None:
     assert {trial.seed for trial in trials} == set(range(20))
     assert {trial.proposal for trial in trials} == {"fastslam1"}
     for trial in config.error_trials():
-        assert trial.spec.measurements == 15
+        assert trial.spec.measurements == trial.measurements == 15
         assert trial.spec.association == "unknown"
         assert trial.regime == "paper" or trial.particles in FEW
     assert {(t.robots, t.particles, t.seed) for t in config.time_trials()} == {
@@ -95,8 +97,10 @@ def test_the_papers_filter_resamples_at_every_step(run: StereoRun) -> None:
 
 def test_trials_repeat() -> None:
     """The same trial gives the same figures, and others for another seed."""
-    trial = ErrorTrial(regime="good", proposal="fastslam1", robots=2, particles=5, length=3.0, seed=42)
-    other = ErrorTrial(regime="good", proposal="fastslam1", robots=2, particles=5, length=3.0, seed=43)
+    trial = ErrorTrial(
+        regime="good", proposal="fastslam1", robots=2, particles=5, measurements=8, length=3.0, seed=42
+    )
+    other = replace(trial, seed=43)
     assert play_error(trial) == play_error(trial)
     assert play_error(trial)["map_rmse_m"] != play_error(other)["map_rmse_m"]
 
@@ -127,13 +131,13 @@ def test_taking_turns_changes_no_filter(run: StereoRun) -> None:
 
 def test_times_are_of_full_steps() -> None:
     """A row has one time for each K; full steps are those with B measurements, of which two robots have more."""
-    row = play_time(TimeTrial(robots=(2, 1), particles=3, length=20.0, seed=44))
+    row = play_time(TimeTrial(robots=(2, 1), particles=3, measurements=15, length=20.0, seed=44))
     runs = [simulate_run(REGIMES["paper"].spec(k, 20.0), seed=44) for k in (2, 1)]
     for i, each in enumerate(runs):
         counts = np.array([sum(len(frame) for frame in frames) for frames in each.frames])
         np.testing.assert_array_equal(full_steps(each), counts == 15)
-        assert row["measurements"][i] == pytest.approx(counts.mean())
-    assert row["measurements"][0] > row["measurements"][1]
+        assert row["measured"][i] == pytest.approx(counts.mean())
+    assert row["measured"][0] > row["measured"][1]
     assert all(row["median_ms"][i] > 0.0 for i in range(2))
 
 
