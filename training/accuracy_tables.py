@@ -12,7 +12,7 @@ from training.accuracy_summary import CONDITION
 
 NAMES = {
     "dead_reckoning": "dead reckoning", "batch_ml": "batch ML", "ideal_online": "ideal online",
-    "fastslam1": "fastslam1", "fastslam2": "fastslam2",
+    "fastslam1": "fastslam1", "fastslam2": "fastslam2", "fastslam2+existence": "with existence",
 }  # fmt: skip
 # Per table its columns: heading, figure, statistic over seeds, factor, digits, whether with its interval.
 PARTS: dict[str, tuple[tuple[str, str, str, float, int, bool], ...]] = {

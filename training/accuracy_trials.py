@@ -8,6 +8,7 @@ from typing import Any, Literal
 import numpy as np
 
 from slam_backend.errors import FloatArray, IntArray, check_choice, check_int
+from slam_backend.existence import ExistenceModel
 from slam_backend.filter import FastSlam
 from slam_backend.geometry import transform_points, wrap_angle
 from slam_backend.metrics import align_se2, ate, map_rmse, nees
@@ -16,8 +17,9 @@ from training.batch_problem import BatchProblem
 from training.ideal_online import ideal_online
 from training.stereo_runs import FALSE_POINT, RunSpec, StereoRun, simulate_run
 
-FILTERS = ("fastslam1", "fastslam2")
-METHODS = ("dead_reckoning", "batch_ml", "ideal_online", *FILTERS)
+PEERS = ("dead_reckoning", "batch_ml", "ideal_online")
+FILTERS = ("fastslam1", "fastslam2", "fastslam2+existence")
+METHODS = (*PEERS, *FILTERS)
 CONFIRMED = 2  # sightings that confirm a landmark
 LEAST_SIGMA = 1e-5  # [m, rad]; a collapsed set of particles claims no error at all, which has no NEES
 
@@ -95,13 +97,21 @@ def play(trial: Trial) -> dict[str, Any]:
     begin = time.perf_counter()
     run = _run_of(trial.spec, trial.seed)
     if trial.method in FILTERS:
-        answer = follow(run, run.build_filter(trial.particles, trial.method, seed=trial.seed))  # type: ignore[arg-type]
+        answer = follow(run, _build_filter(run, trial))
     elif trial.method == "dead_reckoning":
         answer = Answer(BatchProblem.of_run(run).dead_reckoning().paths)
     else:
         answer = _optimal(run, trial.method)
     row = asdict(trial) | score(run, answer)
     return row | {"seconds": time.perf_counter() - begin}
+
+
+def _build_filter(run: StereoRun, trial: Trial) -> FastSlam:
+    """Return the filter that a trial's method names, fresh; "+existence": with the default model of existence."""
+    proposal, _, existence = trial.method.partition("+")
+    frame_limit = run.spec.measurements // run.spec.robots
+    options = {"existence": ExistenceModel(frame_limit=frame_limit)} if existence else {}
+    return run.build_filter(trial.particles, proposal, trial.seed, **options)  # type: ignore[arg-type]
 
 
 def score(run: StereoRun, answer: Answer) -> dict[str, float]:

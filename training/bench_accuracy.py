@@ -7,7 +7,7 @@ from typing import Any, Self
 
 from slam_backend.errors import bad_argument, check_int
 from training import kept_trials
-from training.accuracy_trials import FILTERS, METHODS, Trial, play
+from training.accuracy_trials import FILTERS, PEERS, Trial, play
 from training.run_folder import RunFolder
 
 COMMAND = "bench accuracy"
@@ -33,7 +33,7 @@ class AccuracyConfig:
     associations: tuple[str, ...] = ("known",)
     robots: tuple[int, ...] = (1,)
     lengths: tuple[float, ...] = (100.0,)
-    methods: tuple[str, ...] = METHODS
+    methods: tuple[str, ...] = (*PEERS, "fastslam1", "fastslam2")
     particles: tuple[int, ...] = (10, 30, 100, 300, 1000)
     seeds: int = 16
     seed: int = 0

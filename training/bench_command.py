@@ -26,7 +26,10 @@ def bench_accuracy(
     length: Annotated[str | None, typer.Option(help="Metres that each robot drives.", show_default="100")] = None,
     methods: Annotated[
         str | None,
-        typer.Option(help="dead_reckoning, batch_ml, ideal_online, fastslam1, fastslam2.", show_default="all"),
+        typer.Option(
+            help="dead_reckoning, batch_ml, ideal_online, fastslam1, fastslam2, fastslam2+existence.",
+            show_default="all but the last",
+        ),
     ] = None,
     particles: Annotated[str | None, typer.Option(help="Per filter.", show_default="10,30,100,300,1000")] = None,
     processes: Annotated[int, typer.Option(help="At a time.")] = 1,
