@@ -125,7 +125,7 @@ def _find_truth(file: Path, truth: str | Path | None) -> Path | None:
 def _read(file: Path) -> dict[str, FloatArray]:
     """Return the arrays of the archive; all are finite numbers."""
     try:
-        with np.load(file, allow_pickle=False) as archive:
+        with file.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
             missing = [key for key in KEYS if key not in archive]
             content = {} if missing else {key: np.asarray(archive[key], dtype=np.float64) for key in KEYS}
     except UNREADABLE as error:
@@ -159,4 +159,4 @@ def _read_truth(file: Path | None, times: FloatArray) -> Trajectory | None:
 def _check(file: Path, key: str, fine: bool, expected: str) -> None:
     if not fine:
         cure = f"Get {str(file)!r} again."
-        raise bad_argument("path", f"{file.name} with {expected} in {key!r}", "another content", cure)
+        raise bad_argument("path", f"{file.name} with {expected} in {key!r}", "a different one", cure)

@@ -5,7 +5,6 @@ described in the data set's `info.txt`.
 """
 
 import warnings
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,9 +18,7 @@ CONTROLS_FILE = "aa3_dr.mat"
 TREES_FILE = "VictoriaParkSinSincronizar.mat"
 GPS_FILE = "aa3_gpsx.mat"
 MAX_STEERING = 1.0  # [rad], more than any car's wheels turn
-MILLISECONDS = 1e-3  # [s], the unit of time of the files of controls and GPS; that of trees counts seconds
-# What scipy raises on files that are truncated, damaged, of another kind, or of MATLAB's HDF5 format.
-UNREADABLE = (OSError, ValueError, KeyError, EOFError, TypeError, IndexError, NotImplementedError, zlib.error)
+MILLISECONDS = 1000.0  # a second, the unit of time of the files of controls and GPS; that of trees counts seconds
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,7 +66,7 @@ def load_victoria(path: str | Path, duration: float | None = None) -> VictoriaLo
     times = _table(folder / TREES_FILE, found, ("TLsr",), 1.0)[:, 0]
     cells = found["zt"].ravel()
     if found["zt"].dtype != object or len(cells) != len(times):
-        raise _bad(folder / TREES_FILE, f"a cell array zt with one cell for each of {len(times)} times", "another")
+        raise _bad(folder / TREES_FILE, f"a cell array zt with one cell for each of {len(times)} times", "a different one")
     scans = [_trees(folder / TREES_FILE, number, cell) for number, cell in enumerate(cells)]
     fixes = _read(folder / GPS_FILE, ("timeGps", "Lo_m", "La_m"))
     gps = _table(folder / GPS_FILE, fixes, ("timeGps", "Lo_m", "La_m"), MILLISECONDS)
@@ -90,7 +87,7 @@ def _read(file: Path, names: tuple[str, ...]) -> dict[str, Any]:
         with warnings.catch_warnings():
             warnings.simplefilter("error")  # scipy warns of what it cannot make out
             content = loadmat(file, variable_names=names)
-    except (*UNREADABLE, Warning) as error:
+    except Exception as error:  # of any kind, on files that are cut, damaged, of another kind, or MATLAB's HDF5
         raise _bad(file, "a MATLAB file of version 5 to 7.2", "a broken file") from error
     missing = [name for name in names if name not in content]
     if missing:
@@ -99,7 +96,7 @@ def _read(file: Path, names: tuple[str, ...]) -> dict[str, Any]:
 
 
 def _table(file: Path, content: dict[str, Any], names: tuple[str, ...], unit: float) -> FloatArray:
-    """Return variables as columns (n, names), the first one being times in `unit` seconds."""
+    """Return variables as columns (n, names), the first one being times of which `unit` make a second."""
     columns = []
     for name in names:
         values = content[name]
@@ -112,7 +109,7 @@ def _table(file: Path, content: dict[str, Any], names: tuple[str, ...], unit: fl
     table = np.stack(columns, axis=-1)
     if not np.isfinite(table).all():
         raise _bad(file, "finite numbers", f"NaN or infinity in {names[int(np.argwhere(~np.isfinite(table))[0][1])]}")
-    table[:, 0] *= unit
+    table[:, 0] /= unit
     backwards = np.flatnonzero(np.diff(table[:, 0]) < 0.0)
     if len(backwards):
         later = int(backwards[0]) + 1

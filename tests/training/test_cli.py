@@ -14,7 +14,13 @@ def _run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
     return int(end.value.code or 0)
 
 
-@pytest.mark.parametrize("command", [(), ("replay",), ("replay", "mrclam"), ("bench",), ("bench", "filter")])
+@pytest.mark.parametrize(
+    "command",
+    [
+        (), ("replay",), ("replay", "mrclam"), ("replay", "victoria"), ("replay", "kitti"), ("bench",),
+        ("bench", "filter"),
+    ],
+)  # fmt: skip
 def test_every_command_explains_itself(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], command: tuple[str, ...]
 ) -> None:
