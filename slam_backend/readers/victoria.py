@@ -66,7 +66,8 @@ def load_victoria(path: str | Path, duration: float | None = None) -> VictoriaLo
     times = _table(folder / TREES_FILE, found, ("TLsr",), 1.0)[:, 0]
     cells = found["zt"].ravel()
     if found["zt"].dtype != object or len(cells) != len(times):
-        raise _bad(folder / TREES_FILE, f"a cell array zt with one cell for each of {len(times)} times", "a different one")
+        expected = f"a cell array zt with one cell for each of {len(times)} times"
+        raise _bad(folder / TREES_FILE, expected, "a different one")
     scans = [_trees(folder / TREES_FILE, number, cell) for number, cell in enumerate(cells)]
     fixes = _read(folder / GPS_FILE, ("timeGps", "Lo_m", "La_m"))
     gps = _table(folder / GPS_FILE, fixes, ("timeGps", "Lo_m", "La_m"), MILLISECONDS)
