@@ -202,14 +202,20 @@ def test_a_folder_belongs_to_one_bench(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_processes_change_nothing(tmp_path: Path, rows: list[dict[str, Any]]) -> None:
-    """Two processes give the figures of one."""
+    """Two processes give the figures of one: exactly for the filter, to 1e-9 for batch maximum likelihood.
+
+    The latter's linear algebra is done by a BLAS, whose sums depend on how many threads it has, and the processes of a
+    bench have one each. In a run of the filter the one matrix product is that with the camera's axes, a permutation
+    with signs, which is exact in any order.
+    """
     few = [trial for trial in SMALL.trials() if trial.method in ("batch_ml", "fastslam2")]
     done: list[dict[str, Any]] = []
     run_trials(open_folder(tmp_path / "bench", SMALL), few, 2, lambda: False, done.append)
     expected = {(row["seed"], row["method"], row["particles"]): row["pose_rms_m"] for row in rows}
     assert len(done) == len(few)
     for row in done:
-        assert row["pose_rms_m"] == expected[row["seed"], row["method"], row["particles"]]
+        alone = expected[row["seed"], row["method"], row["particles"]]
+        assert row["pose_rms_m"] == (pytest.approx(alone, rel=1e-9) if row["method"] == "batch_ml" else alone)
 
 
 def test_tables_and_figure(tmp_path: Path, rows: list[dict[str, Any]]) -> None:
