@@ -332,9 +332,10 @@ class TeamSlam:
         self._step = state["step"]
         self._rng.bit_generator.state = copy.deepcopy(state["rng"])
         self._events = list(state["events"])
+        at_hand = {group.robots: group.filter for group in self._groups}  # a filter takes longer to build than to fill
         self._groups = []
         for robots, filter_state, report in state["groups"]:
-            slam = FastSlam.from_options(len(robots), filter_state["options"])
+            slam = at_hand.get(robots) or FastSlam.from_options(len(robots), filter_state["options"])
             slam.set_state(filter_state)
             self._groups.append(_Group(robots, slam, report))
         self._alignment = state["alignment"]

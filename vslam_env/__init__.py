@@ -9,9 +9,10 @@ import pettingzoo
 from vslam_env.belief import Belief
 from vslam_env.config import EnvConfig, preset_config
 from vslam_env.environment import ExplorationEnv
+from vslam_env.snapshots import load_state, save_state
 from vslam_env.world import World
 
-__all__ = ["Belief", "EnvConfig", "ExplorationEnv", "World", "preset_config"]
+__all__ = ["Belief", "EnvConfig", "ExplorationEnv", "World", "load_state", "preset_config", "save_state"]
 
 if hasattr(pettingzoo, "register"):  # since 1.27
     pettingzoo.register("parallel", "vslam_env/Exploration-v0", "vslam_env.vslam_v0:parallel_env")

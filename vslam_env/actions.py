@@ -122,3 +122,11 @@ class GoalDriver:
         if self._path is None:
             return np.zeros(2)
         return np.array(follow_path(pose, self._path, MAX_SPEED, MAX_TURN, self._heading))
+
+    def get_state(self) -> dict[str, Any]:
+        """Return where it is heading, and by which way."""
+        return {"goal": self._goal, "heading": self._heading, "path": self._path}
+
+    def set_state(self, state: Mapping[str, Any]) -> None:
+        """Go on as the driver that gave `state`; goals and paths are replaced as a whole and can be shared."""
+        self._goal, self._heading, self._path = state["goal"], state["heading"], state["path"]

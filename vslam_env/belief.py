@@ -1,7 +1,8 @@
 """`TeamBelief` owns the team's filters and the seen grids, and hands out what each robot believes."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -149,6 +150,29 @@ class TeamBelief:
         if robot not in self._beliefs:
             self._beliefs[robot] = self._make_belief(robot)
         return self._beliefs[robot]
+
+    def get_state(self) -> dict[str, Any]:
+        """Return all that decides how the beliefs go on; it shares nothing with them."""
+        return {
+            "tick": self._tick,
+            "team": self._team.get_state(),
+            "grids": [grid.get_state() for grid in self._grids],
+            "slots": [slots.get_state() for slots in self._slots],
+        }
+
+    def set_state(self, state: Mapping[str, Any]) -> None:
+        """Go on exactly as the beliefs that gave `state`.
+
+        Raises:
+            ValueError: If it is of another number of robots, or no state.
+        """
+        self._team.set_state(state["team"])
+        self._tick = state["tick"]
+        for grid, seen in zip(self._grids, state["grids"], strict=True):
+            grid.set_state(seen)
+        for slots, candidates in zip(self._slots, state["slots"], strict=True):
+            slots.set_state(candidates)
+        self._look_up_poses()
 
     def _look_up_poses(self) -> None:
         """Take note of the groups and poses after a step or a merge, and forget what was derived from those before."""

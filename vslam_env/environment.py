@@ -21,6 +21,8 @@ from vslam_env.readings import Readings
 from vslam_env.rendering import Scene, draw_frame
 from vslam_env.reward import RewardSpec, Standing, evaluate, make_terms
 from vslam_env.scenes import scene_of
+from vslam_env.setting import draw_setting
+from vslam_env.snapshots import EnvState, check_state, restored_sequence, sequence_state, state_version
 from vslam_env.window import Window
 from vslam_env.world import World, WorldSource, check_source
 
@@ -73,6 +75,10 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         self.state_space = spaces.Box(-np.inf, np.inf, (size,), np.float32)
         self._root: np.random.SeedSequence | None = None
         self._episode: Episode | None = None
+        self._cycle = 0
+        self._scores: list[MapScores]  # set at a reset, as the two below
+        self._pose_errors: FloatArray
+        self._standing: Standing
         self._window = Window(self.metadata["name"])
 
     # ------------------------------------------------------------------ PettingZoo
@@ -114,14 +120,11 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         if world_seed is not None:
             check_int("options['world_seed']", world_seed, 0, "Give an int >= 0.")
         self.agents = []  # a reset that fails leaves no episode to step
-        self._episode = Episode(
-            self.config,
-            self._source,
-            self._root.spawn(1)[0],
-            world_seed,
-            options.get("start_poses"),
-            self.recorder,
+        setting = draw_setting(
+            self.config, self._source, self._root.spawn(1)[0], world_seed, options.get("start_poses")
         )
+        self._episode = Episode(self.config, setting, self._record)
+        self._episode.begin()
         self.agents = self.possible_agents[:]
         self._cycle = 0
         self._drivers = [GoalDriver() for _ in self.agents]
@@ -259,7 +262,71 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         """Return what a picture shows now."""
         return scene_of(self._running_episode("scene"), self._standing)
 
+    # ------------------------------------------------------------------ snapshots
+
+    def get_state(self) -> EnvState:
+        """Return all that decides how the environment goes on: world, filters, random streams, resets to come.
+
+        An environment that is set to it returns the same bytes for the same actions from there on. What never changes
+        in an episode is shared with the environment, all else copied. `vslam_env.save_state` writes it to disk. The
+        recorder, the window and what reward terms of your own remember are not part of it.
+        """
+        episode = self._episode
+        return {
+            "version": state_version(),
+            "config": self.config,
+            "root": sequence_state(self._root),
+            "agents": tuple(self.agents),
+            "cycle": 0 if episode is None else self._cycle,
+            "episode": None if episode is None else episode.get_state(),
+            "drivers": [] if episode is None else [driver.get_state() for driver in self._drivers],
+            "stock": None if episode is None else (self._scores, self._pose_errors, self._standing),
+        }
+
+    def set_state(self, state: Mapping[str, Any]) -> None:
+        """Go on exactly as the environment that gave `state`, be it of another seed, process, or day.
+
+        Args:
+            state: Of `get_state`; it can be used again.
+
+        Raises:
+            ValueError: If it is no state, one of another version of the package or of another configuration.
+        """
+        state = check_state(state, self.config)
+        self._root = restored_sequence(state["root"])
+        self.agents = []
+        if state["episode"] is None:
+            self._episode = None
+            return
+        if self._episode is None:
+            self._episode = Episode(self.config, state["episode"]["setting"], self._record)
+        self._episode.set_state(state["episode"])
+        self._drivers = [GoalDriver() for _ in state["drivers"]]
+        for driver, kept in zip(self._drivers, state["drivers"], strict=True):
+            driver.set_state(kept)
+        self._scores, self._pose_errors, self._standing = state["stock"]
+        self._cycle, self.agents = state["cycle"], list(state["agents"])
+
+    def clone(self) -> "ExplorationEnv":
+        """Return an independent environment in the same state, for looking ahead; without window and recorder."""
+        mode = None if self.render_mode == "human" else self.render_mode
+        twin = ExplorationEnv(self.config, self._source, self._terms, mode)
+        twin.max_cycles = self.max_cycles
+        twin.set_state(self.get_state())
+        return twin
+
+    def __deepcopy__(self, memo: Any) -> "ExplorationEnv":
+        return self.clone()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        made_from = (self.config, self._source, self._terms, self.render_mode)
+        return _unpickled, (made_from, self.max_cycles, self.get_state())
+
     # ------------------------------------------------------------------ within
+
+    def _record(self, readings: tuple[Readings, ...]) -> None:
+        if self.recorder is not None:
+            self.recorder(readings)
 
     def _running_episode(self, name: str) -> Episode:
         if self._episode is None:
@@ -297,9 +364,9 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
     def _take_stock(self) -> None:
         """Score maps and poses as they stand now."""
         episode = self._running_episode("step")
-        self._scores: list[MapScores] = episode.map_scores()
-        self._pose_errors: FloatArray = episode.pose_errors()
-        self._standing: Standing = episode.standing(self._scores, self._pose_errors)
+        self._scores = episode.map_scores()
+        self._pose_errors = episode.pose_errors()
+        self._standing = episode.standing(self._scores, self._pose_errors)
 
     def _observations(self) -> dict[AgentID, Any]:
         episode, config = self._running_episode("step"), self.config
@@ -342,3 +409,10 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
             }
             infos[agent] |= {f"reward/{name}": float(values[robot]) for name, values in terms.items()}
         return infos
+
+
+def _unpickled(made_from: tuple[Any, ...], max_cycles: int, state: EnvState) -> ExplorationEnv:
+    env = ExplorationEnv(*made_from)
+    env.max_cycles = max_cycles
+    env.set_state(state)
+    return env

@@ -1,31 +1,22 @@
 """`Episode`: one world with robots in it, what they perceive and believe, and the simulator's books; tick by tick."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import combinations
 from typing import Any
 
 import numpy as np
 
-from slam_backend.errors import FloatArray, IntArray, bad_argument
+from slam_backend.errors import FloatArray, IntArray
 from slam_backend.geometry import between, compose, wrap_angle
 from vslam_env.belief import Body, TeamBelief
 from vslam_env.config import TICK, EnvConfig
-from vslam_env.coverage import CoverageMeter
-from vslam_env.errors_of_maps import ClaimLedger, MapScores, world_from_group
+from vslam_env.errors_of_maps import MapScores, world_from_group
 from vslam_env.oracle import true_alignment
 from vslam_env.readings import Readings
 from vslam_env.reward import Standing
-from vslam_env.sensors import Frame, LandmarkSensor, Scan
-from vslam_env.world import (
-    FreeSpace,
-    Simulator,
-    World,
-    WorldSource,
-    draw_bias,
-    make_world,
-    place_landmarks,
-    read_odometry,
-)
+from vslam_env.sensors import Frame
+from vslam_env.setting import Setting
+from vslam_env.world import Simulator, read_odometry
 
 Recorder = Callable[[tuple[Readings, ...]], None]
 
@@ -37,13 +28,11 @@ class Episode:
 
     Args:
         config: Of the environment.
-        source: What the world is made from.
-        seed: Of all streams.
-        world_seed: Of the layout and its textures, if these are to differ from what `seed` would give.
-        start_poses: (K, 3) [m, m, rad], world frame; None: those of the world, or drawn.
+        setting: What was drawn at the reset.
         recorder: Called with the readings of each tick, the first ones included.
 
     Attributes:
+        setting: What was drawn at the reset; of these:
         world: Walls and landmarks.
         true_starts: (K, 3) float64 [m, m, rad], world frame.
         belief_seed: From which the team's beliefs draw.
@@ -51,55 +40,24 @@ class Episode:
         belief: What the robots believe.
         ledger: What their landmarks are in truth.
         tick: Ticks since the reset.
-        readings: Of the last tick, one per robot.
+        readings: Of the last tick, one per robot; none before `begin`.
         frames: Of the last tick, with the true landmarks behind the measurements.
         true_path: Poses (K, 3) after each tick, world frame.
         estimated_path: Poses (K, 3) as estimated after each tick, each in the robot's own start frame.
         merge_ticks: Tick and groups of each merge.
     """
 
-    def __init__(
-        self,
-        config: EnvConfig,
-        source: WorldSource,
-        seed: np.random.SeedSequence,
-        world_seed: int | None = None,
-        start_poses: Any = None,
-        recorder: Recorder | None = None,
-    ) -> None:
-        layout, textures, starts, odometry, sensor, scan, self.belief_seed = seed.spawn(7)
-        if world_seed is not None:
-            layout, textures = np.random.SeedSequence(world_seed).spawn(2)
+    def __init__(self, config: EnvConfig, setting: Setting, recorder: Recorder | None = None) -> None:
         self._config = config
         self._recorder = recorder
-        robots = config.num_robots
-
-        bare = make_world(source, np.random.default_rng(layout))
-        free_space = FreeSpace(bare, config.robot_radius)
-        landmarks = bare.landmarks
-        if landmarks is None:
-            landmarks = place_landmarks(bare, np.random.default_rng(textures), config.landmarks, free_space)
-        self.world = World(bare.name, bare.walls, landmarks, bare.start_poses)
-        self.true_starts = self._starts(free_space, start_poses, np.random.default_rng(starts))
-
-        self._simulator = Simulator(self.world, self.true_starts, config.robot_radius, TICK)
-        self._sensor = LandmarkSensor(config.landmark_sensor, self.world.walls, landmarks, config.robot_radius)
-        self._scan = Scan(config.scan, self.world.walls, config.robot_radius)
-        self._odometry_rng, self._sensor_rng, self._scan_rng = (
-            np.random.default_rng(stream) for stream in (odometry, sensor, scan)
-        )
-        self._bias = draw_bias(config.odometry, robots, self._odometry_rng)
-        self._coverage = CoverageMeter(free_space.free_area_cells, self.true_starts)
-        countable = free_space.visible_landmarks(
-            landmarks, config.landmark_sensor.camera, config.landmark_sensor.max_incidence
-        )
-        self.ledger = ClaimLedger(robots, landmarks.positions, countable, config.map_error_cutoff)
+        self._streams = {name: np.random.default_rng(0) for name in setting.stream_states}
+        self._settle(setting)
         self.body = Body(
             radius=config.robot_radius, ray_angles=config.scan.ray_angles, scan_range=config.scan.max_range
         )
         self.belief = TeamBelief(
             config.belief,
-            robots,
+            config.num_robots,
             self.belief_seed,
             self.body,
             decision_ticks=config.ticks_per_step if config.action_type == "goal" else None,
@@ -107,13 +65,25 @@ class Episode:
         )
 
         self.tick = 0
-        self._collisions = np.zeros(robots, np.int64)
-        self._distances = np.zeros(robots)
+        self._collisions = np.zeros(config.num_robots, np.int64)
+        self._distances = np.zeros(config.num_robots)
         self.true_path: list[FloatArray] = []
         self.estimated_path: list[FloatArray] = []
         self.merge_ticks: list[tuple[int, tuple[int, ...], tuple[int, ...]]] = []
         self.readings: tuple[Readings, ...] = ()
         self.frames: list[Frame] = []
+
+    def _settle(self, setting: Setting) -> None:
+        """Move into a setting, as at its reset."""
+        self.setting = setting
+        self.world, self.true_starts, self.belief_seed = setting.world, setting.true_starts, setting.belief_seed
+        self._simulator = Simulator(setting.world, setting.true_starts, self._config.robot_radius, TICK)
+        self.ledger = setting.new_ledger(self._config.map_error_cutoff)
+        for name, state in setting.stream_states.items():
+            self._streams[name].bit_generator.state = state
+
+    def begin(self) -> None:
+        """Let the robots take their first frame."""
         self._perceive(None)
 
     @property
@@ -129,7 +99,8 @@ class Episode:
         self.tick += 1
         self._distances += np.hypot(*(after - before)[:, :2].T)
         self._collisions += self._simulator.bumped
-        self._perceive(read_odometry(before, after, self._bias, self._config.odometry, self._odometry_rng))
+        noise, stream = self._config.odometry, self._streams["odometry"]
+        self._perceive(read_odometry(before, after, self.setting.bias, noise, stream))
 
     def map_scores(self) -> list[MapScores]:
         """Score each robot's map as it stands."""
@@ -154,41 +125,54 @@ class Episode:
             map_errors=np.array([score.error for score in scores]),
             map_recalls=np.array([score.recall for score in scores]),
             pose_errors=pose_errors[:, 0],
-            coverage=self._coverage.share([self.belief.cells(r) for r in range(len(scores))]),
+            coverage=self.setting.coverage.share([self.belief.cells(r) for r in range(len(scores))]),
             collisions=self._collisions.copy(),
             distances=self._distances.copy(),
             bytes_sent=self.belief.bytes_sent,
             merges=len(self.merge_ticks),
         )
 
-    def _starts(self, free_space: FreeSpace, start_poses: Any, rng: np.random.Generator) -> FloatArray:
-        config = self._config
-        given = self.world.start_poses
-        if start_poses is not None:
-            return free_space.check_starts(start_poses, config.num_robots)
-        if given is not None:
-            if len(given) < config.num_robots:
-                raise bad_argument(
-                    "world.start_poses",
-                    f"a row for each of {config.num_robots} robots",
-                    f"shape {given.shape}",
-                    "Add rows, use fewer robots, or leave them out to have starts drawn.",
-                )
-            return free_space.check_starts(given[: config.num_robots], config.num_robots)
-        return free_space.draw_starts(
-            config.num_robots,
-            rng,
-            config.min_start_distance,
-            no_shared_view=None if config.shared_start_view else config.landmark_sensor.camera,
-            landmarks=self.world.landmarks,
-            max_incidence=config.landmark_sensor.max_incidence,
-        )
+    # ------------------------------------------------------------------ snapshots
+
+    def get_state(self) -> dict[str, Any]:
+        """Return all that decides how the episode goes on; what never changes is shared, all else is copied."""
+        return {
+            "setting": self.setting,
+            "tick": self.tick,
+            "simulator": self._simulator.get_state(),
+            "streams": {name: stream.bit_generator.state for name, stream in self._streams.items()},
+            "belief": self.belief.get_state(),
+            "ledger": self.ledger.get_state(),
+            "counts": (self._collisions.copy(), self._distances.copy()),
+            "last": (self.readings, tuple(self.frames)),
+            "paths": (tuple(self.true_path), tuple(self.estimated_path), tuple(self.merge_ticks)),
+        }
+
+    def set_state(self, state: Mapping[str, Any]) -> None:
+        """Go on exactly as the episode that gave `state`, be it of another seed and world.
+
+        Raises:
+            ValueError: If it is of another number of robots, or no state.
+        """
+        if state["setting"] is not self.setting:
+            self._settle(state["setting"])
+        self._simulator.set_state(state["simulator"])
+        for name, stream in state["streams"].items():
+            self._streams[name].bit_generator.state = stream
+        self.belief.set_state(state["belief"])
+        self.ledger.set_state(state["ledger"])
+        self.tick = state["tick"]
+        self._collisions, self._distances = (counts.copy() for counts in state["counts"])
+        self.readings, self.frames = state["last"][0], list(state["last"][1])
+        self.true_path, self.estimated_path, self.merge_ticks = (list(path) for path in state["paths"])
+
+    # ------------------------------------------------------------------ within
 
     def _perceive(self, odometry: FloatArray | None) -> None:
         """Read all sensors at the true poses, and let the robots take it in."""
         config, poses, bumped = self._config, self._simulator.poses, self._simulator.bumped
-        self.frames = self._sensor.measure(poses, self._sensor_rng)
-        scans = self._scan.measure(poses, self._scan_rng)
+        self.frames = self.setting.sensor.measure(poses, self._streams["sensor"])
+        scans = self.setting.scan.measure(poses, self._streams["scan"])
         self.readings = tuple(
             Readings(
                 odometry=None if odometry is None else odometry[robot],

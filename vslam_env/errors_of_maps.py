@@ -1,7 +1,8 @@
 """The simulator's books: which true landmark created each landmark of each map, and how wrong the maps are."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -95,6 +96,14 @@ class ClaimLedger:
             recall=matched.recall,
             precision=matched.precision,
         )
+
+    def get_state(self) -> dict[str, Any]:
+        """Return a copy of the books, for the same world's landmarks."""
+        return {"claims": {robots: book.copy() for robots, book in self._claims.items()}}
+
+    def set_state(self, state: Mapping[str, Any]) -> None:
+        """Go on with books that `get_state` returned."""
+        self._claims = {robots: book.copy() for robots, book in state["claims"].items()}
 
     def _claims_from(self, true_ids: IntArray) -> IntArray:
         claims = np.full(len(true_ids), FALSE)

@@ -3,36 +3,22 @@ from typing import Any
 
 import numpy as np
 import pytest
+from digests import digest
 from small_env import small_env, wander
 
 from vslam_env import ExplorationEnv
-
-
-def _digest(value: Any, into: "hashlib._Hash") -> None:
-    """Feed everything that an environment returns into a hash."""
-    if isinstance(value, dict):
-        for key in value:
-            into.update(repr(key).encode())
-            _digest(value[key], into)
-    elif isinstance(value, (tuple, list)):
-        for entry in value:
-            _digest(entry, into)
-    else:
-        array = np.asarray(value)
-        into.update(f"{type(value)}{array.dtype}{array.shape}".encode())
-        into.update(array.tobytes())
 
 
 def _run(env: ExplorationEnv, seed: int, steps: int, beside: ExplorationEnv | None = None) -> str:
     """Return the hash of all that `steps` steps return, another environment stepping in between if there is one."""
     total = hashlib.sha256()
     rng, other_rng = np.random.default_rng(7), np.random.default_rng(8)
-    _digest(env.reset(seed=seed), total)
+    digest(env.reset(seed=seed), total)
     if beside is not None:
         beside.reset(seed=99)
     for _ in range(steps):
-        _digest(env.step(wander(env, rng)), total)
-        _digest(env.state(), total)
+        digest(env.step(wander(env, rng)), total)
+        digest(env.state(), total)
         if beside is not None:
             beside.step(wander(beside, other_rng))
     return total.hexdigest()

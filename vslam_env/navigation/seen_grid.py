@@ -11,6 +11,9 @@ from vslam_env.navigation import _painting
 from vslam_env.navigation._arguments import pose_floats
 from vslam_env.navigation._painting import CELL, FREE, GRID_SIZE, HALF_WIDTH, OCCUPIED, UNKNOWN
 
+# What each evidence, as an unsigned byte, says of a cell.
+_VERDICTS = np.where(np.arange(256) == 0, UNKNOWN, np.where(np.arange(256) < 128, OCCUPIED, FREE)).astype(np.uint8)
+
 __all__ = ["CELL", "FREE", "GRID_SIZE", "OCCUPIED", "UNKNOWN", "SeenGrid", "cell_of", "centre_of"]
 
 
@@ -160,9 +163,11 @@ class SeenGrid:
         """Restore what `get_state` returned, in place: views made by `frozen` follow."""
         self._refuse_if_read_only()
         shape = (GRID_SIZE, GRID_SIZE)
-        evidence = check_array("evidence", state["evidence"], shape, "Use what get_state returned.", dtype=np.int8)
+        evidence = state["evidence"]
+        if not (isinstance(evidence, np.ndarray) and evidence.dtype == np.int8 and evidence.shape == shape):
+            evidence = check_array("evidence", evidence, shape, "Use what get_state returned.", dtype=np.int8)
         self._evidence[:] = evidence
-        self._cells[:] = np.where(evidence == 0, UNKNOWN, np.where(evidence > 0, OCCUPIED, FREE))
+        np.take(_VERDICTS, evidence.view(np.uint8), out=self._cells, mode="wrap")
 
     def _refuse_if_read_only(self) -> None:
         if self._read_only:

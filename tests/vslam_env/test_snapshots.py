@@ -1,0 +1,253 @@
+import copy
+import hashlib
+import os
+import pickle
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from digests import digest
+from small_env import MEETING, small_env, wander
+
+from vslam_env import ExplorationEnv, load_state, save_state, vslam_v0
+from vslam_env.snapshots import state_version
+
+FURTHER = 300
+
+
+def _env(action_type: str = "continuous", **kwargs: Any) -> ExplorationEnv:
+    return small_env(action_type=action_type, max_cycles=1000, **kwargs)
+
+
+def _begun(action_type: str = "continuous", steps: int = 20) -> ExplorationEnv:
+    """Return an environment some steps after a reset from which its two robots soon merge."""
+    env = _env(action_type)
+    env.reset(seed=5, options={"start_poses": MEETING})
+    _go_on(env, steps, seed=1)
+    return env
+
+
+def _go_on(env: ExplorationEnv, steps: int, seed: int = 7) -> str:
+    """Return the hash of all that further steps return."""
+    total, rng = hashlib.sha256(), np.random.default_rng(seed)
+    for _ in range(steps):
+        digest(env.step(wander(env, rng)), total)
+        digest(env.state(), total)
+    return total.hexdigest()
+
+
+def _into_another(env: ExplorationEnv, tmp_path: Path) -> ExplorationEnv:
+    """Return an environment that was in the middle of something else."""
+    other = _env(env.config.action_type)
+    other.reset(seed=77)
+    _go_on(other, 5)
+    other.set_state(env.get_state())
+    return other
+
+
+def _through_disk(env: ExplorationEnv, tmp_path: Path) -> ExplorationEnv:
+    save_state(env.get_state(), tmp_path / "state")
+    other = _env(env.config.action_type)
+    other.set_state(load_state(tmp_path / "state"))
+    return other
+
+
+WAYS: dict[str, Callable[[ExplorationEnv, Path], ExplorationEnv]] = {
+    "another env": _into_another,
+    "clone": lambda env, _: env.clone(),
+    "deepcopy": lambda env, _: copy.deepcopy(env),
+    "pickled env": lambda env, _: pickle.loads(pickle.dumps(env)),
+    "disk": _through_disk,
+}
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_a_state_goes_on_bit_by_bit(way: str, tmp_path: Path) -> None:
+    """300 steps after a snapshot, bumps and a merge among them, return the same bytes wherever it is restored."""
+    env = _begun()
+    assert env.belief("robot_0").group == (0,)
+    other = WAYS[way](env, tmp_path)
+    reference = _go_on(env, FURTHER)
+    assert any(event.kind == "merge" for event in env.events)
+    assert env.state()[-1] == 1.0
+    assert env.episode.standing(env.episode.map_scores(), env.episode.pose_errors()).collisions.sum() > 20
+    assert _go_on(other, FURTHER) == reference
+    digests = []
+    for one in (env, other):  # resets to come are part of the state as well
+        total = hashlib.sha256()
+        digest(one.reset(), total)
+        digests.append(total.hexdigest())
+    assert digests[0] == digests[1]
+
+
+@pytest.mark.parametrize("action_type", ["goal", "discrete"])
+def test_all_actions_go_on(action_type: str) -> None:
+    """Ways to candidates that are under way, and discrete actions, go on bit by bit."""
+    env = _begun(action_type, 6)
+    twin = env.clone()
+    assert _go_on(twin, 30) == _go_on(env, 30)
+
+
+def test_before_and_after_a_merge() -> None:
+    """One state of two groups and one of a merged team are restored by turns, and each goes on as it did."""
+    env = _begun()
+    apart = env.get_state()
+    first = _go_on(env, 150)
+    assert len(env.belief("robot_0").group) == 2
+    joined = env.get_state()
+    second = _go_on(env, 50)
+    for _ in range(2):
+        env.set_state(apart)
+        assert env.belief("robot_0").group == (0,)
+        assert _go_on(env, 150) == first
+        env.set_state(joined)
+        assert _go_on(env, 50) == second
+
+
+def test_taking_a_state_changes_nothing() -> None:
+    """An environment goes on as if nobody had looked, and a state stays as it was while the environment moves."""
+    env, quiet = _begun(), _begun()
+    state = env.get_state()
+    before = pickle.dumps(state)
+    assert _go_on(env, 60) == _go_on(quiet, 60)
+    env.set_state(state)
+    _go_on(env, 60)
+    assert pickle.dumps(state) == before
+
+
+def test_the_end_and_the_time_before_the_first_reset() -> None:
+    """States of environments that have ended, or have not begun, are states as well."""
+    env = small_env(max_cycles=3)
+    unborn = env.get_state()
+    env.reset(seed=3)
+    _go_on(env, 3)
+    other = small_env(max_cycles=3)
+    other.set_state(env.get_state())
+    with pytest.raises(RuntimeError, match="one that has ended"):
+        other.step({})
+    assert np.array_equal(other.state(), env.state())
+    other.set_state(unborn)
+    with pytest.raises(RuntimeError, match="got none"):
+        other.state()
+
+
+def test_a_clone_is_independent() -> None:
+    """Stepping a clone leaves its original alone; cycles are counted on."""
+    env = small_env(max_cycles=10)
+    env.reset(seed=3)
+    _go_on(env, 4)
+    before = pickle.dumps(env.get_state())
+    twin = env.clone()
+    _go_on(twin, 6)
+    assert not twin.agents
+    assert pickle.dumps(env.get_state()) == before
+    assert env.clone().agents == env.agents
+
+
+@pytest.mark.slow
+def test_another_process_goes_on(tmp_path: Path) -> None:
+    """A state on disk goes on in another process, under another hash seed, with the same bytes."""
+    env = _begun()
+    save_state(env.get_state(), tmp_path / "state")
+    code = (
+        "import test_snapshots as t\n"
+        "from vslam_env import load_state\n"
+        "env = t._env()\n"
+        f"env.set_state(load_state({str(tmp_path / 'state')!r}))\n"
+        "print(t._go_on(env, 100))"
+    )
+    folder = Path(__file__).parent
+    found = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=folder,
+        env=os.environ | {"PYTHONHASHSEED": "12345", "PYTHONPATH": f"{folder}:{folder.parents[1]}"},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert found.stdout.strip() == _go_on(env, 100)
+
+
+def _edited(**changes: Any) -> Callable[[], Any]:
+    def act() -> None:
+        env = _begun(steps=1)
+        env.set_state(env.get_state() | changes)
+
+    return act
+
+
+def _without(key: str) -> Callable[[], Any]:
+    def act() -> None:
+        env = _begun(steps=1)
+        env.set_state({name: value for name, value in env.get_state().items() if name != key})
+
+    return act
+
+
+def _from_other(**kwargs: Any) -> Callable[[], Any]:
+    def act() -> None:
+        env = vslam_v0.parallel_env(**kwargs)
+        small_env().set_state(env.get_state())
+
+    return act
+
+
+@pytest.mark.parametrize(
+    ("act", "says"),
+    [
+        (lambda: small_env().set_state(3), "state: expected what get_state returned, got a int. Pass it unchanged"),
+        (_without("drivers"), "state: expected what get_state returned, got a mapping without 'drivers'"),
+        (_edited(version="0/0.0.1"), rf"state: expected a state of version '{state_version()}', got '0/0.0.1'"),
+        (_from_other(num_robots=4), "state: expected one made with world = 'room', got 'office'"),
+        (_from_other(world="fig5"), "state: expected one made with world = 'room', got 'fig5'"),
+    ],
+)  # fmt: skip
+def test_bad_states_are_refused(act: Callable[[], Any], says: str) -> None:
+    """What is no state, or one of another version or configuration, is refused with the reason."""
+    with pytest.raises(ValueError, match=says):
+        act()
+
+
+def test_a_refused_state_leaves_the_environment_alone() -> None:
+    """After a refusal an environment goes on as before."""
+    env, quiet = _begun(), _begun()
+    with pytest.raises(ValueError, match="version"):
+        env.set_state(env.get_state() | {"version": "other"})
+    assert _go_on(env, 20) == _go_on(quiet, 20)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "says"),
+    [
+        (lambda content: content[: len(content) // 2], "path: expected a whole file of a state, got a damaged file"),
+        (lambda content: b"hello" + content, "path: expected the file of a state"),
+        (lambda content: content.replace(b"state 1/", b"state 9/", 1), r"expected a state of version .*got '9/"),
+        (None, "path: expected the file of a state, .*no such file|No such file"),
+    ],
+)
+def test_bad_files_are_refused(spoil: Callable[[bytes], bytes] | None, says: str, tmp_path: Path) -> None:
+    """A file that is missing, cut off, something else or of another version is refused with the reason."""
+    path = tmp_path / "state"
+    if spoil is not None:
+        save_state(_begun(steps=1).get_state(), path)
+        path.write_bytes(spoil(path.read_bytes()))
+    with pytest.raises(ValueError, match=says):
+        load_state(path)
+
+
+def test_files_are_whole_or_not_there(tmp_path: Path) -> None:
+    """A write that fails leaves the old file and no other."""
+    path = tmp_path / "state"
+    state = _begun(steps=1).get_state()
+    save_state(state, path)
+    before = path.read_bytes()
+    with pytest.raises((pickle.PicklingError, AttributeError)):
+        save_state(state | {"cycle": lambda: None}, path)
+    assert path.read_bytes() == before
+    assert [file.name for file in tmp_path.iterdir()] == ["state"]
+    with pytest.raises(ValueError, match="path: expected a file that can be written"):
+        save_state(state, tmp_path / "nowhere" / "state")

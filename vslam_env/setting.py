@@ -1,0 +1,119 @@
+"""`Setting`: all of an episode that is drawn at its reset and never changes afterwards."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from slam_backend.errors import FloatArray, bad_argument
+from vslam_env.config import EnvConfig
+from vslam_env.coverage import CoverageMeter
+from vslam_env.errors_of_maps import ClaimLedger
+from vslam_env.sensors import LandmarkSensor, Scan
+from vslam_env.world import FreeSpace, World, WorldSource, draw_bias, make_world, place_landmarks
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Setting:
+    """A world with the robots' starts and sensors in it. Episodes and their snapshots share it, for it never changes.
+
+    Attributes:
+        world: Walls and landmarks.
+        true_starts: (K, 3) float64 [m, m, rad], world frame. Read-only.
+        bias: (K, 2) float64. What each robot's odometry misreads throughout the episode, see `draw_bias`.
+        belief_seed: From which the team's beliefs draw.
+        stream_states: Where the random streams of odometry, sensor and scan stand before the first frame, by name.
+        sensor: The cameras.
+        scan: The range finders.
+        coverage: What measures how much of the floor has been seen.
+        countable: (N',) bool. Landmarks that some robot could ever see: only they count.
+    """
+
+    world: World
+    true_starts: FloatArray
+    bias: FloatArray
+    belief_seed: np.random.SeedSequence
+    stream_states: dict[str, Any]
+    sensor: LandmarkSensor
+    scan: Scan
+    coverage: CoverageMeter
+    countable: np.ndarray
+
+    def new_ledger(self, cutoff: float) -> ClaimLedger:
+        """Return empty books for this world's landmarks; `cutoff` is c of the map error [m]."""
+        landmarks = self.world.landmarks
+        assert landmarks is not None
+        return ClaimLedger(len(self.true_starts), landmarks.positions, self.countable, cutoff)
+
+
+def draw_setting(
+    config: EnvConfig,
+    source: WorldSource,
+    seed: np.random.SeedSequence,
+    world_seed: int | None = None,
+    start_poses: Any = None,
+) -> Setting:
+    """Draw an episode's setting. Each concern draws from a stream of its own, so that none shifts another.
+
+    Args:
+        config: Of the environment.
+        source: What the world is made from.
+        seed: Of all streams.
+        world_seed: Of the layout and its textures, if these are to differ from what `seed` would give.
+        start_poses: (K, 3) [m, m, rad], world frame; None: those of the world, or drawn.
+
+    Raises:
+        ValueError: If there is no such world, or robots cannot start there.
+    """
+    layout, textures, starts, odometry, sensor, scan, belief_seed = seed.spawn(7)
+    if world_seed is not None:
+        layout, textures = np.random.SeedSequence(world_seed).spawn(2)
+    bare = make_world(source, np.random.default_rng(layout))
+    free_space = FreeSpace(bare, config.robot_radius)
+    landmarks = bare.landmarks
+    if landmarks is None:
+        landmarks = place_landmarks(bare, np.random.default_rng(textures), config.landmarks, free_space)
+    world = World(bare.name, bare.walls, landmarks, bare.start_poses)
+    true_starts = _starts(config, world, free_space, start_poses, np.random.default_rng(starts))
+    true_starts.setflags(write=False)
+    streams = {
+        name: np.random.default_rng(stream)
+        for name, stream in (("odometry", odometry), ("sensor", sensor), ("scan", scan))
+    }
+    sight = config.landmark_sensor
+    return Setting(
+        world=world,
+        true_starts=true_starts,
+        bias=draw_bias(config.odometry, config.num_robots, streams["odometry"]),
+        belief_seed=belief_seed,
+        stream_states={name: stream.bit_generator.state for name, stream in streams.items()},
+        sensor=LandmarkSensor(sight, world.walls, landmarks, config.robot_radius),
+        scan=Scan(config.scan, world.walls, config.robot_radius),
+        coverage=CoverageMeter(free_space.free_area_cells, true_starts),
+        countable=free_space.visible_landmarks(landmarks, sight.camera, sight.max_incidence),
+    )
+
+
+def _starts(
+    config: EnvConfig, world: World, free_space: FreeSpace, start_poses: Any, rng: np.random.Generator
+) -> FloatArray:
+    given = world.start_poses
+    if start_poses is not None:
+        return free_space.check_starts(start_poses, config.num_robots)
+    if given is not None:
+        if len(given) < config.num_robots:
+            raise bad_argument(
+                "world.start_poses",
+                f"a row for each of {config.num_robots} robots",
+                f"shape {given.shape}",
+                "Add rows, use fewer robots, or leave them out to have starts drawn.",
+            )
+        return free_space.check_starts(given[: config.num_robots], config.num_robots)
+    return free_space.draw_starts(
+        config.num_robots,
+        rng,
+        config.min_start_distance,
+        no_shared_view=None if config.shared_start_view else config.landmark_sensor.camera,
+        landmarks=world.landmarks,
+        max_incidence=config.landmark_sensor.max_incidence,
+    )

@@ -1,0 +1,128 @@
+"""Snapshots of an environment: their version, their check, and their form on disk."""
+
+import dataclasses
+import pickle
+from collections.abc import Mapping
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
+from os import replace
+from pathlib import Path
+from tempfile import NamedTemporaryFile
+from typing import Any
+
+import numpy as np
+
+from slam_backend.errors import bad_argument
+from vslam_env.config import EnvConfig
+
+STATE_FORMAT = 1  # raised when what a state holds changes; a state goes on bit by bit only with what made it
+MAGIC = b"vslam_env state "
+KEYS = ("version", "config", "root", "agents", "cycle", "episode", "drivers", "stock")
+
+EnvState = dict[str, Any]
+
+
+@cache
+def state_version() -> str:
+    """Return what a state is marked with: the number of its format and the version of the package."""
+    try:
+        package = version("vslam-env")
+    except PackageNotFoundError:  # run from a source tree that was never installed
+        package = "source"
+    return f"{STATE_FORMAT}/{package}"
+
+
+def check_state(state: Any, config: EnvConfig) -> Mapping[str, Any]:
+    """Return a state if an environment of `config` can go on from it.
+
+    Raises:
+        ValueError: If it is no state, one of another version, or one of another configuration.
+    """
+    if not isinstance(state, Mapping) or not all(key in state for key in KEYS):
+        raise bad_argument("state", "what get_state returned", _kind(state), "Pass it unchanged.")
+    _check_version("state", state["version"])
+    if state["config"] != config:
+        for field in dataclasses.fields(config):
+            theirs, ours = getattr(state["config"], field.name), getattr(config, field.name)
+            if theirs != ours:
+                cure = "Restore into an environment of the same configuration."
+                raise bad_argument("state", f"one made with {field.name} = {_short(ours)}", theirs, cure)
+    return state
+
+
+def save_state(state: Mapping[str, Any], path: str | Path) -> None:
+    """Write a state of `get_state` to a file; an interrupted write leaves no file, or the old one.
+
+    The file is a marked pickle: like any pickle, load it only from where you would run code from.
+
+    Raises:
+        ValueError: If it is no state, or the file cannot be written.
+    """
+    if not isinstance(state, Mapping) or not all(key in state for key in KEYS):
+        raise bad_argument("state", "what get_state returned", _kind(state), "Pass it unchanged.")
+    path = Path(path)
+    try:
+        with NamedTemporaryFile(dir=path.parent, prefix=path.name, suffix=".part", delete=False) as file:
+            part = Path(file.name)
+            try:
+                file.write(MAGIC + f"{state['version']}\n".encode())
+                pickle.dump(dict(state), file, protocol=5)
+                file.close()
+                replace(part, path)
+            except BaseException:
+                part.unlink(missing_ok=True)
+                raise
+    except OSError as error:
+        raise bad_argument("path", "a file that can be written", str(path), f"The system says: {error}.") from error
+
+
+def load_state(path: str | Path) -> EnvState:
+    """Read a state that `save_state` wrote.
+
+    Raises:
+        ValueError: If there is no such file, it holds no state, is cut off, or is of another version.
+    """
+    try:
+        content = Path(path).read_bytes()
+    except OSError as error:
+        raise bad_argument("path", "the file of a state", str(path), f"The system says: {error}.") from error
+    head, _, body = content.partition(b"\n")
+    if not head.startswith(MAGIC):
+        raise bad_argument("path", "the file of a state", str(path), "Write one with save_state.")
+    _check_version(str(path), head[len(MAGIC) :].decode(errors="replace"))  # before anything of it is unpickled
+    try:
+        return dict(pickle.loads(body))
+    except Exception as error:
+        cure = f"Save it again; reading says: {error}."
+        raise bad_argument("path", "a whole file of a state", f"a damaged file {path}", cure) from error
+
+
+def sequence_state(sequence: np.random.SeedSequence | None) -> dict[str, Any] | None:
+    """Return what a seed sequence is made of, its count of children included."""
+    if sequence is None:
+        return None
+    names = ("entropy", "spawn_key", "pool_size", "n_children_spawned")
+    return {name: getattr(sequence, name) for name in names}
+
+
+def restored_sequence(state: Mapping[str, Any] | None) -> np.random.SeedSequence | None:
+    """Return the seed sequence that `sequence_state` described."""
+    return None if state is None else np.random.SeedSequence(**state)
+
+
+def _check_version(name: str, found: Any) -> None:
+    if found != state_version():
+        cure = "Go on with the version that made it; only the same one goes on bit by bit."
+        raise bad_argument(name, f"a state of version {state_version()!r}", found, cure)
+
+
+def _kind(state: Any) -> str:
+    if isinstance(state, Mapping):
+        missing = next(key for key in KEYS if key not in state)
+        return f"a mapping without {missing!r}"
+    return f"a {type(state).__name__}"
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 40 else text[:37] + "..."
