@@ -186,20 +186,38 @@ def test_bounds_follow_from_counts_and_rates() -> None:
     assert processor()
 
 
-def test_compilation_is_timed_in_a_cache_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two new processes share a cache that begins empty; its size is told, and it is gone afterwards."""
-    code = """
+# What a new process does in place of warming up: it leaves a file in the cache and tells how many there were.
+FAKE_WARM_UP = """
 import json, os, pathlib
 folder = pathlib.Path(os.environ["NUMBA_CACHE_DIR"])
 found = len(list(folder.iterdir()))
-(folder / f"kernel{found}").write_bytes(bytes(100))
-print(json.dumps({"found": found, "folder": str(folder)}))
+(folder / f"kernel{found}").write_bytes(bytes(150_000))
+seconds = {"import_s": 1.2, "compile_s": 41.0 * (not found), "warm_up_s": 0.3 + 41.0 * (not found)}
+print(json.dumps(seconds | {"found": found, "folder": str(folder)}))
 """
-    monkeypatch.setattr(compile_timing, "WARM_UP", code)
+
+
+def test_compilation_is_timed_in_a_cache_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two new processes share a cache that begins empty; its size is told, and it is gone afterwards."""
+    monkeypatch.setattr(compile_timing, "WARM_UP", FAKE_WARM_UP)
     times = compile_timing.time_compilation()
     assert (times["cold"]["found"], times["cached"]["found"]) == (0, 1)
-    assert (times["cache_files"], times["cache_bytes"]) == (2, 200)
+    assert (times["cache_files"], times["cache_bytes"]) == (2, 300_000)
     assert not Path(times["cold"]["folder"]).exists()
+
+
+def test_a_bench_tells_what_compiling_costs(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """With --compile one line says how long compiling takes, and the cache after it; the JSON holds both processes."""
+    monkeypatch.setattr(compile_timing, "WARM_UP", FAKE_WARM_UP)
+    least = ("--particles", "3", "--landmarks", "30", "--measurements", "2", "--robots", "1", "--steps", "2")
+    assert _run(monkeypatch, *least, "--no-plain", "--compile", "--out", str(tmp_path / "bench")) == 0
+    shown = " ".join(capsys.readouterr().out.split())  # lines may be broken anywhere
+    assert "Kernels: compiled in 41 s, once; taken from the cache (0.3 MB) in 0.3 s; import 1.2 s." in shown
+    told = json.loads((tmp_path / "bench" / "metrics.json").read_text())["compilation"]
+    assert (told["cold"]["compile_s"], told["cached"]["compile_s"]) == (41.0, 0.0)
+    assert (told["cache_files"], told["cache_bytes"]) == (2, 300_000)
 
 
 def test_counts_with_commas() -> None:

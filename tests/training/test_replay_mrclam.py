@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from small_logs import LANDMARKS, write_log
 
 from slam_backend.geometry import compose, inverse, transform_points
 from slam_backend.landmark_map import LandmarkMap
@@ -12,16 +13,11 @@ from slam_backend.metrics import align_se2
 from slam_backend.motion import OdometryModel
 from slam_backend.readers.mrclam import load_mrclam
 from slam_backend.readers.mrclam_steps import Drive, SightingNoise
-from slam_backend.readers.velocities import integrate_commands
 from slam_backend.trajectory import Trajectory
 from training import cli
 from training.replay_mrclam import MOTION, ReplayConfig, replay
 from training.replay_scores import align_to_truth, score_path, summarise
 
-ANGLES, RADII = np.random.default_rng(11).uniform([[0.0], [2.8]], [[2.0 * np.pi], [4.2]], (2, 14))
-LANDMARKS = np.column_stack([RADII * np.cos(ANGLES), RADII * np.sin(ANGLES)])  # a ring around both robots
-STARTS = {2: (0.5, -1.0, 0.4), 5: (-1.5, 1.0, -2.0)}
-SECONDS = 45.0
 EXACT = ReplayConfig(
     path="log",
     particles=7,
@@ -31,33 +27,9 @@ EXACT = ReplayConfig(
 )
 
 
-def _write_log(folder: Path, noise: float, seed: int = 3) -> None:
-    """Write a log of two robots that drive in circles among 14 landmarks, with `noise` times the usual errors."""
-    rng = np.random.default_rng(seed)
-    subjects = np.arange(6, 6 + len(LANDMARKS))
-    (folder / "Barcodes.dat").write_text("".join(f"{n} {100 + n}\n" for n in [1, 2, 3, 4, 5, *subjects]))
-    lines = [f"{n} {x} {y} 0 0\n" for n, (x, y) in zip(subjects, LANDMARKS, strict=True)]
-    (folder / "Landmark_Groundtruth.dat").write_text("".join(lines))
-    for robot, start in STARTS.items():
-        times = 1000.0 + 0.1 * np.arange(round(SECONDS / 0.1))
-        driven = np.column_stack([times, np.full_like(times, 0.5), np.full_like(times, 0.6 if robot == 2 else -0.5)])
-        told = driven * [1.0, 1.0 + 0.2 * noise, 1.0 - 0.15 * noise]
-        np.savetxt(folder / f"Robot{robot}_Odometry.dat", told, fmt="%.6f")
-        poses = compose(start, integrate_commands(driven, times))
-        np.savetxt(folder / f"Robot{robot}_Groundtruth.dat", np.column_stack([times, poses]), fmt="%.9f")
-        rows = []
-        for time, pose in zip(times[::3], poses[::3], strict=True):
-            seen = transform_points(inverse(pose), LANDMARKS)
-            ranges, bearings = np.hypot(*seen.T), np.arctan2(seen[:, 1], seen[:, 0])
-            for n in np.flatnonzero((np.abs(bearings) < 0.5) & (ranges < 9.0)):
-                r, b = [ranges[n], bearings[n]] + noise * rng.normal(0.0, [0.05, 0.01])
-                rows.append(f"{time:.3f} {100 + subjects[n]} {r:.9f} {b:.9f}\n")
-        (folder / f"Robot{robot}_Measurement.dat").write_text("".join(rows))
-
-
 def test_without_noise_the_team_is_right(tmp_path: Path) -> None:
     """Exact readings that are believed give one group, and paths, maps and the merge exact to centimetres."""
-    _write_log(tmp_path, noise=0.0)
+    write_log(tmp_path, noise=0.0)
     log = load_mrclam(tmp_path)
     result = replay(log, EXACT)
     paths = [score_path(result, robot, own.truth) for robot, own in enumerate(log.robots)]
@@ -79,7 +51,7 @@ def test_without_noise_the_team_is_right(tmp_path: Path) -> None:
 
 def test_noise_is_removed_that_dead_reckoning_keeps(tmp_path: Path) -> None:
     """With biased odometry each path is at most a third as wrong as dead reckoning, in both kinds of score."""
-    _write_log(tmp_path, noise=1.0)
+    write_log(tmp_path, noise=1.0)
     log = load_mrclam(tmp_path)
     result = replay(log, ReplayConfig(path=str(tmp_path), particles=25, seed=4))
     for robot, own in enumerate(log.robots):
@@ -95,7 +67,7 @@ def test_a_run_is_written_and_repeats_itself(
     """The command leaves a complete folder, and run again from its config the same metrics to the last digit."""
     log, first, second = (tmp_path / name for name in ("log", "first", "second"))
     log.mkdir()
-    _write_log(log, noise=1.0)
+    write_log(log, noise=1.0)
     monkeypatch.setenv("VSLAM_DATA", str(tmp_path))
     monkeypatch.chdir(tmp_path)
     options = ("--path", "log", "--duration", "20", "--particles", "7", "--seed", "5")
@@ -127,7 +99,7 @@ def test_a_run_is_written_and_repeats_itself(
 
 def test_a_log_without_truth_has_no_path_scores(tmp_path: Path) -> None:
     """Where the true path is not known its errors are NaN, while the map is scored."""
-    _write_log(tmp_path, noise=1.0)
+    write_log(tmp_path, noise=1.0)
     (tmp_path / "Robot5_Groundtruth.dat").unlink()
     log = load_mrclam(tmp_path, robots=(5,), duration=10.0)
     result = replay(log, ReplayConfig(path=str(tmp_path), particles=5))
@@ -138,7 +110,7 @@ def test_a_log_without_truth_has_no_path_scores(tmp_path: Path) -> None:
 
 def test_map_is_aligned_by_its_most_seen_landmarks(tmp_path: Path) -> None:
     """A duplicate seen once does not turn the map; it lowers the precision."""
-    _write_log(tmp_path, noise=0.0)
+    write_log(tmp_path, noise=0.0)
     log = load_mrclam(tmp_path)
     world_from_map = np.array([1.0, -2.0, 0.7])
     means = transform_points(inverse(world_from_map), LANDMARKS[[0, 3, 5, 3]])
@@ -182,7 +154,7 @@ def test_a_config_with_unknown_names_is_refused(values: dict[str, object], messa
 
 def test_robots_that_stay_alone_never_merge(tmp_path: Path) -> None:
     """Alone, each robot ends with its own map, and what it estimates does not depend on which others are replayed."""
-    _write_log(tmp_path, noise=1.0)
+    write_log(tmp_path, noise=1.0)
     config = ReplayConfig(path=str(tmp_path), particles=7, alone=True, seed=4)
     both, first = load_mrclam(tmp_path, duration=20.0), load_mrclam(tmp_path, (2,), duration=20.0)
     result = replay(both, config)
@@ -193,7 +165,7 @@ def test_robots_that_stay_alone_never_merge(tmp_path: Path) -> None:
 
 def test_hidden_identities_are_found_by_position(tmp_path: Path) -> None:
     """Without barcodes exact readings of landmarks that stand apart still give each of them once."""
-    _write_log(tmp_path, noise=0.0)
+    write_log(tmp_path, noise=0.0)
     apart: list[int] = []
     for row, place in enumerate(LANDMARKS):
         if all(np.hypot(*(place - LANDMARKS[other])) > 1.1 for other in apart):
@@ -246,7 +218,7 @@ def test_the_same_assumptions_hold_on_another_log(data_dir: Path) -> None:
 
 def test_paths_in_start_frames_and_group_frames_agree(tmp_path: Path) -> None:
     """Late poses, moved into the group's frame, fit the true poses by the same motion as the group's map."""
-    _write_log(tmp_path, noise=0.0)
+    write_log(tmp_path, noise=0.0)
     log = load_mrclam(tmp_path)
     result = replay(log, EXACT)
     late = compose(inverse(result.start_from_group), result.paths[:, -4])

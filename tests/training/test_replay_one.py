@@ -4,14 +4,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.io import savemat
+from small_logs import EAST, TREES, write_drive, write_park
 
-from slam_backend.camera import ROBOT_FROM_CAMERA
-from slam_backend.geometry import compose, inverse, transform_points
-from slam_backend.readers.kitti import ABSENT, load_kitti
+from slam_backend.geometry import compose, transform_points
+from slam_backend.readers.kitti import load_kitti
 from slam_backend.readers.velocities import integrate_commands
 from slam_backend.readers.victoria import load_victoria
-from slam_backend.readers.victoria_steps import SENSOR, axle_velocities, steps
+from slam_backend.readers.victoria_steps import axle_velocities, steps
 from slam_backend.trajectory import Trajectory
 from training import cli
 from training.replay_kitti import KittiConfig, find_loop
@@ -24,71 +23,10 @@ from training.replay_victoria import replay as replay_victoria
 from training.replay_victoria import score as score_victoria
 from training.replay_victoria import summarise as summarise_victoria
 
-ANGLES = np.linspace(0.0, 2.0 * np.pi, 17, endpoint=False)
-RING = np.array([0.0, 14.0])  # middle of the vehicle's circle
-TREES = np.vstack([RING + 8.0 * np.column_stack([np.cos(ANGLES[::2]), np.sin(ANGLES[::2])]),
-                   RING + 24.0 * np.column_stack([np.cos(ANGLES), np.sin(ANGLES)])])  # fmt: skip
-EAST = np.array([100.0, -50.0, 0.8])  # the start, as the GPS sees it
-
-
-def _write_park(folder: Path, skew: float = 0.0) -> None:
-    """Write a log of a vehicle that drives two rounds among trees; its steering is told with an error `skew` [rad]."""
-    times = np.arange(0.0, 60.0, 0.025)
-    steering = np.full_like(times, np.arctan(2.83 / 14.0))
-    driven = axle_velocities(np.column_stack([times, np.full_like(times, 3.0), steering]))
-    laser = np.array([*SENSOR[:2], 0.0])
-    scan_times = np.arange(0.1, 59.0, 0.2)
-    cells = np.empty(len(scan_times), dtype=object)
-    for k, pose in enumerate(compose(integrate_commands(driven, scan_times), laser)):
-        seen = transform_points(inverse(pose), TREES)
-        bearings = np.arctan2(seen[:, 1], seen[:, 0])
-        front = np.abs(bearings) < 0.5 * np.pi
-        polar = [np.hypot(*seen[front].T), bearings[front] + 0.5 * np.pi, np.full(front.sum(), 0.4)]
-        cells[k] = np.array(polar)
-    stamps = np.arange(500, 58000, 200)
-    fixes = transform_points(EAST, compose(integrate_commands(driven, stamps / 1000.0), laser)[:, :2])
-    told = {"time": times * 1000, "speed": np.full_like(times, 3.0), "steering": steering + skew}
-    savemat(folder / "aa3_dr.mat", told)
-    savemat(folder / "VictoriaParkSinSincronizar.mat", {"TLsr": scan_times, "zt": cells[None]})
-    savemat(folder / "aa3_gpsx.mat", {"timeGps": stamps, "Lo_m": fixes[:, 0], "La_m": fixes[:, 1]})
-
-
-def _write_drive(folder: Path, bias: float = 0.0, bus: bool = False) -> None:
-    """Write a drive along a bend; the turn rate is told with an error `bias` [rad/s], a bus drives ahead if asked."""
-    rng = np.random.default_rng(5)
-    times = 0.1 * np.arange(120)
-    mount = np.array([1.1, -0.3, 0.0])
-    commands = np.column_stack([times, np.full(120, 8.0), np.where(times < 6.0, 0.0, 0.3)])
-    cameras = compose(integrate_commands(commands, times), mount)
-    points = np.column_stack([rng.uniform(-20.0, 120.0, 400), rng.uniform(-40.0, 70.0, 400)])
-    features = np.full((4, len(points) + 8, len(times)), ABSENT)
-    for k, pose in enumerate(cameras):
-        ahead = transform_points(inverse(pose), points)
-        if bus:
-            ahead = np.vstack([ahead, np.column_stack([np.full(8, 12.0 + 0.3 * k), np.linspace(-1.2, 1.2, 8)])])
-        columns = 600.0 - 700.0 * ahead[:, 1] / np.maximum(ahead[:, 0], 1e-3)
-        seen = np.flatnonzero((ahead[:, 0] > 3.0) & (ahead[:, 0] < 60.0) & (columns > 0.0) & (columns < 1200.0))
-        disparity = 700.0 * 0.5 / ahead[seen, 0]
-        features[:, seen, k] = [columns[seen], 180.0 + 0 * seen, columns[seen] - disparity, 180.0 + 0 * seen]
-    turns = commands[:, 2] + bias
-    zeros = np.zeros(120)
-    np.savez(
-        folder / "drive.npz", time_stamps=times, features=features,
-        K=[[700.0, 0.0, 600.0], [0.0, 700.0, 180.0], [0.0, 0.0, 1.0]],
-        linear_velocity=[commands[:, 1], zeros, zeros], rotational_velocity=[zeros, zeros, turns], b=0.5,
-        cam_T_imu=np.vstack([np.column_stack([ROBOT_FROM_CAMERA.T, mount]), [0.0, 0.0, 0.0, 1.0]]),
-    )  # fmt: skip
-    (folder / "poses").mkdir()
-    rows = []
-    for x, y, theta in compose(inverse(cameras[0]), cameras):
-        c, s = np.cos(theta), np.sin(theta)
-        rows.append(f"{c} 0 {-s} {-y} 0 1 0 0 {s} 0 {c} {x}\n")
-    (folder / "poses" / "00.txt").write_text("".join(rows))
-
 
 def test_a_park_is_mapped_by_position_alone(tmp_path: Path) -> None:
     """With steering told wrong by half a degree, nameless trees keep the path right, and each is in the map once."""
-    _write_park(tmp_path, skew=0.01)
+    write_park(tmp_path, skew=0.01)
     log = load_victoria(tmp_path)
     result = replay_victoria(log, VictoriaConfig(path="log", particles=10, seed=3))
     scored = score_victoria(result, log)
@@ -104,7 +42,7 @@ def test_a_park_is_mapped_by_position_alone(tmp_path: Path) -> None:
 
 def test_exact_dead_reckoning_needs_no_fit(tmp_path: Path) -> None:
     """Controls that are followed lead the antenna through all fixes; start and fit then agree."""
-    _write_park(tmp_path)
+    write_park(tmp_path)
     log = load_victoria(tmp_path)
     scored = score_victoria(replay_victoria(log, VictoriaConfig(path="log", particles=2)), log)
     assert scored.odometry.start < 0.01
@@ -114,7 +52,7 @@ def test_exact_dead_reckoning_needs_no_fit(tmp_path: Path) -> None:
 
 def test_trees_are_described_by_where_they_stand(tmp_path: Path) -> None:
     """Seen from the true pose, descriptors are the trees' places."""
-    _write_park(tmp_path)
+    write_park(tmp_path)
     log = load_victoria(tmp_path)
     frame = steps(log).measurements[0]
     assert frame is not None
@@ -127,7 +65,7 @@ def test_trees_are_described_by_where_they_stand(tmp_path: Path) -> None:
 
 def test_fewer_than_two_fixes_are_refused(tmp_path: Path) -> None:
     """A stretch without GPS cannot be scored, and says so."""
-    _write_park(tmp_path)
+    write_park(tmp_path)
     log = load_victoria(tmp_path, duration=0.4)
     result = replay_victoria(log, VictoriaConfig(path="log", particles=2))
     with pytest.raises(ValueError, match="duration: expected two GPS fixes or more, got a stretch with 0"):
@@ -136,7 +74,7 @@ def test_fewer_than_two_fixes_are_refused(tmp_path: Path) -> None:
 
 def test_tracks_correct_the_turn_of_a_drive(tmp_path: Path) -> None:
     """With the turn rate told wrong, tracked features leave a tenth of dead reckoning's error."""
-    _write_drive(tmp_path, bias=0.05)
+    write_drive(tmp_path, bias=0.05)
     log = load_kitti(tmp_path)
     result = replay_kitti(log, KittiConfig(path="log", particles=10, seed=3))
     scored = score_kitti(result, log)
@@ -149,7 +87,7 @@ def test_tracks_correct_the_turn_of_a_drive(tmp_path: Path) -> None:
 
 def test_tracks_on_a_bus_are_refused(tmp_path: Path) -> None:
     """Eight tracks that move with a bus are refused once they move, and the path stays right to a decimetre."""
-    _write_drive(tmp_path, bus=True)
+    write_drive(tmp_path, bus=True)
     log = load_kitti(tmp_path)
     result = replay_kitti(log, KittiConfig(path="log", particles=10, seed=3))
     scored = score_kitti(result, log)
@@ -160,7 +98,7 @@ def test_tracks_on_a_bus_are_refused(tmp_path: Path) -> None:
 
 def test_a_drive_without_truth_has_no_scores(tmp_path: Path) -> None:
     """Where the true path is not known, errors are NaN."""
-    _write_drive(tmp_path)
+    write_drive(tmp_path)
     (tmp_path / "poses" / "00.txt").unlink()
     log = load_kitti(tmp_path, duration=1.0)
     result = replay_kitti(log, KittiConfig(path="log", particles=2))
@@ -196,7 +134,7 @@ def test_a_run_is_written_and_repeats_itself(
     """The command leaves a complete folder, and run again from its config the same metrics to the last digit."""
     log, first, second = (tmp_path / name for name in ("log", "first", "second"))
     log.mkdir()
-    (_write_park if command == "victoria" else _write_drive)(log)
+    (write_park if command == "victoria" else write_drive)(log)
     monkeypatch.chdir(tmp_path)
     options = ("--path", "log", "--duration", "6", "--particles", "3", "--seed", "5")
     for arguments in (

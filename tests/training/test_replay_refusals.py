@@ -1,0 +1,126 @@
+"""What `vslam replay` says of logs that are not there, damaged, or whose times go back."""
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.io import loadmat, savemat
+from small_logs import write_drive, write_log, write_park
+
+from training import cli
+
+WRITERS: dict[str, Callable[[Path], None]] = {
+    "mrclam": lambda folder: write_log(folder, noise=1.0),
+    "victoria": write_park,
+    "kitti": write_drive,
+}
+
+
+def _refusal(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    """Return the one line that a replay ends with; its status is 2, it prints nothing else and makes no folder."""
+    monkeypatch.setattr(sys, "argv", ["vslam", "replay", *arguments])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    shown = capsys.readouterr()
+    assert end.value.code == 2
+    assert not shown.out
+    assert shown.err.count("\n") == 1
+    assert not Path("runs").exists()
+    return shown.err
+
+
+def _turn_back(command: str, log: Path) -> None:
+    """Exchange two times of a log."""
+    if command == "mrclam":
+        file = log / "Robot5_Odometry.dat"
+        lines = file.read_text().splitlines()
+        lines[6], lines[7] = lines[7], lines[6]
+        file.write_text("\n".join(lines))
+    elif command == "victoria":
+        file = log / "aa3_dr.mat"
+        content = {name: values for name, values in loadmat(file).items() if not name.startswith("_")}
+        content["time"][0, [6, 7]] = content["time"][0, [7, 6]]
+        savemat(file, content)
+    else:
+        file = log / "drive.npz"
+        with np.load(file) as archive:
+            content = dict(archive)
+        content["time_stamps"][[6, 7]] = content["time_stamps"][[7, 6]]
+        np.savez(file, **content)
+
+
+@pytest.mark.parametrize(
+    ("command", "message"),
+    [
+        ("mrclam", "path: expected a folder of the MR.CLAM log, got no such folder. Check"),
+        ("victoria", "path: expected a folder of the Victoria Park log, got no such folder. Check"),
+        ("kitti", "path: expected an archive (.npz) of KITTI features, or a folder with one, got no such file. Check"),
+    ],
+)
+def test_a_log_that_is_not_there_is_told_so(
+    command: str, message: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """A path that leads nowhere is named."""
+    monkeypatch.chdir(tmp_path)
+    assert _refusal(monkeypatch, capsys, command, "--path", "none").startswith(f"error {message}")
+
+
+@pytest.mark.parametrize(
+    ("command", "file", "message"),
+    [
+        ("mrclam", "Robot2_Measurement.dat", "path: expected 4 numbers (time barcode range bearing), got"),
+        ("victoria", "VictoriaParkSinSincronizar.mat", "path: expected VictoriaParkSinSincronizar.mat with a MATLAB"),
+        ("kitti", "drive.npz", "path: expected a numpy archive, got a broken file. Get"),
+    ],
+)
+def test_a_file_that_was_cut_is_named(
+    command: str, file: str, message: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+) -> None:  # fmt: skip
+    """Half of a download is refused with the name of the file, before anything is computed."""
+    monkeypatch.chdir(tmp_path)
+    log = tmp_path / "log"
+    log.mkdir()
+    WRITERS[command](log)
+    whole = (log / file).read_bytes()
+    (log / file).write_bytes(whole[: len(whole) // 2])
+    shown = _refusal(monkeypatch, capsys, command, "--path", "log")
+    assert shown.startswith(f"error {message}")
+    assert file in shown
+
+
+@pytest.mark.parametrize(
+    ("command", "message"),
+    [
+        ("mrclam", "path: expected 3 numbers (time velocity angular_velocity) with a time not before that of the line"),
+        ("victoria", "path: expected aa3_dr.mat with times time that never go back, got a time 0.150 s after 0.175 s"),
+        ("kitti", "path: expected drive.npz with two or more rising times in 'time_stamps', got a different one."),
+    ],
+)
+def test_time_that_goes_back_is_refused(
+    command: str, message: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """Two readings in the wrong order end the replay before it begins."""
+    monkeypatch.chdir(tmp_path)
+    log = tmp_path / "log"
+    log.mkdir()
+    WRITERS[command](log)
+    _turn_back(command, log)
+    assert _refusal(monkeypatch, capsys, command, "--path", "log").startswith(f"error {message}")
+
+
+@pytest.mark.parametrize("command", WRITERS)
+def test_a_folder_with_files_is_never_written_to(
+    command: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """The run folder is a new or an empty one; whatever another one holds stays."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("log", "full"):
+        (tmp_path / name).mkdir()
+    WRITERS[command](tmp_path / "log")
+    (tmp_path / "full" / "file").touch()
+    shown = _refusal(monkeypatch, capsys, command, "--path", "log", "--out", "full")
+    assert shown.startswith("error out: expected a new or empty folder, got")
+    assert [file.name for file in (tmp_path / "full").iterdir()] == ["file"]
