@@ -86,6 +86,12 @@ class TeamBelief:
         """(K, 3) float64 [m, m, rad]. Where each robot believes to be, in its own start frame. A copy."""
         return np.array(self._poses)
 
+    @property
+    def position_sigmas(self) -> FloatArray:
+        """(K,) float64 [m]. One sigma of each robot's position in its own start frame, averaged over directions."""
+        traces = [estimate.covariance[0, 0] + estimate.covariance[1, 1] for estimate in self._estimates]
+        return np.sqrt(0.5 * np.array(traces))
+
     def step(self, readings: Sequence[Readings]) -> TeamReport:
         """Take in one tick's readings of all K robots; the first ones are those of the reset.
 

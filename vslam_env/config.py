@@ -52,6 +52,7 @@ class EnvConfig:
         stop_at_recall: The episode terminates when every robot's map holds this share of the landmarks; None: never.
         observation_type: `"dict"`: named arrays. `"flat"`: one float32 vector.
         reward: Weights of the named reward terms.
+        shared_reward: Each robot gets the mean of all robots' rewards, term by term.
         oracle_pose: The robots know their poses, each in its own start frame.
         oracle_association: The robots know which landmark is which.
         oracle_merge: Groups that share three true landmarks merge with the true transform; none tries by itself.
@@ -77,6 +78,7 @@ class EnvConfig:
     stop_at_recall: float | None = None
     observation_type: Literal["dict", "flat"] = "dict"
     reward: Mapping[str, float] = field(default_factory=lambda: {"map_error": 1.0})
+    shared_reward: bool = False
     oracle_pose: bool = False
     oracle_association: bool = False
     oracle_merge: bool = False
@@ -104,7 +106,7 @@ class EnvConfig:
         check_int("max_cycles", self.max_cycles, 1, "Give a number of steps.")
         if self.stop_at_recall is not None:
             check_float("stop_at_recall", self.stop_at_recall, "Give a share or None.", above=0.0, at_most=1.0)
-        for name in ("oracle_pose", "oracle_association", "oracle_merge", "shared_start_view"):
+        for name in ("oracle_pose", "oracle_association", "oracle_merge", "shared_start_view", "shared_reward"):
             if not isinstance(getattr(self, name), bool):
                 raise bad_argument(name, "True or False", getattr(self, name), "Give a bool.")
         if not isinstance(self.reward, Mapping):

@@ -163,7 +163,7 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         self._take_stock()
         self._cycle += 1
 
-        terms = evaluate(self._terms, before, self._standing)
+        terms = evaluate(self._terms, before, self._standing, self.config.shared_reward)
         rewards = np.sum(list(terms.values()), axis=0)
         goal = self.config.stop_at_recall
         terminated = goal is not None and bool(self._standing.map_recalls.min() >= goal)

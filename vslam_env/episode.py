@@ -124,12 +124,15 @@ class Episode:
         return Standing(
             map_errors=np.array([score.error for score in scores]),
             map_recalls=np.array([score.recall for score in scores]),
+            placed_recalls=np.array([score.placed for score in scores]),
             pose_errors=pose_errors[:, 0],
+            pose_sigmas=self.belief.position_sigmas,
             coverage=self.setting.coverage.share([self.belief.cells(r) for r in range(len(scores))]),
             collisions=self._collisions.copy(),
             distances=self._distances.copy(),
             bytes_sent=self.belief.bytes_sent,
             merges=len(self.merge_ticks),
+            time=self.tick * TICK,
         )
 
     # ------------------------------------------------------------------ snapshots

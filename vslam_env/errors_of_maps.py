@@ -1,19 +1,21 @@
 """The simulator's books: which true landmark created each landmark of each map, and how wrong the maps are."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from slam_backend._jit import jit
 from slam_backend.errors import FloatArray, IntArray, check_float
-from slam_backend.geometry import compose, transform_points
+from slam_backend.geometry import compose
 from slam_backend.landmark_map import LandmarkMap
-from slam_backend.metrics import map_error, map_rmse
 from slam_backend.reports import Renaming, TeamReport
 
 FALSE, UNCOUNTED = -1, -2
 UNUSED = -3  # an id that no landmark has had so far
+PLACED = 0.5  # [m] a landmark held nearer than this is well placed
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,12 +27,49 @@ class MapScores:
         rmse: Of the matched landmarks [m]; the cutoff where nothing is matched.
         recall: Matched landmarks over the true ones.
         precision: Matched landmarks over the estimated ones.
+        placed: Matched landmarks closer than 0.5 m over the true ones.
     """
 
     error: float
     rmse: float
     recall: float
     precision: float
+    placed: float
+
+
+@jit
+def _score(
+    means: FloatArray, claims: IntArray, pose: FloatArray, truths: FloatArray, cutoff: float
+) -> tuple[float, float, float, float, float]:
+    """Compute `MapScores` of means (n, 3) that `pose` (3,) moves to the frame of the truths (N, 3), N >= 1."""
+    least = np.full(len(truths), np.inf)
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    estimated = surplus = 0
+    for i in range(len(means)):
+        claim = claims[i]
+        estimated += claim != UNCOUNTED
+        if claim == FALSE:
+            surplus += 1
+        elif claim >= 0:
+            x = pose[0] + c * means[i, 0] - s * means[i, 1] - truths[claim, 0]
+            y = pose[1] + s * means[i, 0] + c * means[i, 1] - truths[claim, 1]
+            z = means[i, 2] - truths[claim, 2]
+            surplus += least[claim] < np.inf
+            least[claim] = min(least[claim], x * x + y * y + z * z)
+    matched = placed = 0
+    squares = 0.0
+    total = 0.5 * cutoff * cutoff * surplus
+    for square in least:
+        if square < np.inf:
+            matched += 1
+            placed += square < PLACED * PLACED
+            squares += square
+            total += min(square, cutoff * cutoff)
+        else:
+            total += 0.5 * cutoff * cutoff
+    rmse = math.sqrt(squares / matched) if matched else cutoff
+    count = len(truths)
+    return math.sqrt(total / count), rmse, matched / count, matched / max(estimated, 1), placed / count
 
 
 class ClaimLedger:
@@ -87,15 +126,8 @@ class ClaimLedger:
             group_map: Its map, in its map frame.
             world_from_group: (3,) [m, m, rad]. Through the robot's own start frame and its true start pose.
         """
-        means = transform_points(world_from_group, group_map.means)
         claims = self.claims(robots, group_map.ids)
-        matched = map_rmse(means, self.true_positions, claims=claims)
-        return MapScores(
-            error=map_error(means, claims, self.true_positions, self.cutoff),
-            rmse=matched.rmse if len(matched.matched) else self.cutoff,
-            recall=matched.recall,
-            precision=matched.precision,
-        )
+        return MapScores(*_score(group_map.means, claims, world_from_group, self.true_positions, self.cutoff))
 
     def get_state(self) -> dict[str, Any]:
         """Return a copy of the books, for the same world's landmarks."""

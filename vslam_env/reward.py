@@ -15,23 +15,29 @@ class Standing:
 
     Attributes:
         map_errors: (K,) float64 [m]. E of each robot's map.
-        map_recalls: (K,) float64. Share of the landmarks that each holds.
+        map_recalls: (K,) float64. Share of the landmarks that each holds, wherever it has them.
+        placed_recalls: (K,) float64. Share of the landmarks that each holds closer than 0.5 m to where they are.
         pose_errors: (K,) float64 [m].
+        pose_sigmas: (K,) float64 [m]. One sigma of the position in its own start frame, as each believes.
         coverage: Share of the free floor that the team has seen.
         collisions: (K,) int64. Ticks since the reset in which each robot was kept from moving as commanded.
         distances: (K,) float64 [m]. Way that each has gone since the reset.
         bytes_sent: (K,) int64. Since the reset.
         merges: Since the reset.
+        time: Since the reset [s].
     """
 
     map_errors: FloatArray
     map_recalls: FloatArray
+    placed_recalls: FloatArray
     pose_errors: FloatArray
+    pose_sigmas: FloatArray
     coverage: float
     collisions: IntArray
     distances: FloatArray
     bytes_sent: IntArray
     merges: int
+    time: float
 
 
 @runtime_checkable
@@ -63,6 +69,22 @@ def _map_error(before: Standing, after: Standing) -> FloatArray:
     return before.map_errors - after.map_errors
 
 
+def _map_error_squared(before: Standing, after: Standing) -> FloatArray:
+    return before.map_errors**2 - after.map_errors**2
+
+
+def _team_map_error(before: Standing, after: Standing) -> FloatArray:
+    return np.full(len(after.map_errors), before.map_errors.mean() - after.map_errors.mean())
+
+
+def _recall(before: Standing, after: Standing) -> FloatArray:
+    return after.placed_recalls - before.placed_recalls
+
+
+def _pose_uncertainty(before: Standing, after: Standing) -> FloatArray:
+    return before.pose_sigmas - after.pose_sigmas
+
+
 def _coverage(before: Standing, after: Standing) -> FloatArray:
     return np.full(len(after.map_errors), after.coverage - before.coverage)
 
@@ -71,11 +93,30 @@ def _collisions(before: Standing, after: Standing) -> FloatArray:
     return (before.collisions - after.collisions).astype(np.float64)
 
 
-TERMS: dict[str, Callable[[Standing, Standing], FloatArray]] = {
-    "map_error": _map_error,  # [m]; telescopes: an episode's return is the first error minus the last
-    "coverage": _coverage,  # the team's gain, for each robot
-    "collisions": _collisions,  # -1 for each tick of pushing against something
+def _distance(before: Standing, after: Standing) -> FloatArray:
+    return before.distances - after.distances
+
+
+def _time(before: Standing, after: Standing) -> FloatArray:
+    return np.full(len(after.map_errors), before.time - after.time)
+
+
+# Potentials telescope: what an episode pays in all is where it ends minus where it began, so that nothing is gained by
+# going to and fro. Costs only ever fall.
+POTENTIALS: dict[str, Callable[[Standing, Standing], FloatArray]] = {
+    "map_error": _map_error,
+    "map_error_squared": _map_error_squared,
+    "team_map_error": _team_map_error,
+    "recall": _recall,
+    "pose_uncertainty": _pose_uncertainty,
+    "coverage": _coverage,
 }
+COSTS: dict[str, Callable[[Standing, Standing], FloatArray]] = {
+    "collisions": _collisions,
+    "distance": _distance,
+    "time": _time,
+}
+TERMS = POTENTIALS | COSTS
 
 RewardSpec = Mapping[str, float] | list[RewardTerm] | tuple[RewardTerm, ...]
 
@@ -106,8 +147,16 @@ def make_terms(reward: RewardSpec) -> tuple[RewardTerm, ...]:
     return tuple(reward)
 
 
-def evaluate(terms: Sequence[RewardTerm], before: Standing, after: Standing) -> dict[str, FloatArray]:
+def evaluate(
+    terms: Sequence[RewardTerm], before: Standing, after: Standing, shared: bool = False
+) -> dict[str, FloatArray]:
     """Return the weighted reward (K,) of each term for a step, by name.
+
+    Args:
+        terms: What is paid for.
+        before: The step.
+        after: The step.
+        shared: Each robot gets the mean over all robots, term by term.
 
     Raises:
         ValueError: If a term returns anything but one finite number for each robot.
@@ -120,5 +169,5 @@ def evaluate(terms: Sequence[RewardTerm], before: Standing, after: Standing) -> 
             raise bad_argument(
                 f"reward term {term.name!r}", f"{robots} finite numbers", value, "Return one number for each robot."
             )
-        rewards[term.name] = term.weight * value
+        rewards[term.name] = term.weight * (np.full(robots, value.mean()) if shared else value)
     return rewards

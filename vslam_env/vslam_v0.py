@@ -25,6 +25,7 @@ def parallel_env(
     max_cycles: int | None = None,
     preset: str | None = None,
     reward: RewardSpec | None = None,
+    shared_reward: bool | None = None,
     observation_type: str | None = None,
     oracle_pose: bool | None = None,
     oracle_association: bool | None = None,
@@ -47,6 +48,7 @@ def parallel_env(
         max_cycles: Steps until the episode is truncated; default 1000.
         preset: `"easy"`, `"standard"` (default) or `"hard"`; see `preset_config`.
         reward: Weights of terms by name (default `{"map_error": 1.0}`), or a list of terms of your own.
+        shared_reward: Each robot gets the mean of all robots' rewards; default its own.
         observation_type: `"dict"` (default) or `"flat"`.
         oracle_pose: The robots know their poses in their own start frames.
         oracle_association: They know which landmark is which.
@@ -74,6 +76,7 @@ def parallel_env(
         "decision_ticks": decision_ticks,
         "max_cycles": max_cycles,
         "observation_type": observation_type,
+        "shared_reward": shared_reward,
         "oracle_pose": oracle_pose,
         "oracle_association": oracle_association,
         "oracle_merge": oracle_merge,

@@ -2,8 +2,9 @@ import numpy as np
 from small_env import MEETING, small_env, turning
 
 from slam_backend.errors import IntArray
+from slam_backend.geometry import inverse, transform_points
 from slam_backend.landmark_map import LandmarkMap
-from slam_backend.metrics import gospa
+from slam_backend.metrics import gospa, map_error, map_rmse
 from slam_backend.reports import Renaming, TeamReport
 from vslam_env.coverage import CoverageMeter
 from vslam_env.errors_of_maps import ClaimLedger
@@ -91,6 +92,29 @@ def test_error_agrees_with_gospa_where_landmarks_are_apart() -> None:
     means = TRUTHS[[0, 1]] + rng.normal(0.0, 0.2, (2, 3))
     score = ledger.score((0,), _map(means, _ids(0, 1)), STAY)
     assert np.isclose(score.error, gospa(means, TRUTHS[COUNTABLE], cutoff=1.0).error)
+
+
+def test_scores_agree_with_the_metrics() -> None:
+    """The compiled score is that of `map_error` and `map_rmse`, whatever is claimed, twice or not at all."""
+    rng = np.random.default_rng(3)
+    for _ in range(50):
+        truths, countable = rng.uniform(-5.0, 5.0, (9, 3)), rng.random(9) < 0.8
+        countable[0] = True
+        ledger = ClaimLedger(1, truths, countable, 0.8)
+        held = rng.integers(-1, 9, 13)
+        ids = np.arange(13)
+        ledger.record(_report((ids,)), [held])
+        pose = rng.uniform(-3.0, 3.0, 3)
+        means = transform_points(pose, truths[held] + rng.normal(0.0, 0.4, (13, 3)))
+        claims = ledger.claims((0,), ids)
+        score = ledger.score((0,), _map(means, ids), inverse(pose))
+        placed = transform_points(inverse(pose), means)
+        matched = map_rmse(placed, ledger.true_positions, claims=claims)
+        assert np.isclose(score.error, map_error(placed, claims, ledger.true_positions, 0.8))
+        assert np.isclose(score.rmse, matched.rmse if len(matched.matched) else 0.8)
+        assert np.allclose((score.recall, score.precision), (matched.recall, matched.precision))
+        errors = np.linalg.norm(placed[matched.matched[:, 0]] - ledger.true_positions[matched.matched[:, 1]], axis=1)
+        assert np.isclose(score.placed, np.count_nonzero(errors < 0.5) / len(ledger.true_positions))
 
 
 def test_infos_agree_with_the_own_start_frame() -> None:

@@ -6,33 +6,81 @@ from small_env import MEETING, small_env, turning
 
 from agents import make_policy
 from slam_backend.alignment import Alignment
-from vslam_env import vslam_v0
+from slam_backend.landmark_map import LandmarkMap
+from slam_backend.reports import TeamReport
+from vslam_env import ExplorationEnv, vslam_v0
+from vslam_env.errors_of_maps import ClaimLedger
 from vslam_env.oracle import true_alignment
-from vslam_env.reward import TERMS, Standing, evaluate, make_terms
+from vslam_env.reward import POTENTIALS, TERMS, Standing, evaluate, make_terms
 
 
 def _standing(**changes: Any) -> Standing:
     values: dict[str, Any] = {
         "map_errors": np.array([0.7, 0.6]),
         "map_recalls": np.array([0.1, 0.2]),
+        "placed_recalls": np.array([0.1, 0.15]),
         "pose_errors": np.zeros(2),
+        "pose_sigmas": np.array([0.02, 0.05]),
         "coverage": 0.25,
         "collisions": np.array([0, 3]),
         "distances": np.array([1.0, 2.0]),
         "bytes_sent": np.zeros(2, np.int64),
         "merges": 0,
+        "time": 3.0,
     }
     return Standing(**values | changes)
 
 
+def _rewards(env: ExplorationEnv, actions: dict[str, Any]) -> tuple[dict[str, float], dict[str, dict[str, Any]]]:
+    """Step and return rewards and infos."""
+    _, rewards, _, _, infos = env.step(actions)
+    return rewards, infos
+
+
 def test_named_terms() -> None:
     """Each named term is what its name says, times its weight."""
-    after = _standing(map_errors=np.array([0.5, 0.65]), coverage=0.5, collisions=np.array([2, 3]))
-    rewards = evaluate(make_terms({"map_error": 2.0, "coverage": 3.0, "collisions": 0.1}), _standing(), after)
-    assert set(rewards) == set(TERMS)
-    assert np.allclose(rewards["map_error"], [0.4, -0.1])
-    assert np.allclose(rewards["coverage"], [0.75, 0.75])
-    assert np.allclose(rewards["collisions"], [-0.2, 0.0])
+    after = _standing(
+        map_errors=np.array([0.5, 0.65]),
+        placed_recalls=np.array([0.3, 0.1]),
+        pose_sigmas=np.array([0.03, 0.01]),
+        coverage=0.5,
+        collisions=np.array([2, 3]),
+        distances=np.array([1.25, 2.0]),
+        time=3.5,
+    )
+    weights = {name: float(weight) for weight, name in enumerate(TERMS, start=2)}
+    rewards = evaluate(make_terms(weights), _standing(), after)
+    expected = {
+        "map_error": [0.2, -0.05],
+        "map_error_squared": [0.7**2 - 0.5**2, 0.6**2 - 0.65**2],
+        "team_map_error": [0.075, 0.075],
+        "recall": [0.2, -0.05],
+        "pose_uncertainty": [-0.01, 0.04],
+        "coverage": [0.25, 0.25],
+        "collisions": [-2.0, 0.0],
+        "distance": [-0.25, 0.0],
+        "time": [-0.5, -0.5],
+    }
+    assert rewards.keys() == expected.keys() == TERMS.keys()
+    for name, values in expected.items():
+        np.testing.assert_allclose(rewards[name], weights[name] * np.array(values), err_msg=name)
+
+
+def test_a_shared_reward_is_the_mean() -> None:
+    """With a shared reward each robot gets the mean of what the robots would get alone, term by term."""
+    weights = {"map_error": 1.0, "collisions": 0.1}
+    alone, shared = (small_env(reward=weights, shared_reward=on, max_cycles=120) for on in (False, True))
+    for env in (alone, shared):
+        env.reset(seed=5)
+    for _ in range(120):
+        actions = {agent: np.array([1.0, 0.0]) for agent in alone.agents}
+        own, own_infos = _rewards(alone, actions)
+        team, team_infos = _rewards(shared, actions)
+        assert np.allclose(list(team.values()), np.mean(list(own.values())))
+        for name in weights:
+            mean = np.mean([info[f"reward/{name}"] for info in own_infos.values()])
+            assert all(np.isclose(info[f"reward/{name}"], mean) for info in team_infos.values())
+    assert own_infos["robot_0"]["collisions"] + own_infos["robot_1"]["collisions"] > 0
 
 
 def test_terms_of_ones_own() -> None:
@@ -55,18 +103,37 @@ def test_terms_of_ones_own() -> None:
             assert info["reward/frugal"] < 0.0
 
 
-def test_reward_telescopes() -> None:
-    """An episode's return is the first map error minus the last, a merge included."""
-    env = small_env(max_cycles=120)
-    first = env.reset(seed=5, options={"start_poses": MEETING})[1]
-    total = dict.fromkeys(env.agents, 0.0)
+def test_potentials_telescope() -> None:
+    """What each potential pays in an episode is where it ends minus where it began, a merge included."""
+    env = small_env(max_cycles=120, reward=dict.fromkeys(POTENTIALS, 1.0))
+    first_infos = env.reset(seed=5, options={"start_poses": MEETING})[1]
+    first = env.episode.standing(env.episode.map_scores(), env.episode.pose_errors())
+    totals = {agent: dict.fromkeys(POTENTIALS, 0.0) for agent in env.agents}
     while env.agents:
         _, rewards, _, _, infos = env.step(turning(env.agents))
         for agent, reward in rewards.items():
-            total[agent] += reward
+            assert np.isclose(reward, sum(infos[agent][f"reward/{name}"] for name in POTENTIALS))
+            for name in POTENTIALS:
+                totals[agent][name] += infos[agent][f"reward/{name}"]
+    last = env.episode.standing(env.episode.map_scores(), env.episode.pose_errors())
     assert any(event.kind == "merge" for event in env.events)
-    for agent in env.possible_agents:
-        assert np.isclose(total[agent], first[agent]["map_error"] - infos[agent]["map_error"], atol=1e-12)
+    for robot, agent in enumerate(env.possible_agents):
+        for name, term in POTENTIALS.items():
+            assert np.isclose(totals[agent][name], term(first, last)[robot], atol=1e-12), name
+        lost = first_infos[agent]["map_error"] - infos[agent]["map_error"]
+        assert np.isclose(totals[agent]["map_error"], lost, atol=1e-12)
+
+
+def test_a_map_that_is_placed_wrong_has_no_recall() -> None:
+    """The term `recall` pays for landmarks closer than 0.5 m to where they are; the info counts all that are held."""
+    truths = np.array([[1.0, 2.0, 0.0], [4.0, 1.0, 0.2], [6.0, 6.0, 0.1]])
+    books = ClaimLedger(1, truths, np.ones(3, np.bool_), 1.0)
+    ids = np.arange(2)
+    books.record(TeamReport(0, (ids,), (ids,), ((0,),), (), ()), [ids])
+    held = LandmarkMap(truths[:2], np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 2)), ids=ids)
+    for shift, placed in ((0.0, 2 / 3), (0.4, 2 / 3), (0.6, 0.0)):
+        scores = books.score((0,), held, np.array([shift, 0.0, 0.0]))
+        assert (scores.recall, scores.placed) == (2 / 3, placed)
 
 
 def test_a_wrong_merge_costs() -> None:
@@ -92,33 +159,40 @@ def test_a_wrong_merge_costs() -> None:
 
 
 @pytest.mark.slow
-def test_the_reward_cannot_be_farmed() -> None:
-    """200 idle ticks, or a second turn on the spot, change the return by less than 1 % of a frontier episode's.
+def test_no_potential_can_be_farmed() -> None:
+    """200 idle ticks, or a second turn on the spot, gain less than 1 % of what a frontier episode changes.
 
-    Means over 20 seeds of one robot in the office; the frontier episode is 40 s long.
+    Means over 20 seeds of one robot in the office; the frontier episode is 40 s long. They lose less than 1 %, too,
+    but for the uncertainty of the pose, which wanders by fractions of a millimetre.
     """
+    weights = dict.fromkeys(POTENTIALS, 1.0)
+
+    def paid(infos: Any) -> Any:
+        return np.array([infos["robot_0"][f"reward/{name}"] for name in POTENTIALS])
+
     idle, turn, frontier = [], [], []
-    spinner = vslam_v0.parallel_env(num_robots=1, decision_ticks=42)  # at 1.5 rad/s a whole turn and a little
-    idler = vslam_v0.parallel_env(num_robots=1, decision_ticks=200)
-    explorer = vslam_v0.parallel_env(num_robots=1, max_cycles=40, action_type="goal")
+    spinner = vslam_v0.parallel_env(num_robots=1, decision_ticks=42, reward=weights)  # 1.5 rad/s: a turn and a little
+    idler = vslam_v0.parallel_env(num_robots=1, decision_ticks=200, reward=weights)
+    explorer = vslam_v0.parallel_env(num_robots=1, max_cycles=40, action_type="goal", reward=weights)
     for seed in range(20):
         spinner.reset(seed=seed)
-        turns = [spinner.step({"robot_0": np.array([0.0, 1.0])})[1]["robot_0"] for _ in range(2)]
-        turn.append(turns[1])
+        turn.append([paid(spinner.step({"robot_0": np.array([0.0, 1.0])})[4]) for _ in range(2)][1])
         idler.reset(seed=seed)
         # The idle robot has seen what it sees: before that, standing and looking is honest work.
-        looks = [idler.step({"robot_0": np.zeros(2)})[1]["robot_0"] for _ in range(2)]
-        idle.append(looks[1])
+        idle.append([paid(idler.step({"robot_0": np.zeros(2)})[4]) for _ in range(2)][1])
 
         policy, rng = make_policy("frontier", "goal"), np.random.default_rng(seed)
         observations = explorer.reset(seed=seed)[0]
-        total = 0.0
+        total = np.zeros(len(weights))
         while explorer.agents:
             action = policy.act(observations["robot_0"], explorer.belief("robot_0"), rng)
-            observations, rewards, *_ = explorer.step({"robot_0": action})
-            total += rewards["robot_0"]
+            observations, _, _, _, infos = explorer.step({"robot_0": action})
+            total += paid(infos)
         frontier.append(total)
-    gained = float(np.mean(frontier))
-    assert gained > 0.03
-    assert abs(np.mean(idle)) < 0.01 * gained
-    assert abs(np.mean(turn)) < 0.01 * gained
+    changed = dict(zip(POTENTIALS, np.mean(frontier, axis=0), strict=True))
+    assert changed["map_error"] > 0.03
+    assert changed["coverage"] > 0.1
+    for trick in (np.mean(idle, axis=0), np.mean(turn, axis=0)):
+        for (name, earned), gained in zip(changed.items(), trick, strict=True):
+            assert gained < 0.01 * abs(earned), name
+            assert gained > (-0.001 if name == "pose_uncertainty" else -0.01 * abs(earned)), name
