@@ -84,8 +84,7 @@ def _describe(
     column_of = np.empty(EDGES, dtype=np.int64)
     column_share = np.empty(EDGES, dtype=np.float64)
     boxes = np.empty((EDGES - 1, EDGES - 1), dtype=np.float32)
-    dx = np.empty(SAMPLES, dtype=np.float32)
-    dy = np.empty(SAMPLES, dtype=np.float32)
+    sums = np.empty((4, SAMPLES), dtype=np.float32)  # over the five rows of a cell, column by column
     half = 0.5 * (EDGES - 1)
     for n in range(len(points)):
         s = scales[n]
@@ -109,23 +108,24 @@ def _describe(
                 boxes[j, i] = (lattice[j + 1, i + 1] - lattice[j + 1, i]) - (lattice[j, i + 1] - lattice[j, i])
         square = np.float32(0.0)
         for cell_row in range(4):
-            for i in range(16):
-                descriptors[n, 16 * cell_row + i] = 0.0
-            for k in range(5):
-                j = 5 * cell_row + k
+            for i in range(SAMPLES):
+                sums[0, i], sums[1, i], sums[2, i], sums[3, i] = 0.0, 0.0, 0.0, 0.0
+            for j in range(5 * cell_row, 5 * cell_row + 5):
                 for i in range(SAMPLES):
                     w = weights[j] * weights[i]
                     falling = boxes[j + 1, i + 1] - boxes[j, i]
                     rising = boxes[j + 1, i] - boxes[j, i + 1]
-                    dx[i] = w * (falling - rising)
-                    dy[i] = w * (falling + rising)
-                for cell in range(4):
-                    at = 16 * cell_row + 4 * cell
+                    dx, dy = w * (falling - rising), w * (falling + rising)
+                    sums[0, i] += dx
+                    sums[1, i] += dy
+                    sums[2, i] += abs(dx)
+                    sums[3, i] += abs(dy)
+            for cell in range(4):
+                for part in range(4):
+                    total = np.float32(0.0)
                     for i in range(5 * cell, 5 * cell + 5):
-                        descriptors[n, at] += dx[i]
-                        descriptors[n, at + 1] += dy[i]
-                        descriptors[n, at + 2] += abs(dx[i])
-                        descriptors[n, at + 3] += abs(dy[i])
+                        total += sums[part, i]
+                    descriptors[n, 16 * cell_row + 4 * cell + part] = total
         for i in range(SIZE):
             square += descriptors[n, i] * descriptors[n, i]
         length = np.sqrt(square)

@@ -1,0 +1,262 @@
+"""`StereoFrontEnd`: a rectified pair of images becomes `Measurements`: corners, matches along rows, points.
+
+Guards, in this order; each throws matches away and none brings any back:
+
+1. mutual: of two matched corners each is the other's most similar one near its row;
+2. patch: the patch around the left corner is laid over the right image, to a fraction of a pixel, and fits;
+3. rows: both rows then agree;
+4. back: laid from right to left, the patch comes back to where it came from;
+5. range: the point is neither nearer nor farther than asked for.
+"""
+
+from dataclasses import dataclass, field
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from slam_backend.camera import StereoCamera
+from slam_backend.errors import (
+    BoolArray,
+    Float32Array,
+    FloatArray,
+    bad_argument,
+    check_array,
+    check_choice,
+    check_float,
+    check_int,
+)
+from slam_backend.frontend._matching_kernels import LARGEST_PATCH, match_rows, refine
+from slam_backend.frontend.corners import CornerOptions, Corners, find_corners, spread_order
+from slam_backend.frontend.descriptors import DESCRIPTORS, KINDS, describe_points
+from slam_backend.frontend.images import Image, check_image
+from slam_backend.measurements import Measurements
+
+GUARDS = ("mutual", "patch", "rows", "back", "range")
+LEAST_SCALE, LARGEST_SCALE = 1.0, 8.0  # px; of windows of constant physical size
+SWAPPED = 12  # so many points the other way round, and three times as many as the right way, tell of swapped images
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FrontEndOptions:
+    """How a stereo pair is measured.
+
+    Attributes:
+        descriptor: "usurf", "sift" or "orb".
+        corners: What is a corner, and how many are kept in an image.
+        scale: s of the descriptors [px], by which corners are matched between the eyes.
+        window: Side of a descriptor's window [m], the same at any distance; None: 21 `scale` pixels at any distance.
+        row_tolerance: Largest difference of the rows of two corners [px].
+        patch_half: Patches are 2 `patch_half` + 1 pixels wide.
+        iterations: At most so many to lay a patch over another.
+        least_correlation: Of two patches that fit.
+        row_difference: Largest difference of their rows [px].
+        back_difference: Largest difference between the ways forward and back [px].
+        nearest: Points nearer than this are dropped [m].
+        max_measurements: At most so many; those in front of `spread_order` are kept. None: all.
+    """
+
+    descriptor: Literal["usurf", "sift", "orb"] = "usurf"
+    corners: CornerOptions = field(default_factory=CornerOptions)
+    scale: float = 2.3
+    window: float | None = None
+    row_tolerance: float = 1.5
+    patch_half: int = 5
+    iterations: int = 8
+    least_correlation: float = 0.9
+    row_difference: float = 0.5
+    back_difference: float = 0.3
+    nearest: float = 0.4
+    max_measurements: int | None = None
+
+    def __post_init__(self) -> None:
+        check_choice("front_end.descriptor", self.descriptor, DESCRIPTORS)
+        if not isinstance(self.corners, CornerOptions):
+            raise bad_argument(
+                "front_end.corners", "CornerOptions", self.corners, "Build them with CornerOptions(...)."
+            )
+        for name in ("scale", "row_tolerance", "row_difference", "back_difference", "nearest"):
+            check_float(f"front_end.{name}", getattr(self, name), "Give a positive number.", above=0.0)
+        if self.window is not None:
+            check_float("front_end.window", self.window, "Give metres, or None.", above=0.0)
+        half = check_int("front_end.patch_half", self.patch_half, 1, "5 is a good one.")
+        if 2 * half + 1 > LARGEST_PATCH:
+            expected = f"an int <= {LARGEST_PATCH // 2}"
+            raise bad_argument("front_end.patch_half", expected, half, "Large patches cover several depths.")
+        check_int("front_end.iterations", self.iterations, 1, "8 are enough.")
+        cure = "Give a correlation."
+        check_float("front_end.least_correlation", self.least_correlation, cure, at_least=0.0, at_most=1.0)
+        if self.max_measurements is not None:
+            check_int("front_end.max_measurements", self.max_measurements, 1, "Use None to keep all.")
+
+
+class StereoMatches(NamedTuple):
+    """Corners of both eyes that were matched by descriptor, and what each guard said of them.
+
+    Attributes:
+        corners: (n, 2) float64 [px]. In the left image.
+        responses: (n,) float64 [-]. Harris responses there.
+        corner_disparity: (n,) float64 [px]. Difference of the columns of both corners.
+        disparity: (n,) float64 [px]. By patches; meaningless where the guard "patch" failed.
+        descriptors: (n, d) float32. Of the left corners, at the scale by which they were matched.
+        passed: (5, n) bool. Whether a match passed the guard, for each of `GUARDS` and whatever the others said.
+        num_left: Corners in the left image.
+        num_right: Corners in the right image.
+    """
+
+    corners: FloatArray
+    responses: FloatArray
+    corner_disparity: FloatArray
+    disparity: FloatArray
+    descriptors: Float32Array
+    passed: BoolArray
+    num_left: int
+    num_right: int
+
+
+class StereoFrame(NamedTuple):
+    """What one pair of images says.
+
+    Attributes:
+        measurements: n points with descriptors, without covariances: the camera model holds at the predicted point.
+        pixels: (n, 3) float64 [px]. Column and row in the left image, and disparity; pixel centres are at integers.
+        responses: (n,) float64 [-]. Harris responses.
+        matches: What they were chosen from.
+    """
+
+    measurements: Measurements
+    pixels: FloatArray
+    responses: FloatArray
+    matches: StereoMatches
+
+
+class StereoFrontEnd:
+    """Measures rectified pairs of one camera.
+
+    Args:
+        camera: Focal length, baseline, size of the images, and the range within which points are reported.
+        options: How.
+        centre_px: (2,) [px]. Column and row of the optical axis, pixel centres at integers, the same in both eyes;
+            None: the middle of the image.
+
+    Example:
+        >>> eye = StereoFrontEnd(StereoCamera(width=64, height=48))
+        >>> grey = np.full((48, 64), 128, np.uint8)
+        >>> len(eye.measure(grey, grey).measurements)          # nothing to be seen
+        0
+    """
+
+    def __init__(self, camera: Any, options: FrontEndOptions | None = None, centre_px: Any | None = None) -> None:
+        if not isinstance(camera, StereoCamera):
+            cure = "Points need a focal length and a baseline: read them with slam_backend.readers.calibration."
+            raise bad_argument("camera", "a StereoCamera", camera, cure)
+        self.camera: StereoCamera = camera
+        self.options = FrontEndOptions() if options is None else options
+        middle = (0.5 * (camera.width - 1), 0.5 * (camera.height - 1))
+        centre = check_array("centre_px", middle if centre_px is None else centre_px, (2,), "Give column and row.")
+        self._centre: FloatArray = np.append(centre, 0.0)
+        self._kind = KINDS[self.options.descriptor]
+        span = camera.focal_px * camera.baseline
+        self._least, self._largest = span / camera.max_range, span / self.options.nearest
+
+    @property
+    def descriptor_size(self) -> int:
+        """Length of the descriptors."""
+        return self._kind.size
+
+    def measure(self, left: Any, right: Any) -> StereoFrame:
+        """Measure a rectified pair.
+
+        Args:
+            left: (H, W) uint8, of the camera's size.
+            right: Likewise.
+
+        Returns:
+            What was seen, spread over the image; nothing where images are empty or saturated.
+
+        Raises:
+            ValueError: If an image is in colour, not of eight bits or not of the camera's size, or if the pair is
+                swapped.
+        """
+        left, right = self._check("left", left), self._check("right", right)
+        matches = self.match(left, right)
+        kept = np.flatnonzero(matches.passed.all(axis=0))
+        if len(kept) < SWAPPED:
+            self._check_order(left, right, len(kept))
+        order = spread_order(matches.corners[kept], matches.responses[kept], self.options.corners.cell)
+        kept = kept[order]
+        pixels = np.column_stack([matches.corners[kept], matches.disparity[kept]])
+        points = self.camera.triangulate(pixels - self._centre)
+        near = np.flatnonzero((points * points).sum(axis=1) <= self.camera.max_range**2)
+        near = near[: self.options.max_measurements]
+        pixels, points, kept = pixels[near], points[near], kept[near]
+        descriptors = matches.descriptors[kept]
+        if self.options.window is not None:
+            scales = self.options.window * self.camera.focal_px / (21.0 * points[:, 2])
+            scales = np.clip(scales, LEAST_SCALE, LARGEST_SCALE)
+            descriptors = describe_points(left, pixels[:, :2], scales, self.options.descriptor)
+            known = descriptors.any(axis=1)
+            pixels, points, descriptors, kept = pixels[known], points[known], descriptors[known], kept[known]
+        return StereoFrame(Measurements._trusted(points, descriptors), pixels, matches.responses[kept], matches)
+
+    def match(self, left: Image, right: Image) -> StereoMatches:
+        """Match the corners of a pair that was checked already; all matches by descriptor are returned."""
+        options = self.options
+        (ours, described), (theirs, their_descriptors) = (self._describe(image) for image in (left, right))
+        partner, mutual, _ = match_rows(
+            ours.points,
+            theirs.points,
+            described,
+            their_descriptors,
+            options.row_tolerance,
+            0.8 * self._least,
+            1.2 * self._largest,
+            self._kind.stereo_gate**2,
+        )
+        found = partner >= 0
+        corners, others = ours.points[found], theirs.points[partner[found]]
+        laid = refine(left, right, corners, others, options.patch_half, options.iterations)
+        forward, row_forward, backward, row_backward, *correlations = laid.T
+        disparity = 0.5 * (forward + backward)
+        return StereoMatches(
+            corners=corners,
+            responses=ours.responses[found],
+            corner_disparity=corners[:, 0] - others[:, 0],
+            disparity=disparity,
+            descriptors=described[found],
+            passed=np.stack(
+                [
+                    mutual[found],
+                    np.minimum(*correlations) >= options.least_correlation,
+                    np.abs(0.5 * (row_forward + row_backward)) <= options.row_difference,
+                    np.hypot(forward - backward, row_forward - row_backward) <= options.back_difference,
+                    (disparity >= self._least) & (disparity <= self._largest),
+                ]
+            ),
+            num_left=len(ours.points),
+            num_right=len(theirs.points),
+        )
+
+    def _check(self, name: str, image: Any) -> Image:
+        checked = check_image(name, image)
+        expected = (self.camera.height, self.camera.width)
+        if checked.shape != expected:
+            cure = "Rectify it to the camera's size, or correct the camera."
+            raise bad_argument(name, f"an image of {expected[1]} x {expected[0]} px", f"shape {checked.shape}", cure)
+        return checked
+
+    def _check_order(self, left: Image, right: Image, count: int) -> None:
+        """Raise if a pair in which hardly anything was found shows a lot the other way round."""
+        reverse = int(self.match(right, left).passed.all(axis=0).sum())
+        if reverse >= SWAPPED and reverse > 3 * count:
+            got = f"a pair with {reverse} points at negative disparities and {count} at positive ones"
+            raise bad_argument("left, right", "the left image first", got, "Swap the images.")
+
+    def _describe(self, image: Image) -> tuple[Corners, Float32Array]:
+        """Return the corners of an image and their descriptors; those that cannot be described are left out."""
+        corners = find_corners(image, self.options.corners)
+        scales = np.full(len(corners.points), self.options.scale)
+        descriptors = describe_points(image, corners.points, scales, self.options.descriptor)
+        known = descriptors.any(axis=1)
+        if known.all():
+            return corners, descriptors
+        return Corners(corners.points[known], corners.responses[known]), descriptors[known]
