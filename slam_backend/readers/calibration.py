@@ -1,0 +1,213 @@
+"""Calibrations of stereo pairs: KITTI's rectified ones and EuRoC's raw ones, and how raw pairs are rectified."""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from slam_backend.camera import StereoCamera
+from slam_backend.errors import Float32Array, FloatArray, bad_argument, check_array, check_float
+from slam_backend.frontend.images import Image, check_image
+
+SMOOTH_ROTATION = 1e-4  # largest deviation of a rotation matrix from orthogonality
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RectifiedPair:
+    """The calibration of a rectified pair: both eyes look the same way, rows agree.
+
+    Attributes:
+        focal_px: Focal length [px]; pixels are square.
+        centre_px: (2,) float64 [px]. Column and row of the optical axis, the same in both eyes.
+        baseline: Distance between the eyes [m].
+    """
+
+    focal_px: float
+    centre_px: FloatArray
+    baseline: float
+
+    def camera(self, width: int, height: int, **changes: Any) -> StereoCamera:
+        """Return the camera for images of this size; `changes` are further fields of `StereoCamera`."""
+        return StereoCamera(focal_px=self.focal_px, baseline=self.baseline, width=width, height=height, **changes)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Eye:
+    """One camera as its maker calibrated it: a pinhole with radial and tangential distortion.
+
+    Attributes:
+        width: Of the image [px].
+        height: Likewise.
+        matrix: (3, 3) float64. Intrinsics.
+        distortion: (4,) or (5,) float64. k1, k2, p1, p2 and perhaps k3.
+        body_from_camera: (4, 4) float64. Rigid motion from camera axes to those of the body [m].
+    """
+
+    width: int
+    height: int
+    matrix: FloatArray
+    distortion: FloatArray
+    body_from_camera: FloatArray
+
+
+class Rectifier:
+    """Raw images of two eyes become a rectified pair of the same size.
+
+    Args:
+        left: The left eye.
+        right: The right eye.
+
+    Attributes:
+        pair: The calibration of what `rectify` returns.
+        body_from_camera: (4, 4) float64. From the axes of the rectified left camera to those of the body [m].
+
+    Raises:
+        ValueError: If the images differ in size, or the right eye does not stand to the right of the left one.
+    """
+
+    def __init__(self, left: Eye, right: Eye) -> None:
+        if (left.width, left.height) != (right.width, right.height):
+            got = f"a pair of {left.width} x {left.height} and {right.width} x {right.height} px"
+            raise bad_argument("right", "an eye with images of the left one's size", got, "Check the calibrations.")
+        self._size = left.width, left.height
+        right_from_left = np.linalg.solve(right.body_from_camera, left.body_from_camera)
+        found: Any = cv2.stereoRectify(
+            left.matrix,
+            left.distortion,
+            right.matrix,
+            right.distortion,
+            self._size,
+            right_from_left[:3, :3],
+            right_from_left[:3, 3:],
+            flags=cv2.CALIB_ZERO_DISPARITY,
+            alpha=0.0,
+        )
+        rectified_from_left, rectified_from_right, left_projection, right_projection = found[:4]
+        focal = float(left_projection[0, 0])
+        baseline = -float(right_projection[0, 3]) / focal
+        if baseline <= 0.0 or abs(float(right_projection[1, 3])) > abs(float(right_projection[0, 3])):
+            cure = "Swap the calibrations; eyes above each other are not supported."
+            raise bad_argument("right", "an eye to the right of the left one", f"a baseline of {baseline:.3f} m", cure)
+        self.pair = RectifiedPair(focal, left_projection[:2, 2].copy(), baseline)
+        back = np.eye(4)
+        back[:3, :3] = rectified_from_left.T
+        self.body_from_camera = left.body_from_camera @ back
+        self._maps = [
+            self._map(eye, turn, projection)
+            for eye, turn, projection in (
+                (left, rectified_from_left, left_projection),
+                (right, rectified_from_right, right_projection),
+            )
+        ]
+
+    @property
+    def camera(self) -> StereoCamera:
+        """The rectified camera."""
+        return self.pair.camera(*self._size)
+
+    def rectify(self, left: Any, right: Any) -> tuple[Image, Image]:
+        """Return the rectified images (H, W) uint8 of a raw pair, interpolated linearly.
+
+        Raises:
+            ValueError: If an image is not grey and of eight bits, or of another size than the calibration's.
+        """
+        rectified = []
+        for name, image, (columns, rows) in zip(("left", "right"), (left, right), self._maps, strict=True):
+            checked = check_image(name, image)
+            if checked.shape != (self._size[1], self._size[0]):
+                expected = f"an image of {self._size[0]} x {self._size[1]} px"
+                raise bad_argument(name, expected, f"shape {checked.shape}", "Check that the calibration is its own.")
+            rectified.append(np.asarray(cv2.remap(checked, columns, rows, cv2.INTER_LINEAR), dtype=np.uint8))
+        return rectified[0], rectified[1]
+
+    def _map(self, eye: Eye, turn: FloatArray, projection: FloatArray) -> tuple[Float32Array, Float32Array]:
+        """Return where each pixel of the rectified image comes from."""
+        maps: Any = cv2.initUndistortRectifyMap(
+            eye.matrix, eye.distortion, turn, projection[:, :3], self._size, cv2.CV_32FC1
+        )
+        return maps[0], maps[1]
+
+
+def load_kitti_calibration(path: str | Path) -> RectifiedPair:
+    """Read a file `calib.txt` of KITTI's odometry benchmark: projection matrices of the left and the right eye.
+
+    Args:
+        path: The file; its first two matrices of 12 numbers are used, with or without names such as `P0:`.
+
+    Raises:
+        ValueError: If the file is missing, holds no two such matrices, or these are no rectified pair.
+    """
+    file = Path(path)
+    rows = []
+    for line in _text(file).splitlines():
+        try:
+            numbers = [float(word) for word in line.split(":", 1)[-1].split()]
+        except ValueError:
+            numbers = []
+        if len(numbers) == 12:
+            rows.append(numbers)
+    if len(rows) < 2 or not np.isfinite(rows).all():
+        expected = f"{file.name} with two matrices of 12 numbers"
+        raise bad_argument("calibration", expected, f"a file with {len(rows)}", f"Get {str(file)!r} again.")
+    left, right = (np.array(row).reshape(3, 4) for row in rows[:2])
+    focal, baseline = left[0, 0], (left[0, 3] - right[0, 3]) / left[0, 0]
+    if not (np.allclose(left[:, :3], right[:, :3]) and np.isclose(left[1, 1], focal) and focal > 0.0 and baseline > 0):
+        expected = f"{file.name} with a rectified pair of square pixels, the left eye first"
+        raise bad_argument("calibration", expected, "other matrices", f"Correct {str(file)!r}.")
+    return RectifiedPair(float(focal), left[:2, 2].copy(), float(baseline))
+
+
+def load_euroc_calibration(left: str | Path, right: str | Path) -> Rectifier:
+    """Read two files `sensor.yaml` of EuRoC's cameras and prepare the rectification of their images.
+
+    Raises:
+        ValueError: If a file is missing or lacks an entry, or the two are no stereo pair.
+    """
+    return Rectifier(load_euroc_eye(left), load_euroc_eye(right))
+
+
+def load_euroc_eye(path: str | Path) -> Eye:
+    """Read one file `sensor.yaml` of EuRoC's cameras: pinhole, radial-tangential distortion, place on the body."""
+    file = Path(path)
+    text = re.sub(r"#[^\n]*", "", _text(file))
+    model = re.search(r"distortion_model:\s*(\S+)", text)
+    if model is not None and model.group(1) not in ("radial-tangential", "radtan", "plumb_bob"):
+        raise bad_argument("calibration", "the distortion model radial-tangential", repr(model.group(1)), "Undistort.")
+    pose = _numbers(file, text, "data", (16,)).reshape(4, 4)
+    turn = pose[:3, :3]
+    rigid = np.abs(turn @ turn.T - np.eye(3)).max() < SMOOTH_ROTATION and np.linalg.det(turn) > 0.0
+    if not rigid or not np.array_equal(pose[3], [0.0, 0.0, 0.0, 1.0]):
+        raise bad_argument("calibration", f"{file.name} with a rigid motion T_BS", "another matrix", "Correct it.")
+    fu, fv, cu, cv = _numbers(file, text, "intrinsics", (4,))
+    for focal in (fu, fv):
+        check_float("calibration.intrinsics", float(focal), "Focal lengths are positive.", above=0.0)
+    width, height = _numbers(file, text, "resolution", (2,))
+    return Eye(
+        int(width),
+        int(height),
+        np.array([[fu, 0.0, cu], [0.0, fv, cv], [0.0, 0.0, 1.0]]),
+        _numbers(file, text, "distortion_coefficients", (4, 5)),
+        pose,
+    )
+
+
+def _text(file: Path) -> str:
+    try:
+        return file.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        cure = f"Check {str(file)!r}."
+        raise bad_argument("calibration", "a readable file of a calibration", "no such file", cure) from error
+
+
+def _numbers(file: Path, text: str, key: str, counts: tuple[int, ...]) -> FloatArray:
+    """Return the list of numbers after a key."""
+    found = re.search(rf"\b{key}:\s*\[([^\]]*)\]", text)
+    words = [] if found is None else [word for word in re.split(r"[,\s]+", found.group(1)) if word]
+    if len(words) not in counts:
+        expected = f"{file.name} with {counts[0]} numbers {key!r}"
+        raise bad_argument("calibration", expected, f"a list of {len(words)}", f"Get {str(file)!r} again.")
+    cure = f"Correct {key!r} in {str(file)!r}."
+    return np.asarray(check_array("calibration", words, (len(words),), cure))
