@@ -51,7 +51,7 @@ def draw_fig1(file: Path, run: StereoRun, panels: Sequence[tuple[str, str, Cloud
             handles=_legend(len(run.true_paths)), loc="outside lower center", ncols=3, frameon=False, columnspacing=1.2,
             handlelength=1.6, borderpad=0.0,
         )  # fmt: skip
-        figure.savefig(file, dpi=300)
+        figure.savefig(file, dpi=270)
 
 
 def _draw_office(ax: Axes, office: Office) -> None:

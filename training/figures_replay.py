@@ -1,4 +1,4 @@
-"""The picture of a replay: paths and maps against the truth, one panel per robot and one for each joint map."""
+"""The pictures of a replay: paths and maps against the truth, a panel per robot and joint map, and joint maps alone."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -48,6 +48,25 @@ def draw_replay(file: Path, log: MrclamLog, replay: Replay, paths: Sequence[Path
         figure.savefig(file, dpi=110)
 
 
+def draw_joint_map(
+    file: Path, log: MrclamLog, replay: Replay, paths: Sequence[PathScore | None], group: tuple[int, ...]
+) -> None:
+    """Draw the map that a group of robots shares at the end, with their paths, alone into a PNG file.
+
+    Args:
+        file: Where to write.
+        log: With the truth.
+        replay: What was estimated.
+        paths: Scores of `score_path`, per robot; None where the truth is not known.
+        group: Its robots, counted from 0, as in `Replay.groups`.
+    """
+    with mpl.rc_context({"font.size": 9, "axes.titlesize": 10}):
+        figure = Figure(figsize=(5.2, 7.4), layout="constrained")
+        FigureCanvasAgg(figure)
+        _draw_group(figure.subplots(), log, replay, paths, group)
+        figure.savefig(file, dpi=110)
+
+
 def _draw_robot(ax: Axes, log: MrclamLog, replay: Replay, path: PathScore | None, robot: int) -> None:
     """Draw one robot's path and dead reckoning, each fitted to the true path, and its map, fitted to the landmarks."""
     colour = COLOURS[robot % len(COLOURS)]
@@ -79,7 +98,8 @@ def _draw_group(
             points = transform_points(compose(fitted.world_from_map, first_from_own), replay.paths[robot][:, :2])
             score = paths[robot]
             if score is not None:
-                ax.plot(*score.truth[:, :2].T, color=TRUTH, alpha=0.35, lw=1.6)
+                label = "true paths" if robot == first else None
+                ax.plot(*score.truth[:, :2].T, color=TRUTH, alpha=0.35, lw=1.6, label=label)
             label = f"robot {log.robots[robot].robot}"
             ax.plot(*points.T, color=COLOURS[robot % len(COLOURS)], lw=0.7, alpha=0.85, label=label)
         _draw_landmarks(ax, fitted.landmarks, "black")

@@ -10,10 +10,12 @@ from matplotlib.figure import Figure
 
 from slam_backend.errors import FloatArray, IntArray
 from slam_backend.geometry import transform_points
-from training.figures_replay import COLOURS
+from training.figures_replay import COLOURS, TRUTH
 from training.replay_one import OneReplay, PositionScore
 
 MARGIN = 0.06  # of the larger extent, around what the picture must show
+STRAY = 0.001  # share of the known positions at each edge that it need not show: a fix may jump by 100 m
+WIDTH = 8.0  # [in]
 OFTEN = 10  # measurements that make a landmark a sure one
 
 
@@ -28,7 +30,8 @@ def draw_one(
 ) -> None:
     """Draw a replay into a PNG file, all fitted to the truth, each path by its own SE(2) alignment.
 
-    Dead reckoning may leave the picture, which shows estimate and truth.
+    Dead reckoning may leave the picture, which shows estimate and truth, stray known positions apart; the legend says
+    how many of these lie outside.
 
     Args:
         file: Where to write.
@@ -44,28 +47,38 @@ def draw_one(
     estimate, reckoned = (transform_points(fit, path) for fit, path in zip(fits, paths, strict=True))
     landmarks = transform_points(fits[0], result.landmarks.means[:, :2])
     tails = ("", "") if scores is None else tuple(f", {score.aligned:.2f} m RMS" for score in scores)
+    low, high = _window(estimate, truth)
     with mpl.rc_context({"font.size": 9, "axes.titlesize": 10}):
-        figure = Figure(figsize=(9.0, 9.0), layout="constrained")
+        ratio = float(np.clip((high - low)[1] / (high - low)[0], 0.4, 1.6))
+        figure = Figure(figsize=(WIDTH, 0.93 * WIDTH * ratio + 0.6), layout="constrained")
         FigureCanvasAgg(figure)
         ax = figure.subplots()
+        if truth is not None:
+            outside = np.count_nonzero(((truth < low) | (truth > high)).any(axis=1))
+            label = f"{truth_label} ({outside} of {len(truth)} outside)" if outside else truth_label
+            ax.plot(*truth.T, ls="", marker=".", ms=5.0, mew=0.0, color=TRUTH, label=label)
         _draw_landmarks(ax, landmarks, result.landmarks.counts)
         ax.plot(*reckoned.T, color=COLOURS[1], lw=0.8, ls=":", label=f"odometry{tails[1]}")
-        ax.plot(*estimate.T, color=COLOURS[0], lw=1.1, label=f"estimate{tails[0]}")
-        shown = [estimate]
-        if truth is not None:
-            ax.plot(*truth.T, ls="", marker=".", ms=2.5, color="#202020", label=truth_label, zorder=4)
-            shown.append(truth)
-        low, high = np.vstack(shown).min(axis=0), np.vstack(shown).max(axis=0)
-        room = MARGIN * float((high - low).max()) + 1e-3
+        ax.plot(*estimate.T, color=COLOURS[0], lw=0.9, label=f"estimate{tails[0]}")
         ax.set_aspect("equal", adjustable="box")
-        ax.set_xlim(low[0] - room, high[0] + room)
-        ax.set_ylim(low[1] - room, high[1] + room)
+        ax.set_xlim(low[0], high[0])
+        ax.set_ylim(low[1], high[1])
         ax.set_title(title)
         ax.set_xlabel("x [m]")
         ax.set_ylabel("y [m]")
         ax.grid(alpha=0.15)
         ax.legend(fontsize=8, loc="best", framealpha=0.85)
-        figure.savefig(file, dpi=120)
+        figure.savefig(file, dpi=100)
+
+
+def _window(estimate: FloatArray, truth: FloatArray | None) -> tuple[FloatArray, FloatArray]:
+    """Return the lower and upper corner (2,) [m] of what the picture shows."""
+    low, high = estimate.min(axis=0), estimate.max(axis=0)
+    if truth is not None:
+        few, most = np.quantile(truth, [STRAY, 1.0 - STRAY], axis=0)
+        low, high = np.minimum(low, few), np.maximum(high, most)
+    room = MARGIN * float((high - low).max()) + 1e-3
+    return low - room, high + room
 
 
 def _draw_landmarks(ax: Axes, landmarks: FloatArray, counts: IntArray) -> None:

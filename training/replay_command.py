@@ -49,7 +49,7 @@ def replay_mrclam(
 ) -> None:
     """Five real robots with unknown starts: a filter each, maps aligned and merged, one team in the end."""
     from slam_backend.readers.mrclam import load_mrclam
-    from training.figures_replay import draw_replay
+    from training.figures_replay import draw_joint_map, draw_replay
     from training.replay_mrclam import ReplayConfig, replay
     from training.replay_scores import score_path, summarise
     from training.run_folder import RunFolder, plain, to_json
@@ -82,6 +82,10 @@ def replay_mrclam(
     _write_paths(folder, log, result)
     folder.write_text("timing.json", to_json({"seconds": result.seconds, "times_real_time": speed}))
     draw_replay(folder.path / "replay.png", log, result, paths)
+    for group in result.groups:
+        if len(group) > 1:
+            names = "-".join(str(log.robots[robot].robot) for robot in group)
+            draw_joint_map(folder.path / f"joint_map_{names}.png", log, result, paths, group)
     finish(console, folder, folder.write_metrics(scores), json)
 
 

@@ -83,10 +83,12 @@ def test_a_run_is_written_and_repeats_itself(
     assert "odometry" in capsys.readouterr().out
     names = {f"robot{n}_{kind}.tum" for n in (2, 5) for kind in ("estimate", "dead_reckoning", "truth")}
     assert {file.name for file in first.iterdir()} == {
-        "config.toml", "metrics.json", "replay.png", "timing.json", *names
+        "config.toml", "metrics.json", "replay.png", "joint_map_2-5.png", "timing.json", *names
     }  # fmt: skip
-    assert (first / "replay.png").read_bytes()[:4] == b"\x89PNG"
+    for file in first.glob("*.png"):
+        assert file.read_bytes()[:4] == b"\x89PNG"
     metrics = json.loads((first / "metrics.json").read_text())
+    assert metrics["groups"] == [[2, 5]]  # whose map is drawn alone
     assert metrics == json.loads((tmp_path / "copy.json").read_text())
     assert metrics == json.loads((second / "metrics.json").read_text())
     assert metrics["seed"] == 5
