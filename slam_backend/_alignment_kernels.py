@@ -18,6 +18,9 @@ MEDIAN_CHI2_3 = 2.3659738843753377
 SAME_DISTANCE, SAME_ANGLE = 0.25, math.radians(2.5)  # half of what makes two alignments differ
 MAX_ROUNDS = 30
 BISECTIONS = 12  # of a variance between 1e-8 and 1e-2 m^2, on the log scale: to 0.3 %
+# The median of k squared residuals of 3 degrees of freedom is above 1 + 2.2 / sqrt(k) times its own by chance in 2.5 %.
+CHANCE_EXCESS = 2.2
+MOST_LEVERAGE = 0.5  # of one match in the rotation: beyond it the others cannot vouch for it
 
 
 @jit
@@ -84,6 +87,17 @@ def _support(
 
 
 @jit
+def own_support(table: FloatArray, poses: FloatArray, claimed: BoolArray, floor: float, gate: float) -> IntArray:
+    """Return how many candidates each of `poses` (h, 3) has within `gate`, those that are `claimed` (k,) left out."""
+    found = np.zeros(len(poses), np.int64)
+    members = np.zeros(len(table), np.bool_)
+    rest = table[~claimed]
+    for h in range(len(poses)):
+        found[h] = _support(rest, poses[h], floor, gate, members)[0]
+    return found
+
+
+@jit
 def information(table: FloatArray, members: BoolArray, pose: FloatArray, floor: float) -> tuple[FloatArray, FloatArray]:
     """Return H = sum J^T S^-1 J (3, 3) and g = sum J^T S^-1 r (3,) over the members, J = [e_x, e_y, dR/dtheta p_b]."""
     cos, sin, tx, ty = math.cos(pose[2]), math.sin(pose[2]), pose[0], pose[1]
@@ -132,14 +146,17 @@ def gauss_newton_step(table: FloatArray, members: BoolArray, pose: FloatArray, f
 def fitted_variance(table: FloatArray, members: BoolArray, pose: FloatArray, floor: float) -> float:
     """Return the added variance, at most `floor`, under which the members' median D is that of 3 degrees of freedom.
 
-    Honest covariances get almost nothing added, so that the weights stay efficient; over-confident ones get what
-    their residuals show.
+    Covariances that explain the residuals, up to what chance may do, get almost nothing added, so that weights stay
+    efficient and the result's covariance honest; over-confident ones get what their residuals show.
     """
     chosen = table[members]
     target = MEDIAN_CHI2_3 * (1.0 - 1.0 / max(len(chosen), 2))  # three of the 3 k residuals went into the fit
+    low, high = min(MIN_VARIANCE, floor), floor
+    by_chance = 1.0 + CHANCE_EXCESS / math.sqrt(max(len(chosen), 1))
+    if np.median(squared_distances(chosen, pose, low)) <= target * by_chance:
+        return low
     if np.median(squared_distances(chosen, pose, floor)) >= target:
         return floor
-    low, high = min(MIN_VARIANCE, floor), floor
     for _ in range(BISECTIONS):
         middle = math.sqrt(low * high)
         if np.median(squared_distances(chosen, pose, middle)) > target:
@@ -147,6 +164,36 @@ def fitted_variance(table: FloatArray, members: BoolArray, pose: FloatArray, flo
         else:
             high = middle
     return high
+
+
+@jit
+def drop_unverified(table: FloatArray, members: BoolArray, pose: FloatArray, floor: float) -> None:
+    """Take out, one after the other, members that alone say more about the rotation than all others together.
+
+    Where landmarks lie close together, a wrong match far away would turn the fit until it fits itself.
+    """
+    cos, sin = math.cos(pose[2]), math.sin(pose[2])
+    for _ in range(len(table)):
+        h = information(table, members, pose, floor)[0]
+        scale = h[0, 0] * h[1, 1] - h[0, 1] * h[0, 1]
+        if scale <= 1e-12 * h[0, 0] * h[1, 1]:
+            return
+        ux = (h[1, 1] * h[0, 2] - h[0, 1] * h[1, 2]) / scale
+        uy = (h[0, 0] * h[1, 2] - h[0, 1] * h[0, 2]) / scale
+        whole, most, worst, count = 0.0, 0.0, -1, 0
+        for i in range(len(table)):
+            if members[i]:
+                _, _, _, wxx, wxy, wyy = _residual(table, i, cos, sin, pose[0], pose[1], floor)
+                jx = -sin * table[i, 3] - cos * table[i, 4] - ux
+                jy = cos * table[i, 3] - sin * table[i, 4] - uy
+                own = wxx * jx * jx + 2.0 * wxy * jx * jy + wyy * jy * jy
+                whole += own
+                count += 1
+                if own > most:
+                    most, worst = own, i
+        if count <= FEWEST_INLIERS or most <= MOST_LEVERAGE * whole:
+            return
+        members[worst] = False
 
 
 @jit
@@ -164,6 +211,7 @@ def refine(table: FloatArray, start: FloatArray, floor: float, gate: float) -> t
         _support(table, pose, floor, gate, members)
         variance = fitted_variance(table, members, pose, floor)
         _support(table, pose, variance, gate, members)
+        drop_unverified(table, members, pose, variance)
         moved = gauss_newton_step(table, members, pose, variance)
         rests = np.abs(moved - pose).max() < 1e-10
         pose = moved

@@ -5,6 +5,7 @@ import math
 import numpy as np
 
 from slam_backend import _alignment_kernels as kernels
+from slam_backend import _proposals as proposals
 from slam_backend._matching import mutual_nearest, unlike_other_places
 from slam_backend.alignment_types import REASONS, Alignment, AlignmentOptions, Reason
 from slam_backend.errors import BoolArray, FloatArray, IntArray, bad_argument, check_choice
@@ -12,18 +13,25 @@ from slam_backend.geometry import transform_points, wrap_angle
 from slam_backend.landmark_map import LandmarkMap
 from slam_backend.metrics import align_se2
 
-__all__ = ["METHODS", "REASONS", "Alignment", "AlignmentOptions", "Reason", "align_maps", "candidate_matches"]
+__all__ = [
+    "METHODS", "REASONS", "Alignment", "AlignmentOptions", "Reason", "align_maps", "candidate_matches",
+    "propose_motion",
+]  # fmt: skip
 
-METHODS = ("ransac", "svd")
+METHODS = ("ransac", "svd", "icp", "impicp", "gnc", "clique")
 RIVAL_DISTANCE = 0.5  # [m]; beyond these two an alignment counts as another one, and as a false one
 RIVAL_ANGLE = np.deg2rad(5.0)
+RIVALS = 5  # most promising rivals that are refined
+MOST_PAIRS = 10_000  # candidates by geometry alone
+MIRRORED = 3, 0.1  # the mirror image is believed if it fits so many more matches, and this share of the inliers more
 
 
 def candidate_matches(map_a: LandmarkMap, map_b: LandmarkMap, options: AlignmentOptions) -> IntArray:
     """Match landmarks by appearance, without regard to where they lie in the plane.
 
     Each is the other's nearest descriptor, within the gate, clearly nearer than any landmark of another place in
-    either map; and their heights agree, because planar robots with one camera height share z (Sec. 3.1).
+    either map; and their heights agree, because planar robots with one camera height share z (Sec. 3.1). Without
+    appearance all pairs whose heights agree are candidates.
 
     Args:
         map_a: The one map.
@@ -31,10 +39,11 @@ def candidate_matches(map_a: LandmarkMap, map_b: LandmarkMap, options: Alignment
         options: Gates.
 
     Returns:
-        (k, 2) int64 rows (index in map_a, index in map_b), one-to-one, by rising index in map_a.
+        (k, 2) int64 rows (index in map_a, index in map_b), by rising index in map_a; one-to-one unless
+        `options.appearance` is off.
 
     Raises:
-        ValueError: If the maps' descriptors differ in size.
+        ValueError: If the maps' descriptors differ in size, or there are too many pairs to try without appearance.
     """
     if map_a.descriptors.shape[1] != map_b.descriptors.shape[1]:
         raise bad_argument(
@@ -43,11 +52,19 @@ def candidate_matches(map_a: LandmarkMap, map_b: LandmarkMap, options: Alignment
             map_b.descriptors.shape[1],
             "Describe the landmarks of both maps with the same front end.",
         )
-    matches = mutual_nearest(map_a.descriptors, map_b.descriptors, options.descriptor_gate)
-    for one, other, here, there in ((map_a, map_b, 0, 1), (map_b, map_a, 1, 0)):
-        descriptors, partners = one.descriptors[matches[:, here]], matches[:, there]
-        limits = (options.same_place, options.descriptor_ratio)
-        matches = matches[unlike_other_places(descriptors, partners, other.descriptors, other.means, *limits)]
+    if options.appearance:
+        matches = mutual_nearest(map_a.descriptors, map_b.descriptors, options.descriptor_gate)
+        for one, other, here, there in ((map_a, map_b, 0, 1), (map_b, map_a, 1, 0)):
+            descriptors, partners = one.descriptors[matches[:, here]], matches[:, there]
+            limits = (options.same_place, options.descriptor_ratio)
+            matches = matches[unlike_other_places(descriptors, partners, other.descriptors, other.means, *limits)]
+    else:
+        if len(map_a) * len(map_b) > MOST_PAIRS:
+            raise bad_argument(
+                "map_b", f"at most {MOST_PAIRS} pairs of landmarks without appearance", len(map_a) * len(map_b),
+                "Give smaller maps, or tell landmarks apart.",
+            )  # fmt: skip
+        matches = np.argwhere(np.ones((len(map_a), len(map_b)), np.bool_))
     rows_a, rows_b = matches.T
     climb = map_a.means[rows_a, 2] - map_b.means[rows_b, 2]
     variance = map_a.covariances[rows_a, 2, 2] + map_b.covariances[rows_b, 2, 2] + options.position_floor**2
@@ -64,12 +81,17 @@ def align_maps(
 ) -> Alignment:
     """Estimate the planar motion between two maps from landmarks that look alike; refuse when in doubt.
 
+    Methods differ in where they begin (`propose_motion`). What follows is common to all: inliers within a Mahalanobis
+    gate, heights included, and weighted Gauss-Newton over them in turn until both rest, which is the maximum of the
+    likelihood; its covariance; the best alignment that differs; and the refusals.
+
     Args:
         map_a: The map whose frame the result leads to.
         map_b: The other map.
-        method: `"ransac"`: search over pairs of candidate matches, each hypothesis locally optimised, then weighted
-            Gauss-Newton to convergence. `"svd"`: closed form and weighted Gauss-Newton over ALL candidate matches,
-            without any rejection of outliers, for comparison.
+        method: `"ransac"`: search over pairs of candidate matches, each hypothesis locally optimised. `"svd"`: closed
+            form over all candidates. `"icp"`: pairs of closest landmarks, from there on. `"impicp"`: ICP from two
+            starts. `"gnc"`: truncated least squares by graduated non-convexity. `"clique"`: largest set of candidates
+            that agree pairwise. Sources are named in `_proposals` and `_clique_kernels`; `docs/alignment.md` compares.
         rng: Order of the search; None: a fixed one. The same generator state gives the same result.
         options: Gates and refusals; None: the defaults.
 
@@ -79,45 +101,112 @@ def align_maps(
     Raises:
         ValueError: If the method is unknown, the maps' descriptors differ in size or `rng` is no generator.
     """
-    check_choice("method", method, METHODS)
-    options = AlignmentOptions() if options is None else options
-    for name, value, kind in (
-        ("map_a", map_a, LandmarkMap), ("map_b", map_b, LandmarkMap), ("options", options, AlignmentOptions)
-    ):
-        if not isinstance(value, kind):
-            raise bad_argument(name, f"a {kind.__name__}", value, f"Build one: {kind.__name__}(...).")
-    rng = np.random.default_rng(0) if rng is None else rng
-    if not isinstance(rng, np.random.Generator):
-        raise bad_argument("rng", "a numpy.random.Generator or None", rng, "Give np.random.default_rng(seed).")
+    options, rng = _checked(map_a, map_b, method, rng, options)
+    if not options.appearance and len(map_a) * len(map_b) > MOST_PAIRS:
+        return Alignment.refused("too many candidates")
     matches = candidate_matches(map_a, map_b, options)
     if len(matches) < options.min_inliers:
         return Alignment.refused("too few candidates")
     table = _match_table(map_a, map_b, matches)
-    floor = options.position_floor**2
-    if method == "ransac":
-        hypotheses = _search(table, rng, options)
-        if not len(hypotheses):
-            return Alignment.refused("too few inliers")
-        pose, members, variance = kernels.refine(
-            table, hypotheses[hypotheses[:, 4].argmax(), :3].copy(), floor, options.position_gate
-        )
-    else:
-        hypotheses = np.empty((0, 5))
-        pose, members, variance = _fit_all(table, floor)
-    inside = kernels.squared_distances(table, pose, floor) <= options.position_gate
+    floor, gate = options.position_floor**2, options.position_gate
+    hypotheses = _search(table, rng, options)
+    start = _propose(method, map_a, map_b, matches, table, hypotheses, options)
+    if start is None:
+        return Alignment.refused("too few inliers")
+    pose, members, variance = kernels.refine(table, start, floor, gate)
+    distances = kernels.squared_distances(table, pose, floor)
+    inside = _one_to_one(matches, distances) & (distances <= gate)
     inliers = matches[inside]
     if len(inliers) < options.min_inliers:
         return Alignment.refused("too few inliers")
     points_b = map_b.means[inliers[:, 1], :2]
-    ratio = _strongest_rival(table, hypotheses, pose, points_b.mean(axis=0), options) / len(inliers)
+    ratio = _strongest_rival(table, matches, hypotheses, pose, variance, points_b.mean(axis=0), options)
     if ratio > options.max_ratio:
         return Alignment.refused("ambiguous", ratio)
+    if _is_mirrored(table, matches, pose, inside, options):
+        return Alignment.refused("mirrored", ratio)
     if _extent(points_b) < options.min_spread:
         return Alignment.refused("poorly spread", ratio)
     covariance = _covariance(kernels.information(table, members, pose, variance)[0])
     if covariance is None or not _certain(covariance, options):
         return Alignment.refused("too uncertain", ratio)
     return Alignment(True, "", pose[0], pose[1], pose[2], covariance, inliers, ratio)
+
+
+def propose_motion(
+    map_a: LandmarkMap,
+    map_b: LandmarkMap,
+    method: str,
+    rng: np.random.Generator | None = None,
+    options: AlignmentOptions | None = None,
+) -> FloatArray | None:
+    """Return a method's own estimate of the motion, before any refinement or refusal, as the paper compares them.
+
+    Args:
+        map_a: The map whose frame the result leads to.
+        map_b: The other map.
+        method: As in `align_maps`.
+        rng: Likewise.
+        options: Likewise.
+
+    Returns:
+        (3,) a_from_b [m, m, rad]; None if the candidates do not suffice for one.
+
+    Raises:
+        ValueError: As `align_maps`.
+    """
+    options, rng = _checked(map_a, map_b, method, rng, options)
+    matches = candidate_matches(map_a, map_b, options)
+    if len(matches) < 2:
+        return None
+    table = _match_table(map_a, map_b, matches)
+    hypotheses = _search(table, rng, options) if method == "ransac" else np.empty((0, 5))
+    return _propose(method, map_a, map_b, matches, table, hypotheses, options)
+
+
+def _checked(
+    map_a: LandmarkMap,
+    map_b: LandmarkMap,
+    method: str,
+    rng: np.random.Generator | None,
+    options: AlignmentOptions | None,
+) -> tuple[AlignmentOptions, np.random.Generator]:
+    """Return options and generator, or raise if an argument is of the wrong kind."""
+    check_choice("method", method, METHODS)
+    options = AlignmentOptions() if options is None else options
+    for name, value, kind in (
+        ("map_a", map_a, LandmarkMap), ("map_b", map_b, LandmarkMap), ("options", options, AlignmentOptions)
+    ):  # fmt: skip
+        if not isinstance(value, kind):
+            raise bad_argument(name, f"a {kind.__name__}", value, f"Build one: {kind.__name__}(...).")
+    rng = np.random.default_rng(0) if rng is None else rng
+    if not isinstance(rng, np.random.Generator):
+        raise bad_argument("rng", "a numpy.random.Generator or None", rng, "Give np.random.default_rng(seed).")
+    return options, rng
+
+
+def _propose(
+    method: str,
+    map_a: LandmarkMap,
+    map_b: LandmarkMap,
+    matches: IntArray,
+    table: FloatArray,
+    hypotheses: FloatArray,
+    options: AlignmentOptions,
+) -> FloatArray | None:
+    """Return the motion (3,) at which a method begins; None if it finds none."""
+    floor, gate = options.position_floor**2, options.position_gate
+    if method == "ransac":
+        return hypotheses[hypotheses[:, 4].argmax(), :3].copy() if len(hypotheses) else None
+    if method == "gnc":
+        return proposals.graduated(table, floor, gate)
+    if method == "clique":
+        unlike = np.linalg.norm(map_a.descriptors[matches[:, 0]] - map_b.descriptors[matches[:, 1]], axis=1)
+        return proposals.consistent(table, matches, unlike, floor, gate)
+    if method == "impicp":
+        return proposals.two_starts(map_a, map_b, matches, table, floor, gate)
+    fit = align_se2(table[:, :2], table[:, 3:5])
+    return fit if method == "svd" else proposals.closest_points(map_a, map_b, fit)
 
 
 def _match_table(map_a: LandmarkMap, map_b: LandmarkMap, matches: IntArray) -> FloatArray:
@@ -133,7 +222,7 @@ def _match_table(map_a: LandmarkMap, map_b: LandmarkMap, matches: IntArray) -> F
 def _search(table: FloatArray, rng: np.random.Generator, options: AlignmentOptions) -> FloatArray:
     """Return the hypotheses (h, 5) of a random search over pairs of candidates; over all of them if they are few."""
     pairs = len(table) * (len(table) - 1) // 2
-    few = 4 * pairs <= options.max_samples
+    few = pairs <= options.max_samples
     samples = rng.permutation(pairs) if few else rng.integers(0, pairs, options.max_samples)
     return kernels.search(
         table,
@@ -147,27 +236,72 @@ def _search(table: FloatArray, rng: np.random.Generator, options: AlignmentOptio
     )
 
 
-def _fit_all(table: FloatArray, floor: float) -> tuple[FloatArray, BoolArray, float]:
-    """Return the motion (3,) fitted to all candidates alike, all of them as members, and the added variance."""
-    pose = align_se2(table[:, :2], table[:, 3:5])
-    members, variance = np.ones(len(table), np.bool_), floor
-    for _ in range(kernels.MAX_ROUNDS):
-        variance = kernels.fitted_variance(table, members, pose, floor)
-        pose = kernels.gauss_newton_step(table, members, pose, variance)
-    return pose, members, variance
+def _one_to_one(matches: IntArray, distances: FloatArray) -> BoolArray:
+    """Tell which matches (k, 2) remain if each landmark keeps that of the smallest distance (k,), greedily."""
+    kept = np.zeros(len(matches), np.bool_)
+    taken_a, taken_b = set[int](), set[int]()
+    if len(np.unique(matches[:, 0])) == len(np.unique(matches[:, 1])) == len(matches):
+        return ~kept
+    for i in np.argsort(distances, kind="stable"):
+        a, b = matches[i].tolist()
+        if a not in taken_a and b not in taken_b:
+            kept[i] = True
+            taken_a.add(a)
+            taken_b.add(b)
+    return kept
 
 
 def _strongest_rival(
-    table: FloatArray, hypotheses: FloatArray, pose: FloatArray, centre_b: FloatArray, options: AlignmentOptions
-) -> int:
-    """Return how many inliers the best hypothesis has that differs from `pose` even when both are refined."""
+    table: FloatArray,
+    matches: IntArray,
+    hypotheses: FloatArray,
+    pose: FloatArray,
+    variance: float,
+    centre_b: FloatArray,
+    options: AlignmentOptions,
+) -> float:
+    """Return how near the best hypothesis that differs even when refined comes to `pose`, as `Alignment.ratio` says."""
     floor, gate = options.position_floor**2, options.position_gate
-    rivals = hypotheses[_differ(hypotheses[:, :3], pose, centre_b)]
-    for rival in rivals[np.argsort(-rivals[:, 3], kind="stable")]:
-        refined = kernels.refine(table, rival[:3].copy(), floor, gate)[0]
+
+    def fits(motion: FloatArray) -> BoolArray:
+        distances = kernels.squared_distances(table, motion, variance)
+        return np.asarray(_one_to_one(matches, distances) & (distances <= gate))
+
+    ours = fits(pose)
+    others = np.ascontiguousarray(hypotheses[_differ(hypotheses[:, :3], pose, centre_b), :3])
+    promise = kernels.own_support(table, others, ours, floor, gate)
+    strongest = 0.0
+    for i in np.argsort(-promise, kind="stable")[:RIVALS]:
+        refined = kernels.refine(table, others[i].copy(), floor, gate)[0]
         if _differ(refined[None], pose, centre_b)[0]:
-            return int(np.count_nonzero(kernels.squared_distances(table, refined, floor) <= gate))
-    return 0
+            theirs = fits(refined)
+            own = max(float(np.count_nonzero(ours & ~theirs)), 0.5 * float(np.count_nonzero(ours)), 1.0)
+            strongest = max(strongest, float(np.count_nonzero(theirs & ~ours)) / own)
+    return strongest
+
+
+def _is_mirrored(
+    table: FloatArray, matches: IntArray, pose: FloatArray, inside: BoolArray, options: AlignmentOptions
+) -> bool:
+    """Tell whether the mirror image about the line on which the inliers lie fits clearly more matches.
+
+    The one wall of a mirrored corridor fits a motion, too; but then all the rest fits the image.
+    """
+    points = table[inside, 3:5]
+    centre = points.mean(axis=0)
+    axis = np.linalg.eigh((points - centre).T @ (points - centre))[1][:, -1]
+    mirror = np.eye(3)
+    mirror[:2, :2] = 2.0 * np.outer(axis, axis) - np.eye(2)
+    image = table.copy()
+    image[:, 3:5] = centre + (table[:, 3:5] - centre) @ mirror[:2, :2]
+    upper = np.triu_indices(3)
+    full = np.empty((len(table), 3, 3))
+    full[:, upper[0], upper[1]] = full[:, upper[1], upper[0]] = table[:, 12:]
+    image[:, 12:] = (mirror @ full @ mirror)[:, upper[0], upper[1]]
+    distances = kernels.squared_distances(image, pose, options.position_floor**2)
+    fits = _one_to_one(matches, distances) & (distances <= options.position_gate)
+    more = np.count_nonzero(fits & ~inside) - np.count_nonzero(inside & ~fits)
+    return bool(more >= max(MIRRORED[0], MIRRORED[1] * np.count_nonzero(inside)))
 
 
 def _differ(poses: FloatArray, pose: FloatArray, centre_b: FloatArray) -> BoolArray:

@@ -7,11 +7,16 @@ import numpy as np
 
 from slam_backend.errors import FloatArray, IntArray, bad_argument, check_array, check_float, check_int
 
-Reason = Literal["", "too few candidates", "too few inliers", "ambiguous", "poorly spread", "too uncertain"]
+Reason = Literal[
+    "", "too few candidates", "too many candidates", "too few inliers", "ambiguous", "mirrored", "poorly spread",
+    "too uncertain",
+]  # fmt: skip
 REASONS: tuple[Reason, ...] = (
     "too few candidates",
+    "too many candidates",  # by geometry alone
     "too few inliers",
     "ambiguous",
+    "mirrored",  # the mirror image fits better, and no robot sees one
     "poorly spread",
     "too uncertain",
 )
@@ -23,13 +28,15 @@ class AlignmentOptions:
     """When two landmarks look alike, when they lie together, and when an alignment is believed.
 
     Attributes:
+        appearance: Whether only landmarks that look alike may be the same. False: any two of the same height may, where
+            all look the same; two maps then have at most 10,000 such pairs.
         descriptor_gate: Largest L2 distance between matched descriptors [-].
         descriptor_ratio: A match must be closer than this times the best landmark of another place [-].
         same_place: Landmarks of one map within this distance may be duplicates, and do not compete [m].
         position_gate: Largest squared Mahalanobis residual of an inlier [-]; 11.34 is 99 % of 3 degrees of freedom.
         position_floor: Standard deviation added to the residuals, because filters' maps are over-confident [m].
         min_inliers: Fewer inliers are refused; at least 3.
-        max_ratio: Refused when a different alignment has more than this times the best one's inliers [-].
+        max_ratio: Refused when the `ratio` of an `Alignment` exceeds this [-].
         min_spread: Refused when the inliers extend over less than this along their main axis [m].
         max_sigma_position: Refused when the translation is less certain than this in any direction [m].
         max_sigma_heading: Refused when the rotation is less certain than this [rad].
@@ -38,20 +45,23 @@ class AlignmentOptions:
         max_samples: Bound on the minimal samples of that search, whatever the probability.
     """
 
+    appearance: bool = True
     descriptor_gate: float = 0.45
     descriptor_ratio: float = 0.8
     same_place: float = 1.0
     position_gate: float = 11.34
     position_floor: float = 0.1
     min_inliers: int = 8
-    max_ratio: float = 0.5
+    max_ratio: float = 0.6
     min_spread: float = 2.0
-    max_sigma_position: float = 0.15
+    max_sigma_position: float = 0.18
     max_sigma_heading: float = 0.025
     success_probability: float = 0.999
     max_samples: int = 20_000
 
     def __post_init__(self) -> None:
+        if not isinstance(self.appearance, bool):
+            raise bad_argument("options.appearance", "a bool", self.appearance, "Say True or False.")
         above = ("descriptor_gate", "position_gate", "position_floor", "max_sigma_position", "max_sigma_heading")
         for name in above:
             check_float(f"options.{name}", getattr(self, name), "Give a positive number.", above=0.0)
@@ -77,8 +87,9 @@ class Alignment:
         theta: Rotation [rad] in [-pi, pi); NaN when refused.
         covariance: (3, 3) float64 [m, m, rad] of (tx, ty, theta); NaN when refused.
         inliers: (k, 2) int64 rows (index in map a, index in map b), one-to-one; none when refused.
-        ratio: Inliers of the best alignment that differs (by more than 0.5 m or 5 degrees) over those of this one;
-            0 if there was none or the method looks for none.
+        ratio: How near the best alignment that differs (by more than 0.5 m or 5 degrees) comes to this one: its own
+            inliers, over this one's own or half of this one's if those are more; own are those that the other has not.
+            0 if there was none.
     """
 
     success: bool

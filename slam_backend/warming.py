@@ -4,6 +4,7 @@ from typing import Literal
 
 import numpy as np
 
+from slam_backend.alignment import align_maps
 from slam_backend.attempts import AttemptOptions
 from slam_backend.compilation import watch_compilation
 from slam_backend.existence import ExistenceModel
@@ -49,5 +50,7 @@ def warm_up() -> float:
         team = TeamSlam(2, num_particles=4, attempts=AttemptOptions(every=1))
         for _ in range(STEPS):
             team.step([None, None], [plain, plain])
-        map_error(team.map(0).means, names, points)
+        own = team.map(0)
+        map_error(own.means, names, points)
+        align_maps(own, own, "clique")
     return watch.seconds

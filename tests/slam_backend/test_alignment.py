@@ -360,7 +360,7 @@ def test_bad_input_gives_one_clear_error() -> None:
     """Unknown methods, seeds in place of generators and descriptors of another size are refused by name."""
     with pytest.raises(ValueError, match=r"rng: expected a numpy.random.Generator or None, got 7"):
         align_maps(RICH, RICH, rng=7)  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="method: expected one of 'ransac', 'svd', got 'magic'"):
+    with pytest.raises(ValueError, match=r"method: expected one of 'ransac', 'svd', 'icp', .*, got 'magic'"):
         align_maps(RICH, RICH, "magic")
     narrow = replace(RICH, descriptors=RICH.descriptors[:, :5])
     with pytest.raises(ValueError, match="map_b: expected descriptors of size 32, as in map_a, got 5"):
@@ -372,6 +372,7 @@ def test_bad_input_gives_one_clear_error() -> None:
     [
         ("descriptor_gate", 0.0, "options.descriptor_gate: expected a finite number > 0"),
         ("descriptor_ratio", 1.5, "options.descriptor_ratio: expected a finite number > 0 and <= 1"),
+        ("appearance", 1, "options.appearance: expected a bool, got 1"),
         ("max_ratio", 0.0, "options.max_ratio: expected"),
         ("same_place", -1.0, "options.same_place: expected a finite number >= 0"),
         ("min_spread", float("nan"), "options.min_spread: expected"),

@@ -1,0 +1,280 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from slam_backend import _alignment_kernels as kernels
+from slam_backend import _clique_kernels as cliques
+from slam_backend import _proposals as proposals
+from slam_backend.alignment import METHODS, AlignmentOptions, align_maps, candidate_matches, propose_motion
+from slam_backend.geometry import between, inverse, transform_points
+from slam_backend.landmark_map import LandmarkMap
+
+D = 32
+TURNED = np.array([4.0, -3.0, 2.0])
+
+
+def landmark_map(rng: np.random.Generator, points: np.ndarray, looks: np.ndarray | None = None) -> LandmarkMap:
+    """Build a map of points known to 2 cm; without `looks` each looks different."""
+    d = rng.standard_normal((len(points), D)) if looks is None else looks
+    d = d / np.linalg.norm(d, axis=1, keepdims=True)
+    return LandmarkMap(points, np.tile(4e-4 * np.eye(3), (len(points), 1, 1)), d)
+
+
+def seen_from(m: LandmarkMap, pose: np.ndarray, wrong: int, rng: np.random.Generator) -> LandmarkMap:
+    """Return m in frame b, `pose` = a_from_b, with noise, and its last `wrong` landmarks anywhere in its area."""
+    points = m.means.copy()
+    low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
+    if wrong:
+        points[-wrong:, :2] = rng.uniform(low, high, (wrong, 2))
+    points += 0.02 * rng.standard_normal(points.shape)
+    return replace(m, means=transform_points(inverse(pose), points))
+
+
+def off(found: np.ndarray | None, truth: np.ndarray) -> float:
+    """Return how far a motion is off [m + rad]."""
+    assert found is not None
+    return float(np.abs(between(truth, found)).sum())
+
+
+def largest_clique_plainly(agrees: np.ndarray) -> int:
+    """Return the size of the largest clique, by trying all (Bron and Kerbosch)."""
+
+    def extend(size: int, left: set[int]) -> int:
+        best = size
+        for v in sorted(left):
+            left = left - {v}
+            best = max(best, extend(size + 1, left & set(np.flatnonzero(agrees[v]).tolist())))
+        return best
+
+    return extend(0, set(range(len(agrees))))
+
+
+@given(n=st.integers(0, 90), density=st.floats(0.0, 1.0), seed=st.integers(0, 9999))
+def test_what_the_search_returns_is_a_clique(n: int, density: float, seed: int) -> None:
+    """Whatever the graph and however early the search stops, members agree pairwise; one vertex is always found."""
+    upper = np.triu(np.random.default_rng(seed).random((n, n)) < density, 1)
+    agrees = upper | upper.T
+    for limit in (n, 2000):
+        found = cliques.largest_clique(agrees, limit)
+        inside = agrees[np.ix_(found, found)]
+        assert inside.sum() == len(found) * (len(found) - 1)
+        assert bool(len(found)) == bool(n)
+
+
+@pytest.mark.parametrize("density", [0.1, 0.4, 0.7])
+def test_no_clique_is_larger_than_the_one_found(density: float) -> None:
+    """On graphs of more than one word of bits the size equals that of a plain search through all cliques."""
+    for seed in range(4):
+        n = int(70 * (1.0 - density))
+        upper = np.triu(np.random.default_rng(seed).random((n + 5, n + 5)) < density, 1)
+        agrees = upper | upper.T
+        assert len(cliques.largest_clique(agrees, 10**6)) == largest_clique_plainly(agrees)
+
+
+def test_a_clique_across_words_of_bits_is_found_whole() -> None:
+    """A planted set of 30 among 300 vertices comes back exactly."""
+    rng = np.random.default_rng(5)
+    upper = np.triu(rng.random((300, 300)) < 0.05, 1)
+    planted = np.sort(rng.permutation(300)[:30])
+    agrees = upper | upper.T
+    agrees[np.ix_(planted, planted)] = True
+    np.fill_diagonal(agrees, False)
+    np.testing.assert_array_equal(cliques.largest_clique(agrees, 20_000), planted)
+
+
+def test_agreement_is_that_of_distances_in_units_of_their_noise() -> None:
+    """The compiled test equals the plain one: difference of distances, variance along either direction, one-to-one."""
+    rng = np.random.default_rng(6)
+    n, floor, gate = 25, 0.01, 9.0
+    table = np.zeros((n, 18))
+    table[:, :6] = rng.uniform(0.0, 4.0, (n, 6))
+    sigmas = []
+    for offset in (6, 12):
+        roots = 0.2 * rng.standard_normal((n, 3, 3))
+        full = roots @ roots.transpose(0, 2, 1)
+        table[:, offset : offset + 6] = full[:, *np.triu_indices(3)]
+        sigmas.append(full[:, :2, :2])
+    matches = np.column_stack([np.arange(n), np.arange(n)])
+    matches[3, 0] = matches[4, 0]
+    matches[7, 1] = matches[9, 1]
+    found = cliques.agreement(table, matches, floor, gate)
+    for i in range(n):
+        for j in range(n):
+            lengths, variance = [], 2.0 * floor
+            for first, sigma in ((0, sigmas[0]), (3, sigmas[1])):
+                across = table[j, first : first + 2] - table[i, first : first + 2]
+                lengths.append(np.linalg.norm(across))
+                if i != j:
+                    way = across / lengths[-1]
+                    variance += way @ (sigma[i] + sigma[j]) @ way
+            apart = (matches[i] != matches[j]).all()
+            assert found[i, j] == (apart and (lengths[0] - lengths[1]) ** 2 <= gate * variance), (i, j)
+    assert 0.05 < found.mean() < 0.9
+
+
+@pytest.mark.parametrize(("method", "wrong"), [("icp", 8), ("impicp", 8), ("gnc", 60), ("clique", 85), ("ransac", 85)])
+def test_methods_find_the_motion_among_wrong_matches(method: str, wrong: int) -> None:
+    """Of 100 matches so many may be wrong; the closed form alone is then far off."""
+    for seed in range(5):
+        rng = np.random.default_rng([seed, wrong])
+        a = landmark_map(rng, rng.uniform(0.0, [20.0, 15.0, 1.5], (100, 3)))
+        b = seen_from(a, TURNED, wrong, rng)
+        assert off(propose_motion(a, b, "svd"), TURNED) > 0.2
+        found = align_maps(a, b, method)
+        assert found.success, found.reason
+        assert off(found.transform, TURNED) < 0.05
+        assert len(found.inliers) >= 100 - wrong
+
+
+def test_closest_points_need_a_start_and_the_better_of_two_is_kept() -> None:
+    """ICP from nearby ends at the motion; where all candidates start it off wrongly, the half most alike may not."""
+    rng = np.random.default_rng(7)
+    a = landmark_map(rng, rng.uniform(0.0, [20.0, 15.0, 1.5], (80, 3)))
+    b = seen_from(a, TURNED, 0, rng)
+    assert off(proposals.closest_points(a, b, np.add(TURNED, [0.3, -0.2, 0.02])), TURNED) < 0.02
+    assert off(proposals.closest_points(a, b, np.add(TURNED, [0.0, 0.0, 2.0])), TURNED) > 0.5
+    met = dict.fromkeys(("icp", "impicp"), 0)
+    for seed in range(20):
+        rng = np.random.default_rng([7, seed])
+        a = landmark_map(rng, rng.uniform(0.0, [20.0, 15.0, 1.5], (80, 3)))
+        b = seen_from(a, TURNED, 40, rng)
+        looks = b.descriptors.copy()
+        looks[40:] += 0.2 * rng.standard_normal((40, D)).astype(np.float32) / np.sqrt(np.float32(D))
+        for method in met:
+            met[method] += off(propose_motion(a, replace(b, descriptors=looks), method), TURNED) < 0.1
+    assert met["impicp"] > met["icp"]
+    assert met["impicp"] == 20
+
+
+def test_graduated_non_convexity_minimises_truncated_squares() -> None:
+    """With half of the matches wrong, its truncated cost is no larger than that of the truth."""
+    rng = np.random.default_rng(8)
+    a = landmark_map(rng, rng.uniform(0.0, [20.0, 15.0, 1.5], (60, 3)))
+    b = seen_from(a, TURNED, 30, rng)
+    a_points, b_points = a.means[:, :2], b.means[:, :2]
+    table = np.zeros((60, 18))
+    table[:, :3], table[:, 3:6] = a.means, b.means
+    variance, gate = 8e-4, 11.34
+    found = proposals.graduated(table, variance, gate)
+
+    def cost(pose: np.ndarray) -> float:
+        squares = ((a_points - transform_points(pose, b_points)) ** 2).sum(axis=1) / variance
+        return float(np.minimum(squares, gate).sum())
+
+    assert cost(found) <= cost(TURNED)
+    assert off(found, TURNED) < 0.02
+
+
+def test_one_far_match_cannot_turn_the_others() -> None:
+    """Where landmarks lie close together, a wrong match far away that turning makes fit leaves the motion as it is."""
+    rng = np.random.default_rng(9)
+    near = landmark_map(rng, rng.uniform(0.0, [4.0, 4.0, 1.5], (12, 3)))
+    far_a, far_b = np.array([30.0, 2.0, 1.0]), np.array([30.0, 2.6, 1.0])  # 0.02 rad about the others
+    looks = rng.standard_normal((1, D)).astype(np.float32)
+    looks /= np.linalg.norm(looks)
+    a, b = (
+        LandmarkMap(
+            np.vstack([near.means, far]), np.concatenate([near.covariances, near.covariances[:1]]),
+            np.vstack([near.descriptors, looks]),
+        )
+        for far in (far_a, far_b)
+    )  # fmt: skip
+    found, without = align_maps(a, b), align_maps(near, near)
+    np.testing.assert_allclose(found.transform, without.transform, atol=1e-6)
+    np.testing.assert_allclose(found.covariance, without.covariance, rtol=1e-6)
+    assert 12 not in found.inliers[:, 0]
+
+
+def test_members_without_extent_are_left_alone() -> None:
+    """Coincident landmarks say nothing about the rotation, and none of them is taken out for it."""
+    table = np.zeros((5, 18))
+    table[:, 6] = table[:, 9] = table[:, 11] = 0.01
+    members = np.ones(5, np.bool_)
+    kernels.drop_unverified(table, members, np.zeros(3), 0.01)
+    assert members.all()
+
+
+def corridor(rng: np.random.Generator, low: int, high: int) -> LandmarkMap:
+    """Draw landmarks on the two walls of a corridor 20 m long and 2.4 m wide."""
+    points = rng.uniform(0.0, [20.0, 0.02, 1.5], (low + high, 3))
+    points[low:, 1] += 2.4
+    return landmark_map(rng, points)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_mirrored_corridors_are_refused(method: str) -> None:
+    """One wall of a mirrored corridor fits a motion; the image fits all. What is not mirrored is accepted."""
+    rng = np.random.default_rng(10)
+    a = corridor(rng, 60, 20)
+    mirrored = replace(a, means=a.means * [1.0, -1.0, 1.0])
+    assert not align_maps(a, mirrored, method).success
+    assert align_maps(a, a.moved(TURNED), method).success
+    assert align_maps(a, mirrored).reason == "mirrored"
+
+
+def test_a_shared_cluster_makes_no_rival() -> None:
+    """Turning a small cluster by some degrees is uncertainty, not another place: nobody refuses it as ambiguous."""
+    rng = np.random.default_rng(11)
+    for _ in range(10):
+        a = landmark_map(rng, np.vstack([
+            rng.uniform(0.0, [3.0, 3.0, 1.5], (20, 3)), rng.uniform(-15.0, [15.0, 15.0, 1.5], (120, 3)),
+        ]))  # fmt: skip
+        assert align_maps(a, seen_from(a, TURNED, 120, rng)).reason != "ambiguous"
+
+
+@pytest.mark.parametrize("method", ["ransac", "clique"])
+def test_maps_are_aligned_by_geometry_alone(method: str) -> None:
+    """Where all landmarks look the same, any two of one height may be the same, and each is taken once."""
+    rng = np.random.default_rng(12)
+    a = landmark_map(rng, rng.uniform(0.0, [15.0, 10.0, 0.0], (16, 3)), np.ones((16, 1)))
+    b = seen_from(a, TURNED, 2, rng)
+    assert align_maps(a, b, method).reason == "too few candidates"
+    options = AlignmentOptions(appearance=False)
+    assert len(candidate_matches(a, b, options)) == 256
+    found = align_maps(a, b, method, options=options)
+    assert found.success, found.reason
+    assert off(found.transform, TURNED) < 0.05
+    assert len(found.inliers) == 14
+    assert len(np.unique(found.inliers[:, 0])) == len(np.unique(found.inliers[:, 1])) == 14
+
+
+def test_a_symmetric_place_is_ambiguous_by_geometry_alone() -> None:
+    """A ring of equal landmarks fits itself turned by one place as well."""
+    angles = np.linspace(0.0, 2.0 * np.pi, 12, endpoint=False)
+    ring = np.column_stack([5.0 * np.cos(angles), 5.0 * np.sin(angles), np.ones(12)])
+    a = landmark_map(np.random.default_rng(13), ring, np.ones((12, 1)))
+    found = align_maps(a, a.moved(TURNED), options=AlignmentOptions(appearance=False))
+    assert found.reason == "ambiguous"
+    assert found.ratio > 0.9
+
+
+def test_large_maps_without_appearance_are_refused() -> None:
+    """Pairs of 20,000 landmarks that all look the same are too many to try, and are not tried."""
+    n = 20_000
+    rng = np.random.default_rng(14)
+    huge = LandmarkMap(rng.uniform(0.0, 300.0, (n, 3)), np.tile(0.01 * np.eye(3), (n, 1, 1)), np.ones((n, 1)))
+    options = AlignmentOptions(appearance=False)
+    assert align_maps(huge, huge, options=options).reason == "too many candidates"
+    with pytest.raises(ValueError, match="map_b: expected at most 10000 pairs of landmarks without appearance"):
+        candidate_matches(huge, huge, options)
+
+
+def test_proposals_are_raw_and_need_two_candidates() -> None:
+    """What a method begins with is given even where an alignment is refused, but not from fewer than two matches."""
+    rng = np.random.default_rng(15)
+    a = landmark_map(rng, rng.uniform(0.0, [4.0, 3.0, 1.5], (3, 3)))
+    b = a.moved(inverse(TURNED))
+    for method in METHODS:
+        assert propose_motion(a.subset([0]), b, method) is None
+        if method != "ransac":
+            assert off(propose_motion(a, b, method), TURNED) < 1e-6
+    assert off(propose_motion(a, b, "ransac", options=AlignmentOptions(min_inliers=3)), TURNED) < 1e-6
+
+
+def test_maps_that_are_not_finite_are_never_built() -> None:
+    """NaN is refused where a map is made, by name, so that no alignment meets it."""
+    with pytest.raises(ValueError, match="means: expected finite numbers"):
+        LandmarkMap([[np.nan, 0.0, 0.0]], [np.eye(3)], [[1.0, 0.0]])
