@@ -12,6 +12,7 @@ from training.paper_command import paper
 from training.replay_command import replay_mrclam
 from training.replay_one_command import replay_kitti, replay_victoria
 from training.run import run
+from training.worlds_command import worlds
 
 app = typer.Typer(
     name="vslam",
@@ -29,6 +30,7 @@ app.add_typer(replay, name="replay")
 bench.command("filter")(bench_filter)
 app.add_typer(bench, name="bench")
 app.add_typer(paper, name="paper")
+app.add_typer(worlds, name="worlds")
 
 
 def main() -> None:

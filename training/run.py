@@ -20,7 +20,7 @@ VIDEO_SIZE = (960, 720)
 
 def run(
     world: Annotated[
-        str | None, typer.Option(help="office, fig5, or the path of a floor plan.", show_default="office")
+        str | None, typer.Option(help="A family or a path; see vslam worlds list.", show_default="office")
     ] = None,
     robots: Annotated[int | None, typer.Option(help="How many, 1 to 8.", show_default="3")] = None,
     policy: Annotated[

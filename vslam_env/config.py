@@ -16,7 +16,7 @@ from slam_backend.errors import bad_argument, check_choice, check_float, check_i
 from slam_backend.motion import OdometryModel
 from vslam_env.robot_belief import BeliefConfig
 from vslam_env.sensors import LandmarkSensorConfig, ScanConfig
-from vslam_env.world import LandmarkConfig, OdometryNoise
+from vslam_env.world import SPLITS, LandmarkConfig, OdometryNoise
 
 T = TypeVar("T")
 
@@ -43,6 +43,7 @@ class EnvConfig:
     Attributes:
         world: A family name, or the path of a floor plan, of a JSON file of walls or of a folder of these. Of an
             environment made with a `World` or a function: its name.
+        world_split: Layouts and textures of the seeds of `"train"`, `"validation"` or `"test"` only; None: any.
         num_robots: K, at most 8.
         sensor: What measures landmarks.
         action_type: `"continuous"`: (speed, turn) in [-1, 1]. `"discrete"`: stay, ahead, left, right. `"goal"`: one of
@@ -70,6 +71,7 @@ class EnvConfig:
     __pydantic_config__ = ConfigDict(extra="forbid")
 
     world: str = "office"
+    world_split: Literal["train", "validation", "test"] | None = None
     num_robots: int = 3
     sensor: Literal["landmark"] = "landmark"
     action_type: Literal["continuous", "discrete", "goal"] = "continuous"
@@ -98,6 +100,8 @@ class EnvConfig:
             raise bad_argument("num_robots", f"an int from 1 to {MAX_ROBOTS}", robots, "Use 1 to 8 robots.")
         if not isinstance(self.world, str):
             raise bad_argument("world", "a name or a path, as a string", self.world, "Pass a World to parallel_env.")
+        if self.world_split is not None:
+            check_choice("world_split", self.world_split, tuple(SPLITS))
         check_choice("sensor", self.sensor, SENSORS)
         check_choice("action_type", self.action_type, ACTION_TYPES)
         check_choice("observation_type", self.observation_type, OBSERVATION_TYPES)

@@ -24,7 +24,7 @@ from vslam_env.scenes import scene_of
 from vslam_env.setting import draw_setting
 from vslam_env.snapshots import EnvState, check_state, restored_sequence, sequence_state, state_version
 from vslam_env.window import Window
-from vslam_env.world import World, WorldSource, check_source
+from vslam_env.world import World, WorldSource, check_source, is_one_building
 
 AgentID = str
 RENDER_MODES = ("human", "rgb_array")
@@ -63,6 +63,9 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         self.recorder: Recorder | None = None
         self._source: WorldSource = config.world if world is None else world
         check_source(self._source)
+        if config.world_split is not None and is_one_building(self._source):
+            cure = "Use a family, a folder or a function, or leave the split out."
+            raise bad_argument("world_split", "None for a world of which there is one", config.world_split, cure)
         self._terms = make_terms(config.reward if reward is None else reward)
         self.config = dataclasses.replace(config, reward={term.name: term.weight for term in self._terms})
         self.possible_agents = config.agents

@@ -10,7 +10,15 @@ from vslam_env.config import EnvConfig
 from vslam_env.coverage import CoverageMeter
 from vslam_env.errors_of_maps import ClaimLedger
 from vslam_env.sensors import LandmarkSensor, Scan
-from vslam_env.world import FreeSpace, World, WorldSource, draw_bias, make_world, place_landmarks
+from vslam_env.world import (
+    FreeSpace,
+    World,
+    WorldSource,
+    draw_bias,
+    draw_world_seed,
+    make_world,
+    place_landmarks,
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -66,9 +74,11 @@ def draw_setting(
         ValueError: If there is no such world, or robots cannot start there.
     """
     layout, textures, starts, odometry, sensor, scan, belief_seed = seed.spawn(7)
+    if world_seed is None and config.world_split is not None:
+        world_seed = draw_world_seed(config.world_split, np.random.default_rng(layout))
     if world_seed is not None:
         layout, textures = np.random.SeedSequence(world_seed).spawn(2)
-    bare = make_world(source, np.random.default_rng(layout))
+    bare = make_world(source, np.random.default_rng(layout), config.world_split)
     free_space = FreeSpace(bare, config.robot_radius)
     landmarks = bare.landmarks
     if landmarks is None:

@@ -17,6 +17,7 @@ from vslam_env.world import World, WorldSource
 
 def parallel_env(
     world: WorldSource | None = None,
+    world_split: str | None = None,
     num_robots: int | None = None,
     sensor: str | None = None,
     action_type: str | None = None,
@@ -37,8 +38,11 @@ def parallel_env(
     """Make the parallel environment. An argument that is None leaves what the configuration or preset says.
 
     Args:
-        world: `"office"` (default), `"fig5"`, the path of a floor plan (.png, .jpg, .pgm), of a .json file of walls or
-            of a folder of these, a `World`, or a function of a generator that returns one.
+        world: `"office"` (default), `"maze"`, `"loops"`, `"hall"`, `"fig5"`; the path of a floor plan (.png, .jpg,
+            .pgm), of a ROS map (.yaml), of a .json file of walls or of a folder of these; a `World`; or a function of
+            a generator that returns one.
+        world_split: `"train"`, `"validation"` or `"test"`: worlds of that range of world seeds only, or files of a
+            folder by turns; default any.
         num_robots: 1 to 8; default 3.
         sensor: `"landmark"`.
         action_type: `"continuous"` (default): (speed, turn) in [-1, 1], zeros stand still. `"discrete"`: stay, ahead,
@@ -70,6 +74,7 @@ def parallel_env(
         raise bad_argument("config", "an EnvConfig, a path or None", config, "Build one with EnvConfig(...).")
     changes: dict[str, Any] = {
         "world": None if world is None else _world_name(world),
+        "world_split": world_split,
         "num_robots": num_robots,
         "sensor": sensor,
         "action_type": action_type,

@@ -4,15 +4,18 @@ A reset goes: `make_world` -> `FreeSpace` -> `place_landmarks` (unless the world
 `check_starts` -> `Simulator`.
 """
 
-from vslam_env.world.floorplan import load_floorplan, load_walls_json
+from vslam_env.world.floorplan import load_floorplan, load_walls_json, save_walls_json
 from vslam_env.world.freespace import FreeSpace
 from vslam_env.world.landmarks import LandmarkConfig, place_landmarks
 from vslam_env.world.odometry import OdometryNoise, draw_bias, read_odometry
-from vslam_env.world.registry import WORLD_FAMILIES, WorldSource, check_source, make_world
+from vslam_env.world.registry import WORLD_FAMILIES, WorldSource, check_source, is_one_building, make_world
+from vslam_env.world.rosmap import load_ros_map
 from vslam_env.world.simulator import Simulator
 from vslam_env.world.spec import Landmarks, World
+from vslam_env.world.splits import SPLITS, draw_world_seed
 
 __all__ = [
+    "SPLITS",
     "WORLD_FAMILIES",
     "FreeSpace",
     "LandmarkConfig",
@@ -23,9 +26,13 @@ __all__ = [
     "WorldSource",
     "check_source",
     "draw_bias",
+    "draw_world_seed",
+    "is_one_building",
     "load_floorplan",
+    "load_ros_map",
     "load_walls_json",
     "make_world",
     "place_landmarks",
     "read_odometry",
+    "save_walls_json",
 ]

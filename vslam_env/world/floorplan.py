@@ -36,11 +36,19 @@ def load_floorplan(
     """
     metres_per_pixel = check_float("metres_per_pixel", metres_per_pixel, "Give the side of a pixel.", above=0.0)
     tolerance_px = check_float("tolerance_px", tolerance_px, "Give pixels.", at_least=0.0)
-    path = _existing(path)
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    if image is None:
-        raise bad_argument("world", "an image that OpenCV can read", str(path), "Save the plan as PNG.")
-    free = _free_part(image, str(path))
+    path = existing(path)
+    free = _free_part(read_image(path, cv2.IMREAD_COLOR), str(path))
+    return World(path.stem, trace(free, metres_per_pixel, tolerance_px, robot_radius, str(path)))
+
+
+def trace(free: Any, metres_per_pixel: float, tolerance_px: float, robot_radius: float, path: str) -> FloatArray:
+    """Trace the outlines of a free part (H, W) uint8, 1 = free; return walls (S, 4) [m].
+
+    The origin is the image's lower left corner, y upwards; `path` is what an error names.
+
+    Raises:
+        ValueError: If no robot fits.
+    """
     x, y, width, height = cv2.boundingRect(free)
     cropped = np.pad(free[y : y + height, x : x + width], 1)
     widest = 2.0 * metres_per_pixel * float(cv2.distanceTransform(cropped, cv2.DIST_L2, 3).max())
@@ -49,14 +57,14 @@ def load_floorplan(
             "world",
             f"free space for robots of radius {robot_radius:g} m",
             f"a widest place of {widest:.2f} m in {path}",
-            "Raise metres_per_pixel or draw wider rooms.",
+            "Give pixels a larger side or draw wider rooms.",
         )
     corner = np.array([x - 1, y - 1])  # of the cropped part in the image
     to_metres = metres_per_pixel * np.array([1.0, -1.0])  # rows count downwards, y upwards
     outlines = [
         (line + corner - (0, len(free))) * to_metres for line in _outlines(cropped, tolerance_px)
     ]
-    return World(path.stem, np.vstack([np.hstack([line, np.roll(line, -1, axis=0)]) for line in outlines]))
+    return np.vstack([np.hstack([line, np.roll(line, -1, axis=0)]) for line in outlines])
 
 
 def load_walls_json(path: str | Path) -> World:
@@ -65,7 +73,7 @@ def load_walls_json(path: str | Path) -> World:
     Raises:
         ValueError: If the file is missing, no JSON, or has other keys; `start_poses` and `name` may be left out.
     """
-    path = _existing(path)
+    path = existing(path)
     cure = 'Write {"walls": [[x1, y1, x2, y2], ...]}, in metres; "start_poses" and "name" are optional.'
     try:
         content: Any = json.loads(path.read_text(encoding="utf-8"))
@@ -80,7 +88,34 @@ def load_walls_json(path: str | Path) -> World:
     return World(content.get("name", path.stem), content["walls"], start_poses=content.get("start_poses"))
 
 
-def _existing(path: str | Path) -> Path:
+def save_walls_json(world: World, path: str | Path) -> None:
+    """Write walls, start poses and name as `load_walls_json` reads them; landmarks are left out.
+
+    Raises:
+        ValueError: If the file cannot be written.
+    """
+    content = {"name": world.name, "walls": np.round(world.walls, 6).tolist()}
+    if world.start_poses is not None:
+        content["start_poses"] = world.start_poses.tolist()
+    try:
+        Path(path).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise bad_argument("path", "a file that can be written", str(path), f"The system says: {error}.") from error
+
+
+def read_image(path: Path, flags: int) -> Any:
+    """Return an image as OpenCV reads it.
+
+    Raises:
+        ValueError: If it is none.
+    """
+    image = cv2.imread(str(path), flags)
+    if image is None:
+        raise bad_argument("world", "an image that OpenCV can read", str(path), "Save the plan as PNG.")
+    return image
+
+
+def existing(path: str | Path) -> Path:
     """Return the path of a file that is there."""
     path = Path(path)
     if not path.is_file():
@@ -103,9 +138,13 @@ def _free_part(image: Any, path: str) -> Any:
             f"no free space to tell from walls in {path}",
             "Draw free space white and walls black.",
         )
-    free = ((grey >= BRIGHT_SHARE * brightest) | coloured).astype(np.uint8)
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(free, connectivity=4)
-    marked = np.bincount(labels[coloured], minlength=count)
+    return largest_part((grey >= BRIGHT_SHARE * brightest) | coloured, coloured)
+
+
+def largest_part(free: Any, marked_cells: Any = None) -> Any:
+    """Return the largest part of a mask (H, W) bool that hangs together, or that with the most marked cells, uint8."""
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(free.astype(np.uint8), connectivity=4)
+    marked = np.zeros(count) if marked_cells is None else np.bincount(labels[marked_cells], minlength=count)
     sizes = stats[:, cv2.CC_STAT_AREA].astype(np.int64)
     sizes[0] = marked[0] = 0
     part = int(np.argmax(marked if marked.any() else sizes))

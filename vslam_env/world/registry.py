@@ -1,6 +1,7 @@
 """A name, a path, a `World` or a function becomes a `World`."""
 
 from collections.abc import Callable
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -8,24 +9,32 @@ import numpy as np
 from slam_backend.errors import bad_argument
 from vslam_env.world.fig5 import fig5
 from vslam_env.world.floorplan import load_floorplan, load_walls_json
+from vslam_env.world.hall import hall
+from vslam_env.world.loops import loops
+from vslam_env.world.maze import maze
 from vslam_env.world.office import office
+from vslam_env.world.rosmap import load_ros_map
 from vslam_env.world.spec import World
+from vslam_env.world.splits import files_of_split
 
 WorldMaker = Callable[[np.random.Generator], World]
 WorldSource = str | Path | World | WorldMaker
 
-WORLD_FAMILIES: dict[str, WorldMaker] = {"office": office, "fig5": fig5}
+WORLD_FAMILIES: dict[str, WorldMaker] = {"office": office, "maze": maze, "loops": loops, "hall": hall, "fig5": fig5}
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".pgm")
+MAP_SUFFIXES = (".yaml", ".yml")
+FILE_SUFFIXES = (*IMAGE_SUFFIXES, *MAP_SUFFIXES, ".json")
 
 
-def make_world(world: WorldSource, rng: np.random.Generator) -> World:
+def make_world(world: WorldSource, rng: np.random.Generator, split: str | None = None) -> World:
     """Make a world.
 
     Args:
-        world: A family name (see `WORLD_FAMILIES`); a path of a floor plan (.png, .jpg, .pgm), of a .json file of
-            walls, or of a folder of such files, of which one is drawn; a `World`; or a function of `rng` that returns
-            one.
+        world: A family name (see `WORLD_FAMILIES`); a path of a floor plan (.png, .jpg, .pgm), of a ROS map (.yaml), of
+            a .json file of walls, or of a folder of such files, of which one is drawn; a `World`; or a function of
+            `rng` that returns one.
         rng: Source of all draws.
+        split: Of a folder, only files of this split are drawn; see `splits`. Else of no effect.
 
     Raises:
         ValueError: If there is no such family or file, or the function returns something else.
@@ -36,7 +45,7 @@ def make_world(world: WorldSource, rng: np.random.Generator) -> World:
     if isinstance(world, str) and world in WORLD_FAMILIES:
         return WORLD_FAMILIES[world](rng)
     if isinstance(world, (str, Path)):
-        return _load(world, rng)
+        return _load(world, rng, split)
     made = world(rng)
     if not isinstance(made, World):
         raise bad_argument("world", "a function that returns a World", made, "Return World(name, walls).")
@@ -57,29 +66,48 @@ def check_source(world: object) -> None:
         raise bad_argument("world", "a name, a path, a World or a function", world, cure)
 
 
-def _load(world: str | Path, rng: np.random.Generator) -> World:
+def is_one_building(world: WorldSource) -> bool:
+    """Tell whether all worlds of a source have the same walls, so that there is nothing to split."""
+    named = isinstance(world, (str, Path)) and not (isinstance(world, str) and world in WORLD_FAMILIES)
+    return isinstance(world, World) or (named and not Path(world).is_dir())  # type: ignore[arg-type]
+
+
+def _load(world: str | Path, rng: np.random.Generator, split: str | None) -> World:
     """Load the world at a path, or one of a folder's."""
     files = _files(world)
+    if Path(world).is_dir() and split is not None:
+        files = files_of_split(files, split)
     path = files[int(rng.integers(len(files)))] if Path(world).is_dir() else files[0]
-    return load_walls_json(path) if path.suffix.lower() == ".json" else load_floorplan(path)
+    return _read(path, path.stat().st_mtime_ns)
+
+
+@lru_cache(maxsize=64)
+def _read(path: Path, changed: int) -> World:
+    """Read a file once for as long as it does not change."""
+    suffix = path.suffix.lower()
+    if suffix in MAP_SUFFIXES:
+        return load_ros_map(path)
+    return load_walls_json(path) if suffix == ".json" else load_floorplan(path)
 
 
 def _files(world: str | Path) -> list[Path]:
-    """Return the file at a path, or those of a folder; at least one."""
+    """Return the file at a path, or those of a folder, at least one; an image of a YAML file counts with it."""
     path = Path(world)
     if path.is_dir() and world != "":  # the path of no characters would be the current folder
-        files = sorted(p for p in path.iterdir() if p.suffix.lower() in (*IMAGE_SUFFIXES, ".json"))
+        files = sorted(p for p in path.iterdir() if p.suffix.lower() in FILE_SUFFIXES)
+        maps = {file.stem for file in files if file.suffix.lower() in MAP_SUFFIXES}
+        files = [file for file in files if file.stem not in maps or file.suffix.lower() not in IMAGE_SUFFIXES]
         if not files:
-            cure = "Put .png, .jpg, .pgm or .json files there."
+            cure = "Put .png, .jpg, .pgm, .yaml or .json files there."
             raise bad_argument("world", "a folder with floor plans", str(path), cure)
         return files
-    if path.suffix.lower() not in (*IMAGE_SUFFIXES, ".json"):
+    if path.suffix.lower() not in FILE_SUFFIXES:
         names = ", ".join(repr(name) for name in WORLD_FAMILIES)
         raise bad_argument(
             "world",
-            f"one of {names}, or a path of an image, a .json file or a folder",
+            f"one of {names}, or a path of an image, a .yaml or .json file or a folder",
             str(world),
-            "Check the spelling, or that the file ends in .png, .jpg, .pgm or .json.",
+            "Check the spelling, or that the file ends in .png, .jpg, .pgm, .yaml or .json.",
         )
     if not path.is_file():
         raise bad_argument("world", "a file", str(path), "Check the path: there is no such file.")

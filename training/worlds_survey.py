@@ -1,0 +1,87 @@
+"""What worlds are like: their figures, and pictures of several side by side."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_backend.errors import check_int
+from vslam_env import vslam_v0
+from vslam_env.config import EnvConfig
+from vslam_env.rendering import draw_frame
+from vslam_env.setting import draw_setting
+from vslam_env.world import FreeSpace
+
+TILE = (640, 480)  # [px]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WorldFigures:
+    """One world.
+
+    Attributes:
+        name: Of the world.
+        walls: Its walls.
+        landmarks: Those that robots could ever see.
+        floor_m2: Floor that robots can explore [m²].
+        width_m: Extent along x [m].
+        height_m: Extent along y [m].
+        start_gap_m: Least distance between two drawn start poses [m]; infinity for a single robot.
+    """
+
+    name: str
+    walls: int
+    landmarks: int
+    floor_m2: float
+    width_m: float
+    height_m: float
+    start_gap_m: float
+
+
+def survey(world: str, world_seed: int, robots: int = 3) -> WorldFigures:
+    """Build a world and start robots in it.
+
+    Raises:
+        ValueError: If that is not possible; the text says why and what to do.
+    """
+    check_int("seed", world_seed, 0, "Use 0 or a positive number.")
+    config = EnvConfig(world=world, num_robots=robots)
+    setting = draw_setting(config, world, np.random.SeedSequence(world_seed), world_seed)
+    x_min, y_min, x_max, y_max = setting.world.bounds
+    starts = setting.true_starts[:, :2]
+    gaps = np.linalg.norm(starts[:, None] - starts, axis=2)[~np.eye(robots, dtype=bool)]
+    squares = FreeSpace(setting.world, config.robot_radius).free_area_cells
+    return WorldFigures(
+        name=setting.world.name,
+        walls=len(setting.world.walls),
+        landmarks=int(np.count_nonzero(setting.countable)),
+        floor_m2=0.04 * len(squares),
+        width_m=x_max - x_min,
+        height_m=y_max - y_min,
+        start_gap_m=float(gaps.min(initial=np.inf)),
+    )
+
+
+def contact_sheet(world: str, first_seed: int, count: int, robots: int) -> NDArray[np.uint8]:
+    """Draw worlds of `count` seeds side by side, with landmarks and start poses, (H, W, 3) uint8 RGB.
+
+    Raises:
+        ValueError: If an argument is bad or a world cannot be built.
+    """
+    check_int("count", count, 1, "Draw one world or more.")
+    check_int("seed", first_seed, 0, "Use 0 or a positive number.")
+    env = vslam_v0.parallel_env(world=world, num_robots=robots)
+    tiles: list[Any] = []
+    for seed in range(first_seed, first_seed + count):
+        env.reset(seed=seed, options={"world_seed": seed})
+        tile = draw_frame(env.scene(), TILE)
+        cv2.putText(tile, f"seed {seed}", (70, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (90, 90, 90), 1, cv2.LINE_AA)
+        tiles.append(tile)
+    columns = int(np.ceil(np.sqrt(count)))
+    blank = np.full_like(tiles[0], 255)
+    tiles += [blank] * (-count % columns)
+    rows = [np.hstack(tiles[i : i + columns]) for i in range(0, len(tiles), columns)]
+    sheet: NDArray[np.uint8] = np.vstack(rows)
+    return sheet
