@@ -1,0 +1,197 @@
+"""Fewer key poses: what is known best of a path becomes rigid, so that a long run needs no more room than a short one.
+
+Where the newest keys end, measurements are condensed once for all. If there are still more keys than allowed, those
+neighbours become one whose relative pose is known best, in the mean over the paths just drawn: the second then stands
+rigidly to the first, what was measured from it is moved there, and the odometry between them is spent.
+"""
+
+import heapq
+from dataclasses import replace
+
+import numpy as np
+
+from slam_backend.errors import BoolArray, FloatArray, IntArray
+from slam_backend.geometry import between, compose, rotation
+from slam_backend.smoothing.graph import NONE, PathGraph, chained
+from slam_backend.smoothing.solving import Mode
+
+
+def coarsened(graph: PathGraph, mode: Mode, spreads: FloatArray, max_keys: int, fresh_keys: int) -> PathGraph:
+    """Return the graph at its mode, with old keys condensed and at most `max_keys` of them, if the fresh ones allow.
+
+    Args:
+        graph: As it was solved.
+        mode: Of it.
+        spreads: (k,) [m^2] how far the motion from the key before scatters.
+        max_keys: Of all robots together.
+        fresh_keys: Newest ones to be left as they are, of all robots together.
+    """
+    share = max(1, fresh_keys // len(graph.tips))
+    fresh = np.zeros(graph.num_keys, dtype=np.bool_)
+    for robot in range(len(graph.tips)):
+        fresh[np.flatnonzero(graph.robots == robot)[-share:]] = True
+    at_mode = replace(graph, poses=mode.poses, landmarks=mode.landmarks)
+    condensed = _condensed(at_mode, mode, fresh)
+    condensed = _without_blind(condensed, fresh)
+    representatives, slack = _representatives(condensed, spreads, fresh, max_keys)
+    return compacted(_joined(replace(condensed, slack=slack), representatives))
+
+
+def _condensed(graph: PathGraph, mode: Mode, fresh: BoolArray) -> PathGraph:
+    """Freeze what was measured from keys that are no longer fresh."""
+    seen = mode.sightings
+    frozen = seen.frozen | ~fresh[seen.keys]
+    keep = fresh[graph.frame_keys[graph.point_frames]]
+    return replace(
+        graph,
+        points=graph.points[keep],
+        point_noises=graph.point_noises[keep],
+        given=graph.given[keep],
+        point_frames=graph.point_frames[keep],
+        point_landmarks=graph.point_landmarks[keep],
+        frozen_keys=seen.keys[frozen],
+        frozen_landmarks=seen.landmarks[frozen],
+        centres=seen.centres[frozen],
+        infos=seen.infos[frozen],
+        slopes=seen.slopes[frozen],
+        counts=seen.counts[frozen],
+    )
+
+
+def _without_blind(graph: PathGraph, fresh: BoolArray) -> PathGraph:
+    """Chain the odometry over keys from which nothing was measured; they lose their successors."""
+    sighted = np.zeros(graph.num_keys, dtype=np.bool_)
+    sighted[graph.frozen_keys] = True
+    sighted[graph.frame_keys[graph.point_frames]] = True
+    blind = ~sighted & ~fresh & (graph.previous >= 0)
+    if not blind.any():
+        return graph
+    previous, motions, noises = graph.previous.copy(), graph.motions.copy(), graph.noises.copy()
+    for key in np.flatnonzero(previous >= 0):  # in the order of time
+        before = previous[key]
+        while blind[before]:
+            motions[key], noises[key] = chained(motions[before], noises[before], motions[key], noises[key])
+            before = previous[before]
+        previous[key] = before
+    return replace(graph, previous=previous, motions=motions, noises=noises)
+
+
+def _representatives(
+    graph: PathGraph, cost: FloatArray, fresh: BoolArray, max_keys: int
+) -> tuple[IntArray, FloatArray]:
+    """Return (k,) the key that each stands rigidly to, itself or an earlier one, or `NONE`; and new slacks (k,)."""
+    k = graph.num_keys
+    representative = np.arange(k)
+    following = np.full(k, NONE)
+    linked = np.flatnonzero(graph.previous >= 0)
+    following[graph.previous[linked]] = linked  # a blind key was replaced by its successor, if it has one
+    needed = following[np.maximum(graph.previous, 0)] == np.arange(k)
+    needed |= graph.previous < 0
+    representative[~needed] = NONE
+    surplus = int(needed.sum()) - max_keys
+    slack, previous = graph.slack.copy(), graph.previous.copy()
+    heap = [(cost[b] + slack[b] + slack[previous[b]], int(b)) for b in linked if needed[b] and not fresh[b]]
+    heapq.heapify(heap)
+    while surplus > 0 and heap:
+        price, b = heapq.heappop(heap)
+        a = int(previous[b])
+        if representative[b] != b or price < cost[b] + slack[a] + slack[b]:
+            if representative[b] == b:
+                heapq.heappush(heap, (cost[b] + slack[a] + slack[b], b))
+            continue
+        representative[b] = a
+        slack[a] += slack[b] + cost[b]
+        after = int(following[b])
+        following[a] = after
+        if after >= 0:
+            previous[after] = a
+        surplus -= 1
+    return representative, slack
+
+
+def _joined(graph: PathGraph, representative: IntArray) -> PathGraph:
+    """Move all that hangs on a key to the one it now stands rigidly to."""
+    kept = representative == np.arange(len(representative))
+    root = np.maximum(representative, 0)
+    while (representative[root] != root).any():
+        root = representative[root]
+    offsets = between(graph.poses[root], graph.poses)
+    offsets[kept] = 0.0
+    number = np.cumsum(kept) - 1
+    before = np.maximum(graph.previous, 0)
+    turn = np.zeros((len(kept), 3, 3))
+    turn[:, :2, :2], turn[:, 2, 2] = rotation(offsets[before, 2]), 1.0
+    sightings = _combined(
+        root[graph.frozen_keys], graph.frozen_landmarks, *_moved(graph, offsets[graph.frozen_keys]), graph.counts
+    )
+    return replace(
+        graph,
+        robots=graph.robots[kept],
+        poses=graph.poses[kept],
+        previous=np.where(graph.previous >= 0, number[root[before]], NONE)[kept],
+        motions=compose(offsets[before], graph.motions)[kept],
+        noises=(turn @ graph.noises @ turn.transpose(0, 2, 1))[kept],
+        slack=graph.slack[kept],
+        frame_keys=number[root[graph.frame_keys]],
+        frozen_keys=number[sightings[0]],
+        frozen_landmarks=sightings[1],
+        centres=sightings[2],
+        infos=sightings[3],
+        slopes=sightings[4],
+        counts=sightings[5],
+        tips=number[graph.tips],
+    )
+
+
+def _full(upper: FloatArray) -> FloatArray:
+    return upper[:, [[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
+
+
+def _upper(full: FloatArray) -> FloatArray:
+    return full[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+
+
+def _moved(graph: PathGraph, offsets: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return centres, informations and slopes of the frozen sightings, moved by offsets of their keys."""
+    turn = np.zeros((len(offsets), 3, 3))
+    turn[:, :2, :2], turn[:, 2, 2] = rotation(offsets[:, 2]), 1.0
+    centres = np.einsum("nij,nj->ni", turn, graph.centres)
+    centres[:, :2] += offsets[:, :2]
+    infos = _upper(turn @ _full(graph.infos) @ turn.transpose(0, 2, 1))
+    return centres, infos, np.einsum("nij,nj->ni", turn, graph.slopes)
+
+
+def _combined(
+    keys: IntArray, landmarks: IntArray, centres: FloatArray, infos: FloatArray, slopes: FloatArray, counts: IntArray
+) -> tuple[IntArray, IntArray, FloatArray, FloatArray, FloatArray, IntArray]:
+    """Add up the forms of each pair of key and landmark, about the centre of the first."""
+    if not len(keys):
+        return keys, landmarks, centres, infos, slopes, counts
+    order = np.lexsort((keys, landmarks))
+    keys, landmarks = keys[order], landmarks[order]
+    centres, infos, slopes, counts = centres[order], infos[order], slopes[order], counts[order]
+    new = np.ones(len(keys), dtype=np.bool_)
+    new[1:] = (keys[1:] != keys[:-1]) | (landmarks[1:] != landmarks[:-1])
+    first = np.flatnonzero(new)
+    shift = centres[first][np.cumsum(new) - 1] - centres
+    slopes = slopes - np.einsum("nij,nj->ni", _full(infos), shift)
+    return (
+        keys[first], landmarks[first], centres[first], np.add.reduceat(infos, first), np.add.reduceat(slopes, first),
+        np.add.reduceat(counts, first),
+    )  # fmt: skip
+
+
+def compacted(graph: PathGraph) -> PathGraph:
+    """Drop frames and landmarks from which, and of which, nothing is measured."""
+    frames = np.unique(graph.point_frames)
+    landmarks = np.unique(np.concatenate([graph.point_landmarks, graph.frozen_landmarks]))
+    return replace(
+        graph,
+        frame_keys=graph.frame_keys[frames],
+        frame_offsets=graph.frame_offsets[frames],
+        point_frames=np.searchsorted(frames, graph.point_frames),
+        point_landmarks=np.searchsorted(landmarks, graph.point_landmarks),
+        frozen_landmarks=np.searchsorted(landmarks, graph.frozen_landmarks),
+        landmark_ids=graph.landmark_ids[landmarks],
+        landmarks=graph.landmarks[landmarks],
+    )

@@ -1,0 +1,39 @@
+"""`SmoothingOptions`: what decides how a particle filter is rejuvenated."""
+
+from dataclasses import dataclass
+
+from slam_backend.errors import check_float, check_int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SmoothingOptions:
+    """All that decides a rejuvenation.
+
+    Attributes:
+        max_keys: Most key poses; where there are more, the most rigid neighbours become one. Effort grows with its cube
+            at worst, memory with its product with the landmarks in view.
+        fresh_keys: Newest keys of each robot that keep their raw measurements, which are linearised anew each time.
+        kernel: Squared Mahalanobis distance of a measurement (3 degrees of freedom) above which it loses weight; 0:
+            none does.
+        noise_scale: Factor on the covariance of all measurements.
+        least_ess: Share of M that the effective sample size of the importance weights must reach.
+        max_iterations: Of Gauss and Newton.
+        tolerance: The descent ends when the cost is expected to fall by less than this (half a squared distance).
+    """
+
+    max_keys: int = 150
+    fresh_keys: int = 60
+    kernel: float = 16.0
+    noise_scale: float = 1.0
+    least_ess: float = 0.3
+    max_iterations: int = 15
+    tolerance: float = 1e-3
+
+    def __post_init__(self) -> None:
+        check_int("max_keys", self.max_keys, 2, "Two poses are the least that can be smoothed.")
+        check_int("fresh_keys", self.fresh_keys, 1, "The newest pose is always fresh.")
+        check_int("max_iterations", self.max_iterations, 1, "Ten are enough as a rule.")
+        check_float("kernel", self.kernel, "Use 0 for plain squares.", at_least=0.0)
+        check_float("noise_scale", self.noise_scale, "Use 1 for the noise as it is.", above=0.0)
+        check_float("tolerance", self.tolerance, "Use 1e-3.", above=0.0)
+        check_float("least_ess", self.least_ess, "Give a share of M.", at_least=0.0, at_most=1.0)

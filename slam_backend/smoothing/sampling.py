@@ -1,0 +1,107 @@
+"""Whole paths drawn from the posterior of a smoother, their landmarks, and their importance weights."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import lapack
+
+from slam_backend.errors import FloatArray
+from slam_backend.geometry import between
+from slam_backend.smoothing import _kernels
+from slam_backend.smoothing._kernels import LANES, POSE_ROWS, WORK_ROWS
+from slam_backend.smoothing.graph import PathGraph
+from slam_backend.smoothing.solving import Mode
+
+LEVER = 3.0  # [m]; where an error of the heading between two keys is felt
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Draws:
+    """M paths with the landmarks that each of them asks for.
+
+    Attributes:
+        poses: (k, 3, M) float64 [m, m, rad], map frame.
+        tiles: (l, P / 64, 9, 64) float64. Means (3) and covariances (6) of the landmarks, map frame, by lanes.
+        log_weights: (M,) float64. Importance weights, not normalised.
+        spreads: (k,) float64 [m^2]. How far the motions from the keys before scatter, headings felt at `LEVER`.
+    """
+
+    poses: FloatArray
+    tiles: FloatArray
+    log_weights: FloatArray
+    spreads: FloatArray
+
+    @property
+    def landmarks(self) -> FloatArray:
+        """(l, 9, M) float64. Means and covariances."""
+        rows = self.tiles.transpose(0, 2, 1, 3).reshape(len(self.tiles), 9, -1)
+        return np.ascontiguousarray(rows[:, :, : self.poses.shape[2]])
+
+
+def draw_paths(graph: PathGraph, mode: Mode, num_particles: int, rng: np.random.Generator) -> Draws:
+    """Draw x^(i) = mode + U^-1 z, z ~ N(0, I), and replay each path.
+
+    log w = log p(path given odometry) + log p(measurements given path) - log q(path). The first path is the mode.
+
+    Args:
+        graph: Odometry and measurements.
+        mode: Of it, with the factor of its information.
+        num_particles: M >= 1.
+        rng: Source of the draws.
+    """
+    m = num_particles
+    normals = rng.standard_normal((m, len(mode.factor))).T  # columns lie in a row, as LAPACK wants them
+    normals[:, 0] = 0.0
+    spread = lapack.dtrtrs(mode.factor, normals, lower=0)[0]
+    poses = np.repeat(mode.poses[:, :, None], m, axis=2)
+    poses[mode.columns >= 0] += spread.reshape(-1, 3, m)
+    rows = lane_rows(poses)
+    tiles, log_likelihood = replay(mode, rows, m)
+    log_odometry, spreads = weigh_odometry(graph, mode, rows, m)
+    log_weights = log_likelihood + log_odometry + 0.5 * np.einsum("nm,nm->m", normals, normals)
+    return Draws(poses, tiles, log_weights, spreads)
+
+
+def lane_rows(poses: FloatArray) -> FloatArray:
+    """Return paths (k, 3, M) as (P / 64, k, 5, 64): x, y, cos, sin, heading; filled up with copies."""
+    k, _, m = poses.shape
+    blocks = -(-m // LANES)
+    padded = np.empty((k, POSE_ROWS, blocks * LANES))
+    padded[:, :2, :m], padded[:, 4, :m] = poses[:, :2], poses[:, 2]
+    padded[:, 2, :m], padded[:, 3, :m] = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    padded[:, :, m:] = padded[:, :, :1]
+    return np.ascontiguousarray(padded.reshape(k, POSE_ROWS, blocks, LANES).transpose(2, 0, 1, 3))
+
+
+def replay(mode: Mode, rows: FloatArray, num_particles: int) -> tuple[FloatArray, FloatArray]:
+    """Return the landmarks of M paths, and log p(measurements given path) up to a constant.
+
+    Args:
+        mode: Sightings, linearised there.
+        rows: Of `lane_rows`.
+        num_particles: M.
+
+    Returns:
+        (l, P / 64, 9, 64) means and covariances in blocks of lanes, zeros where a landmark has no sighting; (M,).
+    """
+    blocks, k = rows.shape[:2]
+    seen = mode.sightings
+    tiles = np.zeros((len(mode.landmarks), blocks, 9, LANES))
+    log_likelihood = np.zeros(blocks * LANES)
+    _kernels.replay(
+        rows.reshape(-1), k, blocks, mode.landmarks, seen.keys, seen.starts, seen.centres, seen.infos, seen.slopes,
+        np.zeros(WORK_ROWS * LANES), tiles.reshape(-1), log_likelihood,
+    )  # fmt: skip
+    return tiles, log_likelihood[:num_particles]
+
+
+def weigh_odometry(graph: PathGraph, mode: Mode, rows: FloatArray, num_particles: int) -> tuple[FloatArray, FloatArray]:
+    """Return log p(path given odometry) up to a constant (M,), and how far motions between keys scatter (k,) [m^2]."""
+    blocks, k = rows.shape[:2]
+    log_density, spreads = np.zeros(blocks * LANES), np.zeros(k)
+    moved = between(mode.poses[np.maximum(graph.previous, 0)], mode.poses)
+    _kernels.odometry_of_paths(
+        rows.reshape(-1), k, blocks, num_particles, graph.previous, moved, graph.motions, mode.odometry_infos, LEVER,
+        log_density, spreads,
+    )  # fmt: skip
+    return log_density[:num_particles], spreads

@@ -1,0 +1,150 @@
+"""The most probable paths and landmarks: Gauss-Newton over key poses, landmarks eliminated."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import lapack
+
+from slam_backend.errors import FloatArray, IntArray
+from slam_backend.smoothing import _kernels
+from slam_backend.smoothing._kernels import FREE
+from slam_backend.smoothing.graph import PathGraph
+from slam_backend.smoothing.options import SmoothingOptions
+from slam_backend.smoothing.sightings import Sightings
+
+FIRST_DAMPING, MOST_DAMPING = 1e-4, 1e8
+LARGEST_STEP = 1e3  # [m, rad]; nothing is sought so far away
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mode:
+    """The most probable paths, and the Gaussian about them.
+
+    Attributes:
+        poses: (k, 3) float64 [m, m, rad], map frame; headings are not wrapped against each other.
+        landmarks: (l, 3) float64 [m], map frame.
+        columns: (k,) int64. First row of each key in `factor`, `FREE` where the pose is given.
+        factor: (n, n) float64, upper triangle U with U^T U the information of the paths, landmarks integrated out.
+        slope: (n,) float64. Of half the cost there, landmarks at their best.
+        sightings: As linearised there.
+        odometry_infos: (k, 3, 3) float64. Information of the odometry from the key before; zeros where there is none.
+        cost: Half the sum of squared distances (robust, and up to a constant of the frozen sightings).
+        iterations: Systems solved.
+        reason: Why it is of no use; "" if it is of use.
+    """
+
+    poses: FloatArray
+    landmarks: FloatArray
+    columns: IntArray
+    factor: FloatArray
+    slope: FloatArray
+    sightings: Sightings
+    odometry_infos: FloatArray
+    cost: float
+    iterations: int
+    reason: str
+
+
+def find_mode(graph: PathGraph, camera: FloatArray, options: SmoothingOptions) -> Mode:
+    """Descend from where the graph stands.
+
+    A step that does not lower the cost is tried again with more damping (Levenberg, Marquardt).
+
+    Args:
+        graph: Key poses, odometry, measurements; its poses and landmarks are the start.
+        camera: (7,) focal length, baseline, sigma_px, sigma_disparity, mount.
+        options: Kernel, scale of the noise, tolerance, iterations.
+    """
+    sought = graph.previous >= 0
+    columns = np.where(sought, 3 * np.cumsum(sought) - 3, FREE)
+    size = 3 * int(sought.sum())
+    sightings = Sightings.of(graph)
+    poses, landmarks = graph.poses.copy(), graph.landmarks.copy()
+    empty, informations = np.zeros((0, 0)), np.zeros_like(graph.noises)
+
+    def given_up(reason: str, iterations: int = 0) -> Mode:
+        return Mode(poses, landmarks, columns, empty, np.zeros(0), sightings, informations, np.inf, iterations, reason)
+
+    if not size:
+        return given_up("no pose to seek")
+    noises = graph.noises[sought]
+    if not (np.linalg.eigvalsh(noises)[:, 0] > 0.0).all():
+        return given_up("odometry without noise")
+    informations[sought] = np.linalg.inv(noises)
+    system = _System(graph, columns, size, informations, sightings, camera, options)
+    damping = 0.0
+    cost = system.form(poses, landmarks)
+    for iteration in range(1, options.max_iterations + 1):
+        if not np.isfinite(cost):
+            return given_up("a landmark without information", iteration)
+        factor = system.factor(damping)
+        if factor is None:
+            return given_up("a singular system", iteration)
+        slope = system.vector.copy()
+        change = -lapack.dpotrs(factor, slope, lower=0)[0]
+        if not np.abs(change).max() < LARGEST_STEP:
+            return given_up("a descent that leaves the world", iteration)
+        expected = -0.5 * float(slope @ change)
+        trial_poses, trial_landmarks = poses.copy(), landmarks.copy()
+        trial_poses[sought] += change.reshape(-1, 3)
+        system.move(trial_landmarks, change)
+        if expected <= options.tolerance and damping == 0.0:
+            return Mode(
+                trial_poses, trial_landmarks, columns, factor, slope, sightings, informations, cost - expected,
+                iteration, "",
+            )  # fmt: skip
+        trial_cost = system.form(trial_poses, trial_landmarks)
+        if trial_cost <= cost + 1e-9 * abs(cost):
+            poses, landmarks, cost = trial_poses, trial_landmarks, trial_cost
+            damping = damping / 10.0 if damping > FIRST_DAMPING else 0.0
+        else:
+            damping = max(10.0 * damping, FIRST_DAMPING)
+            if damping > MOST_DAMPING:
+                return given_up("no descent", iteration)
+            cost = system.form(poses, landmarks)
+    return given_up(f"no convergence in {options.max_iterations} iterations", options.max_iterations)
+
+
+class _System:
+    """Room for the normal equations, and what they are formed of."""
+
+    def __init__(
+        self, graph: PathGraph, columns: IntArray, size: int, informations: FloatArray, sightings: Sightings,
+        camera: FloatArray, options: SmoothingOptions,
+    ) -> None:  # fmt: skip
+        self.graph, self.columns, self.sightings = graph, columns, sightings
+        self.informations, self.camera, self.options = informations, camera, options
+        self.matrix = np.zeros((size, size))
+        self.vector = np.zeros(size)
+        self.cross = np.zeros((len(sightings.keys), 3, 3))
+        self.spreads = np.zeros((len(graph.landmark_ids), 6))
+        self.forces = np.zeros((len(graph.landmark_ids), 3))
+
+    def form(self, poses: FloatArray, landmarks: FloatArray) -> float:
+        """Form the equations; return the cost."""
+        seen, graph = self.sightings, self.graph
+        loss = seen.linearise(
+            graph, poses, landmarks, self.camera, self.options.noise_scale, self.options.kernel
+        )
+        self.matrix.fill(0.0)
+        self.vector.fill(0.0)
+        return loss + _kernels.assemble(
+            poses, landmarks, self.columns, graph.previous, graph.motions, self.informations, seen.keys, seen.starts,
+            seen.centres, seen.infos, seen.slopes, self.matrix, self.vector, self.cross, self.spreads, self.forces,
+        )  # fmt: skip
+
+    def factor(self, damping: float) -> FloatArray | None:
+        """Return U with U^T U = the matrix, its diagonal enlarged; None if there is none."""
+        matrix = self.matrix.T.copy(order="F")
+        if damping:
+            matrix[np.diag_indices(len(matrix))] *= 1.0 + damping
+        upper, info = lapack.dpotrf(matrix, lower=0, overwrite_a=1, clean=0)
+        return upper if info == 0 else None
+
+    def move(self, landmarks: FloatArray, change: FloatArray) -> None:
+        """Move landmarks with the poses, in place."""
+        seen = self.sightings
+        _kernels.move_landmarks(
+            landmarks, self.columns, seen.keys, seen.starts, self.cross, self.spreads, self.forces, change
+        )
+

@@ -1,0 +1,152 @@
+import numpy as np
+import pytest
+from scipy.stats import chi2
+from small_problems import TIGHT, camera_of, graph_of, small_run
+
+from slam_backend.errors import FloatArray
+from slam_backend.motion import OdometryModel
+from slam_backend.run_log import RobotLog
+from slam_backend.smoothing.graph import PathGraph, extended
+from slam_backend.smoothing.sampling import draw_paths, lane_rows, replay, weigh_odometry
+from slam_backend.smoothing.solving import Mode, find_mode
+
+MOUNT = np.array([0.1, -0.05, 0.2])
+CAMERA = np.array([320.0, 0.12, 0.2, 0.1, *MOUNT])
+LANDMARKS = np.array([[4.0, 1.0, 0.5], [3.0, -2.0, -0.3], [-2.0, 2.5, 0.1]])
+# Headings as good as known: all else is linear, and Gaussian.
+LINEAR = OdometryModel(
+    sigma_along=0.1, sigma_across=0.06, sigma_heading=0.0, sigma_turn=0.0, floor_position=0.01, floor_heading=1e-7
+)
+
+
+def full(upper: FloatArray) -> FloatArray:
+    """Return symmetric matrices (..., 3, 3) from their upper triangles (..., 6)."""
+    return upper[..., [[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
+
+
+def linear_toy(steps: int = 6) -> tuple[PathGraph, Mode]:
+    """Return a robot that turns among three landmarks, measures them with covariances of its own, and the mode."""
+    rng = np.random.default_rng(5)
+    log = RobotLog()
+    position, theta = np.zeros(2), 0.0
+    for step in range(steps):
+        move = np.array([0.4, 0.1, 0.5])
+        if step:
+            c, s = np.cos(theta), np.sin(theta)
+            position = position + np.array([[c, -s], [s, c]]) @ (move[:2] + rng.normal(size=2) * [0.04, 0.03])
+            theta += 0.5
+        c, s = np.cos(theta), np.sin(theta)
+        roots = 0.05 * (np.eye(3) + rng.uniform(-0.4, 0.4, (3, 3, 3)))
+        seen = (LANDMARKS - [*position, 0.0]) @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) - MOUNT
+        seen += np.einsum("nij,nj->ni", roots, rng.normal(size=(3, 3)))
+        upper = (roots @ roots.transpose(0, 2, 1))[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+        log.append(step, move if step else None, points=seen, ids=np.arange(3), covariances=upper)
+    graph = extended(PathGraph.at_starts(np.zeros((1, 3))), [log.arrays()], LINEAR, MOUNT)
+    return graph, find_mode(graph, CAMERA, TIGHT)
+
+
+def test_where_all_is_linear_the_weights_are_constant():
+    """The Gaussian about the mode is then the posterior itself, and importance weights have nothing to correct."""
+    graph, mode = linear_toy()
+    weights = draw_paths(graph, mode, 500, np.random.default_rng(1)).log_weights
+    assert np.ptp(weights) < 1e-3
+
+
+def test_where_all_is_linear_the_paths_scatter_as_the_posterior():
+    """The sample's mean and covariance agree with mode and information: chi-square at a false alarm rate of 1 %."""
+    graph, mode = linear_toy()
+    m = 4000
+    poses = draw_paths(graph, mode, m + 1, np.random.default_rng(2)).poses[1:, :, 1:]  # the first path is the mode
+    off = (poses - mode.poses[1:, :, None]).reshape(-1, m)
+    white = np.triu(mode.factor) @ off
+    n = len(white)
+    assert m * (white.mean(axis=1) ** 2).sum() < chi2.ppf(0.99, n)
+    squares = (white**2).sum()
+    assert chi2.ppf(0.005, n * m) < squares < chi2.ppf(0.995, n * m)
+    correlations = (white @ white.T / m)[np.triu_indices(n, 1)]
+    assert m * (correlations**2).sum() < chi2.ppf(0.99, len(correlations))
+
+
+def test_the_first_path_is_the_most_probable_one():
+    """Of all paths drawn it alone is the mode, so that the best particle has the best map."""
+    graph, mode = linear_toy()
+    draws = draw_paths(graph, mode, 3, np.random.default_rng(3))
+    np.testing.assert_array_equal(draws.poses[:, :, 0], mode.poses)
+    np.testing.assert_allclose(draws.landmarks[:, :3, 0], mode.landmarks, atol=1e-9)
+
+
+def test_replayed_landmarks_are_those_of_kalman_filters_along_the_path():
+    """Means, covariances and likelihood along a path are those of one Kalman filter per landmark, taken in turn."""
+    graph, mode = linear_toy()
+    poses = draw_paths(graph, mode, 70, np.random.default_rng(4)).poses  # more than one block of lanes
+    tiles, log_likelihood = replay(mode, lane_rows(poses), 70)
+    values = tiles.transpose(0, 2, 1, 3).reshape(3, 9, -1)
+    expected = []
+    for m in (0, 1, 63, 64, 69):
+        total = 0.0
+        for landmark in range(3):
+            mean, covariance = np.zeros(3), np.zeros((3, 3))
+            for n in np.flatnonzero(graph.point_landmarks == landmark):
+                x, y, theta = poses[graph.frame_keys[graph.point_frames[n]], :, m]
+                c, s = np.cos(theta), np.sin(theta)
+                turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+                seen = turn @ (graph.points[n] + MOUNT) + [x, y, 0.0]
+                noise = turn @ full(graph.point_noises[n]) @ turn.T
+                if not covariance.any():
+                    mean, covariance = seen, noise
+                    continue
+                innovation = covariance + noise
+                off = seen - mean
+                total -= 0.5 * (off @ np.linalg.solve(innovation, off) + np.linalg.slogdet(innovation)[1])
+                gain = np.linalg.solve(innovation, covariance).T
+                mean = mean + gain @ off
+                covariance = covariance - gain @ covariance
+            np.testing.assert_allclose(values[landmark, :3, m], mean, atol=1e-9)
+            np.testing.assert_allclose(full(values[landmark, 3:, m]), covariance, atol=1e-10)
+        expected.append(total)
+    differences = log_likelihood[[0, 1, 63, 64, 69]] - log_likelihood[0]
+    np.testing.assert_allclose(differences, np.array(expected) - expected[0], atol=1e-6)
+
+
+def test_stereo_paths_are_weighed_evenly():
+    """With real headings and a stereo camera the Gaussian still fits: nine tenths of the paths count."""
+    run = small_run()
+    graph = graph_of(run)
+    mode = find_mode(graph, camera_of(run), TIGHT)
+    weights = draw_paths(graph, mode, 300, np.random.default_rng(6)).log_weights
+    weights = np.exp(weights - weights.max())
+    assert weights.sum() ** 2 / (weights**2).sum() > 270.0
+
+
+def test_odometry_of_paths_has_its_gaussian_density():
+    """Compiled densities of odometry differ from path to path as the plain formula says."""
+    run = small_run(2)
+    graph = graph_of(run)
+    mode = find_mode(graph, camera_of(run), TIGHT)
+    poses = draw_paths(graph, mode, 65, np.random.default_rng(7)).poses
+    found, spreads = weigh_odometry(graph, mode, lane_rows(poses), 65)
+    linked = np.flatnonzero(graph.previous >= 0)
+    expected, motions = np.zeros(65), []
+    for b in linked:
+        first, second = poses[graph.previous[b]], poses[b]
+        c, s = np.cos(first[2]), np.sin(first[2])
+        dx, dy = second[:2] - first[:2]
+        turn = (second[2] - first[2] + np.pi) % (2.0 * np.pi) - np.pi
+        motion = np.array([c * dx + s * dy, -s * dx + c * dy, turn])
+        off = motion - graph.motions[b][:, None]
+        expected -= 0.5 * (off * np.linalg.solve(graph.noises[b], off)).sum(axis=0)
+        motions.append(motion)
+    np.testing.assert_allclose(found - found[0], expected - expected[0], atol=1e-7)
+    scatter = [((m - m[:, :1])[0] ** 2 + (m - m[:, :1])[1] ** 2 + 9.0 * (m - m[:, :1])[2] ** 2).mean() for m in motions]
+    np.testing.assert_allclose(spreads[linked], scatter, rtol=1e-6)
+
+
+@pytest.mark.parametrize("m", [1, 64, 65])
+def test_any_number_of_paths_can_be_drawn(m):
+    """Blocks of lanes are filled up, and what fills them is not returned."""
+    graph, mode = linear_toy()
+    draws = draw_paths(graph, mode, m, np.random.default_rng(8))
+    assert draws.poses.shape == (6, 3, m)
+    assert draws.landmarks.shape == (3, 9, m)
+    assert np.isfinite(draws.landmarks).all()
+    assert draws.log_weights.shape == (m,)
