@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from slam_backend.alignment import AlignmentOptions, candidate_matches
-from slam_backend.errors import check_int
+from slam_backend.errors import bad_argument, check_int
 from slam_backend.landmark_map import LandmarkMap
 
 PairKey = tuple[tuple[int, ...], tuple[int, ...]]  # two groups, as tuples of robots
@@ -21,15 +21,19 @@ class AttemptOptions:
         new_candidates: A refused pair tries again only when so many of its candidate matches are new, or the last
             attempt is more than `longest_wait` steps ago: by then the same landmarks are known better.
         longest_wait: After each refusal a pair waits twice as long as before, at most so many steps.
+        enabled: Whether any pair tries at all.
     """
 
     every: int = 25
     new_candidates: int = 3
     longest_wait: int = 200
+    enabled: bool = True
 
     def __post_init__(self) -> None:
         for name in ("every", "new_candidates", "longest_wait"):
             check_int(f"attempts.{name}", getattr(self, name), 1, "Give a number of at least 1.")
+        if not isinstance(self.enabled, bool):
+            raise bad_argument("attempts.enabled", "True or False", self.enabled, "Give a bool.")
 
 
 @dataclass(slots=True)
@@ -58,7 +62,7 @@ class AttemptSchedule:
 
     def is_due(self, step: int) -> bool:
         """Tell whether a pair may try at this step."""
-        return step % self._options.every == self._options.every - 1
+        return self._options.enabled and step % self._options.every == self._options.every - 1
 
     def may_try(self, pair: PairKey, step: int) -> bool:
         """Tell whether the pair's wait is over."""
@@ -95,6 +99,10 @@ class AttemptSchedule:
         record.last_step = step
         record.next_step = step + record.wait
         record.wait = min(2 * record.wait, self._options.longest_wait)
+
+    def bar(self, pair: PairKey, until: int) -> None:
+        """Keep a pair from trying before this step."""
+        self._records.setdefault(pair, _Record(self._options.every)).next_step = until
 
     def get_state(self) -> dict[str, Any]:
         """Return the options and a copy of the memory."""

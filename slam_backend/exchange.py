@@ -1,17 +1,32 @@
-"""How much the robots tell each other: new and changed landmarks since the last contact, descriptors once."""
+"""How much the robots tell each other: new and changed landmarks since the last contact, descriptors once.
+
+Counted are numbers of 8 bytes, and of 4 in descriptors, as these are sent:
+
+- Robots that go by one filter: each broadcasts, once, at every step its pose (24), each landmark that it measured (id,
+  mean, covariance: 80) and the descriptors of those that it created. A robot that nobody hears sends nothing.
+- Two groups that try to align their maps: the first robot of each sends the landmarks that are new to the other side
+  or were measured again since it sent them last (80 each), with the descriptors of the new ones.
+- A robot that returns to its filter: for each buffered step its odometry (24) and its measurements (24 each, 48 more
+  with a covariance, and their descriptors). When all is taken in, the first robot of those that kept the filter sends
+  the landmarks that are new or were measured again since they lost contact (80 each), with descriptors of those new
+  ones that the returning robots have not created themselves; after a merge or an undo in between it sends all of them.
+"""
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
+from slam_backend.branches import ReplayedStep
 from slam_backend.errors import IntArray
 from slam_backend.landmark_map import LandmarkMap
 from slam_backend.reports import StepReport
 
 LANDMARK_BYTES = 8 + 9 * 8  # id, mean and covariance
 POSE_BYTES = 3 * 8
+POINT_BYTES = 3 * 8
+COVARIANCE_BYTES = 6 * 8
 
 
 class ExchangeLedger:
@@ -25,14 +40,52 @@ class ExchangeLedger:
         self.bytes_sent: IntArray = np.zeros(num_robots, dtype=np.int64)
         self._known: dict[tuple[int, int], dict[int, int]] = {}  # (from, to) -> landmark id -> its count when last sent
 
-    def record_step(self, robots: tuple[int, ...], report: StepReport, descriptor_size: int) -> None:
-        """Count what the robots of a joint filter broadcast in one step: pose, landmarks updated and created."""
-        if len(robots) < 2:
+    def record_step(
+        self, robots: tuple[int, ...], report: StepReport, descriptor_size: int, live: tuple[int, ...] | None = None
+    ) -> None:
+        """Count what the robots of a joint filter broadcast in one step: pose, landmarks updated and created.
+
+        Args:
+            robots: Of the filter.
+            report: Of its step.
+            descriptor_size: d.
+            live: Those of them that go by it and hear each other; None: all.
+        """
+        live = robots if live is None else live
+        if len(live) < 2:
             return
         for index, robot in enumerate(robots):
-            touched = int(np.count_nonzero(report.associations[index] >= 0))
-            created = int(np.count_nonzero(report.created[index] >= 0))
-            self.bytes_sent[robot] += POSE_BYTES + touched * LANDMARK_BYTES + created * 4 * descriptor_size
+            if robot in live:
+                touched = int(np.count_nonzero(report.associations[index] >= 0))
+                created = int(np.count_nonzero(report.created[index] >= 0))
+                self.bytes_sent[robot] += POSE_BYTES + touched * LANDMARK_BYTES + created * 4 * descriptor_size
+
+    def record_replay(self, replayed: Sequence[ReplayedStep]) -> None:
+        """Count the buffered readings that returning robots send."""
+        for done in replayed:
+            for robot, reading in zip(done.robots, done.inputs, strict=True):
+                if reading.odometry is not None or reading.pose is not None:
+                    self.bytes_sent[robot] += POSE_BYTES
+                frame = reading.frame
+                if frame is not None:
+                    each = POINT_BYTES + 4 * frame.descriptors.shape[1]
+                    each += 0 if frame.covariances is None else COVARIANCE_BYTES
+                    self.bytes_sent[robot] += len(frame) * each
+
+    def record_return(
+        self, sender: int, known: Mapping[int, int], counts: Mapping[int, int], descriptor_size: int
+    ) -> None:
+        """Count what returning robots are told of the map that they come back to.
+
+        Args:
+            sender: Who tells them.
+            known: Per landmark whose descriptor they know: how often it had been measured when they were last told.
+            counts: Per landmark of the map: how often it has been measured now.
+            descriptor_size: d.
+        """
+        changed = sum(1 for name, count in counts.items() if known.get(name) != count)
+        new = sum(1 for name in counts if name not in known)
+        self.bytes_sent[sender] += changed * LANDMARK_BYTES + new * 4 * descriptor_size
 
     def record_maps(self, robot_a: int, robot_b: int, map_a: LandmarkMap, map_b: LandmarkMap) -> None:
         """Count the maps that two groups' first robots exchange to align them."""

@@ -48,7 +48,12 @@ def inverse_alignment(alignment: Alignment) -> Alignment:
 
 
 def merge_filters(
-    a: FastSlam, b: FastSlam, alignment: Alignment, pairs: IntArray, rng: np.random.Generator
+    a: FastSlam,
+    b: FastSlam,
+    alignment: Alignment,
+    pairs: IntArray,
+    rng: np.random.Generator,
+    num_particles: int | None = None,
 ) -> tuple[FastSlam, IntArray]:
     """Merge two filters into a joint one in a's map frame (Secs. 3.2 and 4).
 
@@ -59,12 +64,13 @@ def merge_filters(
             particles share fewer than three landmarks.
         pairs: (k, 2) int64 rows (landmark id in a, landmark id in b) in common, one-to-one.
         rng: For the pairing and the draws of T.
+        num_particles: Of the joint filter; None: as many as the larger of the two.
 
     Returns:
-        The joint filter, a's robots first, with as many particles as the larger of the two; and (n, 2) int64 rows
-        (id in b, id in the joint map) of all of b's landmarks.
+        The joint filter, a's robots first; and (n, 2) int64 rows (id in b, id in the joint map) of all of b's
+        landmarks.
     """
-    count = max(a.num_particles, b.num_particles)
+    count = max(a.num_particles, b.num_particles) if num_particles is None else num_particles
     dense_a, dense_b = _Dense.of(a), _Dense.of(b)
     shared_a, shared_b = np.searchsorted(dense_a.ids, pairs[:, 0]), np.searchsorted(dense_b.ids, pairs[:, 1])
     from_a = systematic(a.weights, rng, CANDIDATES * count)
@@ -81,14 +87,8 @@ def merge_filters(
     draws = rng.standard_normal((count, 3))
     motion = motions[chosen] + np.einsum("mij,mj->mi", factors[chosen], draws)
 
-    joint = FastSlam.from_options(
-        a.num_robots + b.num_robots,
-        replace(a.options, num_particles=count),
-        np.random.default_rng(rng.integers(2**63, size=4)),
-    )
-    _join_poses(joint, a, from_a, b, from_b, motion)
+    joint = joined_robots(a, from_a, b, from_b, motion, rng)
     joint._path_log_weights[:] = a._path_log_weights[from_a] + b._path_log_weights[from_b] + evidence
-    joint._blind[:] = np.concatenate([a._blind, b._blind])
 
     values_a, counts_a = np.take(dense_a.values, from_a, axis=2), np.take(dense_a.counts, from_a, axis=1)
     values_b, counts_b = np.take(dense_b.values, from_b, axis=2), np.take(dense_b.counts, from_b, axis=1)
@@ -114,17 +114,43 @@ def merge_filters(
     joint._maps.load(
         np.concatenate([values_a, values_b[own]]),
         np.concatenate([counts_a, counts_b[own]]),
-        _stack_descriptors(descriptors, dense_b.descriptors[own]),
+        stack_descriptors(descriptors, dense_b.descriptors[own]),
         np.concatenate([dense_a.ids, new_ids]),
         np.concatenate([identities, dense_b.identities[own]]),
         next_id + len(own),
         np.concatenate([odds_a, odds_b[own]]),
     )
+    renamed = np.concatenate([pairs[:, ::-1], np.column_stack([dense_b.ids[own], new_ids])]).astype(np.int64)
+    finish(joint, a, b, renamed)
+    return joint, renamed
+
+
+def joined_robots(
+    a: FastSlam, from_a: IntArray, b: FastSlam, from_b: IntArray, motion: FloatArray, rng: np.random.Generator
+) -> FastSlam:
+    """Return a filter of both groups' robots, a's first, without a map.
+
+    Args:
+        a, b: The filters of either group.
+        from_a, from_b: (M,) which particle of either each joint particle pairs.
+        motion: (M, 3) by which each joint particle moves what stems from b into a's map frame.
+        rng: From which the joint filter's own stream is seeded.
+    """
+    joint = FastSlam.from_options(
+        a.num_robots + b.num_robots,
+        replace(a.options, num_particles=len(motion)),
+        np.random.default_rng(rng.integers(2**63, size=4)),
+    )
+    _join_poses(joint, a, from_a, b, from_b, motion)
+    joint._blind[:] = np.concatenate([a._blind, b._blind])
+    return joint
+
+
+def finish(joint: FastSlam, a: FastSlam, b: FastSlam, renamed: IntArray) -> None:
+    """Give a joint filter, whose map is loaded, its step count, estimates and logs; `renamed` as of `merge_filters`."""
     joint._steps = max(a._steps, b._steps)
     joint._estimates = [joint._mixture(robot) for robot in range(joint.num_robots)]
-    renamed = np.concatenate([pairs[:, ::-1], np.column_stack([dense_b.ids[own], new_ids])]).astype(np.int64)
     joint._logs = [log.copy() for log in a._logs] + [log.renamed(renamed[:, 0], renamed[:, 1]) for log in b._logs]
-    return joint, renamed
 
 
 class _Dense(NamedTuple):
@@ -175,7 +201,7 @@ def _join_poses(
     joint._covariances[k:, :, :count] = moved[..., *UPPER].transpose(0, 2, 1)
 
 
-def _stack_descriptors(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float32]:
+def stack_descriptors(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float32]:
     """Stack the descriptors of two maps, one of which may still be empty and of unknown width."""
     if not len(a) or not len(b):
         return np.array(a if len(a) else b)

@@ -77,11 +77,60 @@ class Renaming:
         robots_a: Group a before the merge; its landmark ids stay.
         robots_b: Group b before the merge.
         ids_b: (k, 2) int64. Rows (id in b's map, id in the joint map); fused landmarks carry the id of a.
+        maps: Numbers of a's map, of b's and of the joint one. The first two are kept until their `MapDropped`: an undo
+            takes them up again as they were.
     """
 
     robots_a: tuple[int, ...]
     robots_b: tuple[int, ...]
     ids_b: IntArray
+    maps: tuple[int, int, int]
+
+
+@dataclass(frozen=True, slots=True)
+class MapCopied:
+    """A filter forked: map number `copy` begins as what map number `source` is now."""
+
+    source: int
+    copy: int
+
+
+@dataclass(frozen=True, slots=True)
+class MapDropped:
+    """Map number `number` is gone for good."""
+
+    number: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LandmarksCreated:
+    """What a robot read in a step created landmarks in a map.
+
+    Attributes:
+        number: Of the map.
+        robot: Who read it.
+        step: When it was read; with a replay that is earlier than the step of the report.
+        ids: (n,) int64. Id of the landmark that each of its measurements created, -1 = none.
+    """
+
+    number: int
+    robot: int
+    step: int
+    ids: IntArray
+
+
+@dataclass(frozen=True, slots=True)
+class MergeUndone:
+    """A merge was taken back: two maps are taken up again as they were before it, and the joint one ends.
+
+    Attributes:
+        maps: Numbers of a's map, of b's and of the joint one, as in its `Renaming`.
+    """
+
+    maps: tuple[int, int, int]
+
+
+MapEntry = MapCopied | MapDropped | LandmarksCreated | MergeUndone | Renaming
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,12 +139,16 @@ class TeamReport:
 
     Attributes:
         step: Number of this step (the first is 0).
-        associations: Per robot (n_i,) int64, as in `StepReport`, ids in the map of the robot's group BEFORE this
-            step's merges.
+        associations: Per robot (n_i,) int64, as in `StepReport`, ids in the robot's map BEFORE this step's merges and
+            undos.
         created: Per robot (n_i,) int64, as in `StepReport`, ids likewise.
         groups: The groups after this step.
-        events: This step's attempts and merges, in order.
+        events: This step's attempts, merges and undos, in order.
         renamings: One for each merge of this step, in order; apply them after `created`.
+        maps: Per robot the number of the map that it goes by after this step. Before the first step they are 0, 1, ...
+        entries: All that happened to maps in this step, in order, replays and `created` included: whoever keeps books
+            on landmarks goes by these.
+        oldest_step: Steps from this one on may still be taken in again; 1 + `step` if none.
     """
 
     step: int
@@ -104,3 +157,6 @@ class TeamReport:
     groups: tuple[tuple[int, ...], ...]
     events: tuple[MergeEvent, ...]
     renamings: tuple[Renaming, ...]
+    maps: tuple[int, ...]
+    entries: tuple[MapEntry, ...]
+    oldest_step: int

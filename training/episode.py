@@ -213,7 +213,7 @@ class _Log:
             infos=tuple(dict(self._infos[agent]) for agent in self._agents),
             own_maps=tuple(maps[robot] for robot in range(len(self._agents))),
             alone_until=tuple(self._alone_until.get(robot) for robot in range(len(self._agents))),
-            map_claims=tuple(self._env.episode.ledger.claims(own.group, own.map.ids) for own in last.values()),
+            map_claims=tuple(self._env.episode.ledger.claims(robot, own.map.ids) for robot, own in last.items()),
             maps=tuple(own.map for own in last.values()),
             true_landmarks=self._env.true_landmarks,
             scene=self._env.scene(),

@@ -42,7 +42,7 @@ MOTION = OdometryModel(
 # stops nonsense; nor does a barcode ever start a second landmark. Identities hidden: all landmarks look alike, and the
 # gate is that of two degrees of freedom, as all is seen in one plane; one landmark is new only far beyond it. With one
 # to three look-alikes in view, most of them contradict a right pose too easily to widen it.
-GATES: dict[str, dict[str, float]] = {
+GATES: dict[str, dict[str, Any]] = {
     "given": {"position_gate": 1e4, "dead_zone": 1e6},
     "hidden": {"position_gate": PLANAR_GATE, "dead_zone": 40.0, "recovery_position": 0.0},
 }
@@ -193,21 +193,20 @@ def replay(
             if event.kind == "merge":
                 since = float(readings.times[step] - readings.times[0])
                 sides = [groups[side[0]] for side in (event.robots_a, event.robots_b)]
-                claims = [ledger.claims(side, maps[side].ids) for side in sides]
+                claims = [ledger.claims(side[0], maps[side].ids) for side in sides]
                 merges.append(Merge(since, event, maps[sides[0]], maps[sides[1]], claims[0], claims[1]))
         ledger.record(report, [_true_rows(frame) for frame in seen])
         for robot in robots:
             paths[robot, step] = team.pose_from_start(robot).mean
         on_step((step + 1) / num_steps, report)
     frames = np.array([team.start_from_group(robot) for robot in robots])
-    groups = {robot: group for group in team.groups for robot in group}
     maps_of = [team.map(robot) for robot in robots]
     return Replay(
         times=readings.times,
         paths=paths,
         reckoned=np.array([own.reckoned for own in readings.robots]),
         maps=tuple(own.moved(frame) for own, frame in zip(maps_of, frames, strict=True)),
-        claims=tuple(ledger.claims(groups[robot], maps_of[robot].ids) for robot in robots),
+        claims=tuple(ledger.claims(robot, maps_of[robot].ids) for robot in robots),
         start_from_group=frames,
         groups=team.groups,
         merges=tuple(merges),

@@ -1,7 +1,7 @@
 """`TeamBelief` owns the team's filters and the seen grids, and hands out what each robot believes."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
@@ -10,13 +10,14 @@ from numpy.typing import NDArray
 from slam_backend.alignment import Alignment
 from slam_backend.errors import FloatArray, IntArray, bad_argument
 from slam_backend.filter_options import FilterOptions
-from slam_backend.geometry import compose, inverse, rotate_covariances
+from slam_backend.geometry import compose, rotate_covariances
 from slam_backend.landmark_map import LandmarkMap
 from slam_backend.reports import MergeEvent, Renaming, TeamReport
 from slam_backend.team import TeamSlam
-from vslam_env.navigation import CandidateSlots, SeenGrid
+from vslam_env.navigation import CandidateSlots
 from vslam_env.readings import Readings
 from vslam_env.robot_belief import Belief, BeliefConfig, Body, Candidates, Teammate
+from vslam_env.shared_grids import SharedGrids
 
 __all__ = ["Belief", "BeliefConfig", "Body", "Candidates", "TeamBelief", "Teammate"]
 
@@ -33,7 +34,7 @@ class TeamBelief:
         body: The robots' hardware.
         decision_ticks: Where policies choose among the candidates: these are renewed at every decision. None: every
             ten ticks, the robots taking turns.
-        attempts: Whether the team tries to align its maps by itself.
+        attempts: Whether the team tries to align its maps by itself; if not, merges from outside are final.
     """
 
     def __init__(
@@ -49,22 +50,22 @@ class TeamBelief:
             # A sequence remembers how often it spawned: a fresh one makes the result depend on its seed alone.
             seed = np.random.SeedSequence(seed.entropy, spawn_key=seed.spawn_key)
         options = {f.name: getattr(config.filter, f.name) for f in fields(FilterOptions)}
-        self._team = TeamSlam(num_robots, config.alignment, seed, attempts=config.attempts, **options)
-        self._body = body
+        rhythm = config.attempts if attempts else replace(config.attempts, enabled=False)
+        merging = config.merging if attempts else replace(config.merging, watch_steps=0)
+        self._team = TeamSlam(num_robots, config.alignment, seed, rhythm, merging, **options)
         self._decision_ticks = decision_ticks
-        self._contacts = None if attempts else np.zeros((num_robots, num_robots), np.bool_)
-        self._grids = [SeenGrid() for _ in range(num_robots)]
+        self._grids = SharedGrids(num_robots, body)
         self._slots = [CandidateSlots() for _ in range(num_robots)]
         self._tick = -1
         self._confirm_after = config.confirm_after
         self._beliefs: dict[int, Belief] = {}  # of this tick, made when asked for
-        self._maps: dict[int, LandmarkMap] = {}  # of this tick, by the group's first robot
+        self._maps: dict[int, LandmarkMap] = {}  # of this tick, by the number of the map
         self._look_up_poses()
 
     @property
     def num_robots(self) -> int:
         """K."""
-        return len(self._grids)
+        return self._team.num_robots
 
     @property
     def groups(self) -> tuple[tuple[int, ...], ...]:
@@ -73,7 +74,7 @@ class TeamBelief:
 
     @property
     def events(self) -> tuple[MergeEvent, ...]:
-        """All attempts and merges so far, in order."""
+        """All attempts, merges and undos so far, in order."""
         return self._team.events
 
     @property
@@ -103,20 +104,21 @@ class TeamBelief:
         report = self._team.step(
             [r.odometry for r in readings],
             [r.measurements for r in readings],
-            self._contacts,
+            None if readings[0].heard is None else np.array([r.heard for r in readings]),
             [r.identities for r in readings] if readings[0].identities is not None else None,
             [r.pose for r in readings] if readings[0].pose is not None else None,
         )
         self._tick += 1
         self._look_up_poses()
-        for renaming in report.renamings:
-            self._join_grids(renaming)
-        for group in self._groups:
-            self._paint(group, readings)
+        self._grids.follow(self._tick, report.entries, report.renamings)
+        self._grids.meet(self._mates, self._starts)
+        for robot, mates in enumerate(self._mates):
+            poses = compose(self._starts[robot], self._means[list(mates)])
+            poses[mates.index(robot)] = self._poses[robot]
+            self._grids.paint(self._tick, robot, mates, poses, readings)
         for robot in range(self.num_robots):
             if self._candidates_are_due(robot):
-                mates = [mate for mate in self.group(robot) if mate != robot]
-                positions = compose(self._starts[robot], self._means[mates])[:, :2]
+                positions = np.array([mate.pose[:2] for mate in self._teammates(robot)]).reshape(-1, 2)
                 self._slots[robot].update(self._grids[robot].cells, self._poses[robot], positions)
         return report
 
@@ -124,12 +126,16 @@ class TeamBelief:
         """Merge the groups of two robots with a given alignment of their filter maps; see `TeamSlam.merge`."""
         renaming = self._team.merge(robot_a, robot_b, alignment)
         self._look_up_poses()
-        self._join_grids(renaming)
+        self._grids.meet(self._mates, self._starts)
         return renaming
 
     def group(self, robot: int) -> tuple[int, ...]:
-        """Return the robots that share a map with this one, itself included."""
-        return next(group for group in self._groups if robot in group)
+        """Return the robots that share a map with this one, as far as it knows, itself included."""
+        return self._members[robot]
+
+    def speaker(self, group: tuple[int, ...]) -> int:
+        """Return the first robot of a group that goes by its joint filter, and so can merge it with another."""
+        return self._team.keepers(group[0])[0]
 
     def filter_map(self, robot: int) -> LandmarkMap:
         """Return the whole map of a robot's group, unconfirmed landmarks included, in the group's map frame."""
@@ -137,11 +143,11 @@ class TeamBelief:
 
     def group_map(self, robot: int) -> LandmarkMap:
         """Return the confirmed landmarks of a robot's group, in the group's map frame."""
-        first = self.group(robot)[0]
-        if first not in self._maps:
-            whole = self._team.map(first)
-            self._maps[first] = whole.subset(whole.counts >= self._confirm_after)
-        return self._maps[first]
+        number = self._numbers[robot]
+        if number not in self._maps:
+            whole = self._team.map(robot)
+            self._maps[number] = whole.subset(whole.counts >= self._confirm_after)
+        return self._maps[number]
 
     def start_from_group(self, robot: int) -> FloatArray:
         """Return (3,) the motion from the group's map frame to the robot's own start frame. A copy."""
@@ -162,7 +168,7 @@ class TeamBelief:
         return {
             "tick": self._tick,
             "team": self._team.get_state(),
-            "grids": [grid.get_state() for grid in self._grids],
+            "grids": self._grids.get_state(),
             "slots": [slots.get_state() for slots in self._slots],
         }
 
@@ -174,8 +180,7 @@ class TeamBelief:
         """
         self._team.set_state(state["team"])
         self._tick = state["tick"]
-        for grid, seen in zip(self._grids, state["grids"], strict=True):
-            grid.set_state(seen)
+        self._grids.set_state(state["grids"])
         for slots, candidates in zip(self._slots, state["slots"], strict=True):
             slots.set_state(candidates)
         self._look_up_poses()
@@ -183,7 +188,9 @@ class TeamBelief:
     def _look_up_poses(self) -> None:
         """Take note of the groups and poses after a step or a merge, and forget what was derived from those before."""
         robots, team = range(self.num_robots), self._team
-        self._groups = team.groups
+        self._groups, self._numbers = team.groups, team.maps
+        self._members = [team.members(robot) for robot in robots]
+        self._mates = [team.mates(robot) for robot in robots]
         self._starts = np.array([team.start_from_group(robot) for robot in robots])
         self._means = np.array([team.pose(robot).mean for robot in robots])
         self._estimates = [team.pose_from_start(robot) for robot in robots]
@@ -191,14 +198,18 @@ class TeamBelief:
         self._beliefs.clear()
         self._maps.clear()
 
-    def _make_belief(self, robot: int) -> Belief:
-        group, start = self.group(robot), self._starts[robot]
-        mates = []
-        for mate in group:
+    def _teammates(self, robot: int) -> list[Teammate]:
+        """Return the other robots that a robot knows of; one out of contact is where it was when contact was lost."""
+        start, mates = self._starts[robot], []
+        for mate in self._members[robot]:
             if mate != robot:
-                estimate = self._team.pose(mate)
+                estimate = self._team.pose(mate, seen_by=robot)
                 covariance = rotate_covariances(start[2], estimate.covariance)
                 mates.append(Teammate(mate, compose(start, estimate.mean), covariance))
+        return mates
+
+    def _make_belief(self, robot: int) -> Belief:
+        group, start, mates = self.group(robot), self._starts[robot], self._teammates(robot)
         own = self._estimates[robot]
         log_weights = self._team.particles(robot)[1]
         slots = self._slots[robot]
@@ -231,28 +242,3 @@ class TeamBelief:
         if self._decision_ticks is not None:
             return self._tick % self._decision_ticks == 0
         return (self._tick - robot * CANDIDATE_TICKS // self.num_robots) % CANDIDATE_TICKS == 0
-
-    def _join_grids(self, renaming: Renaming) -> None:
-        """Give each robot of a new group the floor that the other side has seen.
-
-        The members of a group have seen the same already, so one robot of each side stands for all of it.
-        """
-        sides = (renaming.robots_a, renaming.robots_b)
-        grids = [self._grids[robots[0]].copy() for robots in sides]
-        for robots, others, grid in zip(sides, sides[::-1], grids[::-1], strict=True):
-            for robot in robots:
-                own_from_other = compose(self._starts[robot], inverse(self._starts[others[0]]))
-                self._grids[robot].absorb(grid, own_from_other)
-
-    def _paint(self, group: tuple[int, ...], readings: Sequence[Readings]) -> None:
-        """Paint what each member of a group scans into the grids of all members."""
-        body = self._body
-        for owner in group:
-            grid = self._grids[owner]
-            poses = compose(self._starts[owner], self._means[list(group)])
-            poses[group.index(owner)] = self._poses[owner]
-            for robot, pose in zip(group, poses, strict=True):
-                grid.paint_scan(pose, readings[robot].scan, body.ray_angles, body.scan_range)
-                grid.clear_disc(pose, body.radius)
-                if readings[robot].bump:
-                    grid.bump(pose, body.radius)

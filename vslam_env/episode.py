@@ -107,7 +107,7 @@ class Episode:
         scores = []
         for robot, start in enumerate(self.true_starts):
             placed = world_from_group(start, self.belief.start_from_group(robot))
-            scores.append(self.ledger.score(self.belief.group(robot), self.belief.group_map(robot), placed))
+            scores.append(self.ledger.score(robot, self.belief.group_map(robot), placed))
         return scores
 
     def believed_poses(self) -> FloatArray:
@@ -207,11 +207,12 @@ class Episode:
                     self._claims(a), self._claims(b), self.true_starts[a[0]], self.true_starts[b[0]]
                 )
                 if alignment is not None:
-                    self.ledger.rename(self.belief.merge(a[0], b[0], alignment))
+                    self.ledger.rename(self.belief.merge(self.belief.speaker(a), self.belief.speaker(b), alignment))
                     self.merge_ticks.append((self.tick, a, b))
                     merged = True
                     break
 
     def _claims(self, group: tuple[int, ...]) -> IntArray:
         """Return which true landmark each row of a group's filter map claims."""
-        return self.ledger.claims(group, self.belief.filter_map(group[0]).ids)
+        speaker = self.belief.speaker(group)
+        return self.ledger.claims(speaker, self.belief.filter_map(speaker).ids)

@@ -11,7 +11,7 @@ from slam_backend._jit import jit
 from slam_backend.errors import FloatArray, IntArray, check_float
 from slam_backend.geometry import compose
 from slam_backend.landmark_map import LandmarkMap
-from slam_backend.reports import Renaming, TeamReport
+from slam_backend.reports import LandmarksCreated, MapCopied, MapDropped, Renaming, TeamReport
 
 FALSE, UNCOUNTED = -1, -2
 UNUSED = -3  # an id that no landmark has had so far
@@ -73,10 +73,10 @@ def _score(
 
 
 class ClaimLedger:
-    """Which true landmark each landmark of each group claims, kept outside the filters.
+    """Which true landmark each landmark of each map claims, kept outside the filters.
 
     Args:
-        num_robots: K; each begins as a group of its own.
+        num_robots: K; each begins with a map of its own, numbered as it is.
         true_positions: (N', 3) float64 [m], world frame. All landmarks of the world.
         countable: (N',) bool. Those that some robot could ever see: only they count, N of them.
         cutoff: c of the map error [m].
@@ -86,56 +86,72 @@ class ClaimLedger:
         self.cutoff = check_float("map_error_cutoff", cutoff, "Give metres.", above=0.0)
         self.true_positions = np.ascontiguousarray(true_positions[countable])
         self._claim_of = np.where(countable, np.cumsum(countable) - 1, UNCOUNTED)
-        self._claims: dict[tuple[int, ...], IntArray] = {(r,): np.empty(0, np.int64) for r in range(num_robots)}
+        self._claims: dict[int, IntArray] = {number: np.empty(0, np.int64) for number in range(num_robots)}
+        self._map_of = list(range(num_robots))
+        self._seen: dict[tuple[int, int], IntArray] = {}  # (step, robot): claims of what it measured then
 
     def record(self, report: TeamReport, true_ids: Sequence[IntArray]) -> None:
-        """Enter the landmarks that a step created, then the renamings of its merges.
+        """Enter all that a step did to maps.
 
         Args:
             report: Of the step.
             true_ids: Per robot (n_i,) int64. The landmark behind each measurement; -1 for a false point.
         """
-        for robots in self._claims:
-            for robot in robots:
-                made = report.created[robot]
-                new = made >= 0
-                if new.any():
-                    self._enter(robots, made[new], self._claims_from(true_ids[robot][new]))
-        for renaming in report.renamings:
-            self.rename(renaming)
+        for robot, ids in enumerate(true_ids):
+            if len(ids):
+                self._seen[report.step, robot] = self._claims_from(ids)
+        for entry in report.entries:
+            if isinstance(entry, LandmarksCreated):
+                new = entry.ids >= 0
+                self._enter(entry.number, entry.ids[new], self._seen[entry.step, entry.robot][new])
+            elif isinstance(entry, MapCopied):
+                self._claims[entry.copy] = self._claims[entry.source].copy()
+            elif isinstance(entry, MapDropped):
+                self._claims.pop(entry.number)
+            elif isinstance(entry, Renaming):
+                self.rename(entry)
+        self._map_of = list(report.maps)
+        self._seen = {key: claims for key, claims in self._seen.items() if key[0] >= report.oldest_step}
 
     def rename(self, renaming: Renaming) -> None:
-        """Join the books of two groups: landmarks of a keep their claims, those of b bring theirs."""
-        claims_b = self._claims.pop(renaming.robots_b)
-        joint = tuple(sorted(renaming.robots_a + renaming.robots_b))
-        self._claims[joint] = self._claims.pop(renaming.robots_a)
+        """Join the books of two groups: landmarks of a keep their claims, those of b bring theirs.
+
+        A merge that is in the books already is not entered again.
+        """
+        map_a, map_b, joint = renaming.maps
+        if joint in self._claims:
+            return
+        claims_b, book = self._claims[map_b], self._claims[map_a].copy()
+        self._claims[joint] = book
+        self._map_of = [joint if number in (map_a, map_b) else number for number in self._map_of]
         old, new = renaming.ids_b.T
-        book = self._claims[joint]
         fused = (new < len(book)) & (book[np.minimum(new, len(book) - 1)] != UNUSED) if len(book) else new < 0
         self._enter(joint, new[~fused], claims_b[old[~fused]])
 
-    def claims(self, robots: tuple[int, ...], ids: IntArray) -> IntArray:
-        """Return the claims (n,) int64 of a group's landmarks: index of the true one, -1 false, -2 not countable."""
-        return self._claims[robots][ids]
+    def claims(self, robot: int, ids: IntArray) -> IntArray:
+        """Return the claims (n,) int64 of landmarks of a robot's map: index of the true one, -1 false, -2 no matter."""
+        return self._claims[self._map_of[robot]][ids]
 
-    def score(self, robots: tuple[int, ...], group_map: LandmarkMap, world_from_group: FloatArray) -> MapScores:
-        """Score a group's map as one of its robots holds it.
+    def score(self, robot: int, group_map: LandmarkMap, world_from_group: FloatArray) -> MapScores:
+        """Score a robot's map.
 
         Args:
-            robots: The group.
+            robot: Its index.
             group_map: Its map, in its map frame.
             world_from_group: (3,) [m, m, rad]. Through the robot's own start frame and its true start pose.
         """
-        claims = self.claims(robots, group_map.ids)
+        claims = self.claims(robot, group_map.ids)
         return MapScores(*_score(group_map.means, claims, world_from_group, self.true_positions, self.cutoff))
 
     def get_state(self) -> dict[str, Any]:
         """Return a copy of the books, for the same world's landmarks."""
-        return {"claims": {robots: book.copy() for robots, book in self._claims.items()}}
+        books = {number: book.copy() for number, book in self._claims.items()}
+        return {"claims": books, "map_of": tuple(self._map_of), "seen": dict(self._seen)}
 
     def set_state(self, state: Mapping[str, Any]) -> None:
         """Go on with books that `get_state` returned."""
-        self._claims = {robots: book.copy() for robots, book in state["claims"].items()}
+        self._claims = {number: book.copy() for number, book in state["claims"].items()}
+        self._map_of, self._seen = list(state["map_of"]), dict(state["seen"])
 
     def _claims_from(self, true_ids: IntArray) -> IntArray:
         claims = np.full(len(true_ids), FALSE)
@@ -143,13 +159,13 @@ class ClaimLedger:
         claims[real] = self._claim_of[true_ids[real]]
         return claims
 
-    def _enter(self, robots: tuple[int, ...], ids: IntArray, claims: IntArray) -> None:
-        """Note claims under new ids."""
-        book = self._claims[robots]
+    def _enter(self, number: int, ids: IntArray, claims: IntArray) -> None:
+        """Note claims under new ids of a map."""
+        book = self._claims[number]
         needed = int(ids.max(initial=-1)) + 1
         if needed > len(book):
             book = np.concatenate([book, np.full(max(needed, 2 * len(book)) - len(book), UNUSED)])
-            self._claims[robots] = book
+            self._claims[number] = book
         book[ids] = claims
 
 

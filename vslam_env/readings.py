@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 
-from slam_backend.errors import FloatArray, IntArray
+from slam_backend.errors import BoolArray, FloatArray, IntArray
 from slam_backend.measurements import Measurements
 
 
@@ -18,6 +18,7 @@ class Readings:
         pose: (3,) float64 [m, m, rad], own start frame. The true pose if `oracle_pose` is on, else None.
         identities: (n,) int64. The true landmark behind each measurement, -1 for a false point, if
             `oracle_association` is on, else None.
+        heard: (K,) bool. Which robots its radio hears, itself included; None: all, always.
     """
 
     odometry: FloatArray | None
@@ -26,3 +27,4 @@ class Readings:
     bump: bool
     pose: FloatArray | None = field(default=None)
     identities: IntArray | None = field(default=None)
+    heard: BoolArray | None = field(default=None)

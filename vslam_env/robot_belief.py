@@ -13,6 +13,7 @@ from slam_backend.camera import StereoCamera
 from slam_backend.errors import BoolArray, FloatArray, check_int
 from slam_backend.filter_options import FilterOptions
 from slam_backend.landmark_map import LandmarkMap
+from slam_backend.merge_options import MergeOptions
 from vslam_env.navigation import SeenGrid
 
 
@@ -37,6 +38,7 @@ class BeliefConfig:
         filter: Of each robot's FastSLAM; its camera and motion hold the assumed noise, by default `cautious_filter`.
         alignment: When two maps are believed to fit together.
         attempts: When a pair of groups tries.
+        merging: How their filters are merged, and when a merge is undone.
         confirm_after: Landmarks measured fewer times than this are not yet part of a robot's map: what is seen but
             once may be a false point.
     """
@@ -44,6 +46,7 @@ class BeliefConfig:
     filter: FilterOptions = field(default_factory=cautious_filter)
     alignment: AlignmentOptions = field(default_factory=AlignmentOptions)
     attempts: AttemptOptions = field(default_factory=AttemptOptions)
+    merging: MergeOptions = field(default_factory=MergeOptions)
     confirm_after: int = 2
 
     def __post_init__(self) -> None:
@@ -115,7 +118,7 @@ class Belief:
         robot: Its index.
         tick: Ticks since the reset.
         frame: Identity of the group's map frame: the index of the group's first robot.
-        group: The robots that share the map, itself included.
+        group: The robots that share the map, itself included, as far as it has been told.
         pose: (3,) float64 [m, m, rad].
         covariance: (3, 3) float64 [m, m, rad].
         particles: (M, 3) float64 [m, m, rad]. The robot's pose in each particle.
@@ -123,7 +126,7 @@ class Belief:
         ess: Effective sample size, as a share of M.
         grid: The seen grid, read-only. It follows the robot: `copy()` it to keep it.
         candidates: Places to explore.
-        teammates: The other robots of the group.
+        teammates: The other robots of the group; those out of contact where they were when it was lost.
         start_from_group: (3,) float64 [m, m, rad]. Moves the group's map frame to the own start frame.
         group_map: The confirmed landmarks in the group's frame; `map` has it in the own start frame.
     """

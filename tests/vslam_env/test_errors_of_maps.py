@@ -5,7 +5,7 @@ from slam_backend.errors import IntArray
 from slam_backend.geometry import inverse, transform_points
 from slam_backend.landmark_map import LandmarkMap
 from slam_backend.metrics import gospa, map_error, map_rmse
-from slam_backend.reports import Renaming, TeamReport
+from slam_backend.reports import LandmarksCreated, Renaming, TeamReport
 from vslam_env.coverage import CoverageMeter
 from vslam_env.errors_of_maps import ClaimLedger
 from vslam_env.navigation import FREE, SeenGrid, cell_of
@@ -20,7 +20,9 @@ def _ids(*values: int) -> IntArray:
 
 
 def _report(created: tuple[IntArray, ...], renamings: tuple[Renaming, ...] = ()) -> TeamReport:
-    return TeamReport(0, created, created, tuple((r,) for r in range(len(created))), (), renamings)
+    robots = tuple(range(len(created)))
+    entries = (*(LandmarksCreated(r, r, 0, ids) for r, ids in enumerate(created) if len(ids)), *renamings)
+    return TeamReport(0, created, created, tuple((r,) for r in robots), (), renamings, robots, entries, 1)
 
 
 def _map(means: np.ndarray, ids: IntArray) -> LandmarkMap:
@@ -37,29 +39,29 @@ def _ledger() -> ClaimLedger:
 def test_claims_follow_creation() -> None:
     """A landmark claims the true one whose measurement created it: -1 if that was false, -2 if it does not count."""
     ledger = _ledger()
-    assert ledger.claims((0,), _ids(0, 1, 2)).tolist() == [0, 1, -1]
-    assert ledger.claims((1,), _ids(2, 1, 0)).tolist() == [-2, 2, 1]  # of the four that count, 3 is the third
+    assert ledger.claims(0, _ids(0, 1, 2)).tolist() == [0, 1, -1]
+    assert ledger.claims(1, _ids(2, 1, 0)).tolist() == [-2, 2, 1]  # of the four that count, 3 is the third
 
 
 def test_claims_follow_a_merge() -> None:
     """At a merge landmarks of a keep their claims, fused ones too, and those of b bring theirs under their new ids."""
     ledger = _ledger()
-    ledger.rename(Renaming((0,), (1,), np.array([[0, 1], [1, 3], [2, 4]])))
-    assert ledger.claims((0, 1), _ids(0, 1, 2, 3, 4)).tolist() == [0, 1, -1, 2, -2]
+    ledger.rename(Renaming((0,), (1,), np.array([[0, 1], [1, 3], [2, 4]]), (0, 1, 2)))
+    assert ledger.claims(0, _ids(0, 1, 2, 3, 4)).tolist() == [0, 1, -1, 2, -2]
 
 
 def test_a_fused_false_landmark_stays_false() -> None:
     """What a false point created is false, even if the other map's landmark fused into it was a true one."""
     ledger = _ledger()
-    ledger.rename(Renaming((0,), (1,), np.array([[0, 2], [1, 3], [2, 4]])))
-    assert ledger.claims((0, 1), _ids(2)).tolist() == [-1]
+    ledger.rename(Renaming((0,), (1,), np.array([[0, 2], [1, 3], [2, 4]]), (0, 1, 2)))
+    assert ledger.claims(0, _ids(2)).tolist() == [-1]
 
 
 def test_score_of_a_small_map() -> None:
     """E is the number that one counts by hand: two held, one false, two missed."""
     ledger = _ledger()
     means = TRUTHS[[0, 1, 3]] + np.array([[0.3, 0.0, 0.0], [0.0, 0.0, 0.4], [0.0, 0.0, 0.0]])
-    score = ledger.score((0,), _map(means, _ids(0, 1, 2)), STAY)
+    score = ledger.score(0, _map(means, _ids(0, 1, 2)), STAY)
     assert np.isclose(score.error, np.sqrt((0.3**2 + 0.4**2 + 0.5 * (2 + 1)) / 4))
     assert np.isclose(score.rmse, np.sqrt((0.3**2 + 0.4**2) / 2))
     assert (score.recall, score.precision) == (0.5, 2 / 3)
@@ -67,7 +69,7 @@ def test_score_of_a_small_map() -> None:
 
 def test_score_of_nothing() -> None:
     """An empty map misses everything; its RMSE is the cutoff."""
-    score = _ledger().score((0,), LandmarkMap.empty(2), STAY)
+    score = _ledger().score(0, LandmarkMap.empty(2), STAY)
     assert np.isclose(score.error, np.sqrt(0.5))
     assert (score.rmse, score.recall, score.precision) == (1.0, 0.0, 0.0)
 
@@ -77,10 +79,10 @@ def test_duplicates_false_points_and_wrong_merges_cost() -> None:
     ledger = _ledger()
     ledger.record(_report((_ids(3, 4), _ids())), [_ids(0, -1), _ids()])
     means = np.vstack([TRUTHS[[0, 1]], [[0.1, 0.0, 0.0], [4.0, 4.0, 0.0]]])
-    right = ledger.score((0,), _map(means[:2], _ids(0, 1)), STAY).error
-    duplicate = ledger.score((0,), _map(means[:3], _ids(0, 1, 3)), STAY).error
-    false = ledger.score((0,), _map(means[[0, 1, 3]], _ids(0, 1, 4)), STAY).error
-    wrong = ledger.score((0,), _map(means[:2], _ids(0, 1)), np.array([1.0, 0.2, 0.1])).error
+    right = ledger.score(0, _map(means[:2], _ids(0, 1)), STAY).error
+    duplicate = ledger.score(0, _map(means[:3], _ids(0, 1, 3)), STAY).error
+    false = ledger.score(0, _map(means[[0, 1, 3]], _ids(0, 1, 4)), STAY).error
+    wrong = ledger.score(0, _map(means[:2], _ids(0, 1)), np.array([1.0, 0.2, 0.1])).error
     assert right < min(duplicate, false, wrong)
     assert np.isclose(duplicate, false)
 
@@ -90,7 +92,7 @@ def test_error_agrees_with_gospa_where_landmarks_are_apart() -> None:
     ledger = _ledger()
     rng = np.random.default_rng(3)
     means = TRUTHS[[0, 1]] + rng.normal(0.0, 0.2, (2, 3))
-    score = ledger.score((0,), _map(means, _ids(0, 1)), STAY)
+    score = ledger.score(0, _map(means, _ids(0, 1)), STAY)
     assert np.isclose(score.error, gospa(means, TRUTHS[COUNTABLE], cutoff=1.0).error)
 
 
@@ -106,8 +108,8 @@ def test_scores_agree_with_the_metrics() -> None:
         ledger.record(_report((ids,)), [held])
         pose = rng.uniform(-3.0, 3.0, 3)
         means = transform_points(pose, truths[held] + rng.normal(0.0, 0.4, (13, 3)))
-        claims = ledger.claims((0,), ids)
-        score = ledger.score((0,), _map(means, ids), inverse(pose))
+        claims = ledger.claims(0, ids)
+        score = ledger.score(0, _map(means, ids), inverse(pose))
         placed = transform_points(inverse(pose), means)
         matched = map_rmse(placed, ledger.true_positions, claims=claims)
         assert np.isclose(score.error, map_error(placed, claims, ledger.true_positions, 0.8))
@@ -127,7 +129,7 @@ def test_infos_agree_with_the_own_start_frame() -> None:
             for robot, agent in enumerate(env.agents):
                 belief, ledger = env.belief(agent), env.episode.ledger
                 placed = belief.map.moved(env.true_start_poses[robot])
-                score = ledger.score(belief.group, placed, STAY)
+                score = ledger.score(robot, placed, STAY)
                 assert np.isclose(infos[agent]["map_error"], score.error)
     assert any(event.kind == "merge" for event in env.events)
 

@@ -7,7 +7,7 @@ from small_env import MEETING, small_env, turning
 from agents import make_policy
 from slam_backend.alignment import Alignment
 from slam_backend.landmark_map import LandmarkMap
-from slam_backend.reports import TeamReport
+from slam_backend.reports import LandmarksCreated, TeamReport
 from vslam_env import ExplorationEnv, vslam_v0
 from vslam_env.errors_of_maps import ClaimLedger
 from vslam_env.oracle import true_alignment
@@ -129,10 +129,11 @@ def test_a_map_that_is_placed_wrong_has_no_recall() -> None:
     truths = np.array([[1.0, 2.0, 0.0], [4.0, 1.0, 0.2], [6.0, 6.0, 0.1]])
     books = ClaimLedger(1, truths, np.ones(3, np.bool_), 1.0)
     ids = np.arange(2)
-    books.record(TeamReport(0, (ids,), (ids,), ((0,),), (), ()), [ids])
+    entries = (LandmarksCreated(0, 0, 0, ids),)
+    books.record(TeamReport(0, (ids,), (ids,), ((0,),), (), (), (0,), entries, 1), [ids])
     held = LandmarkMap(truths[:2], np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 2)), ids=ids)
     for shift, placed in ((0.0, 2 / 3), (0.4, 2 / 3), (0.6, 0.0)):
-        scores = books.score((0,), held, np.array([shift, 0.0, 0.0]))
+        scores = books.score(0, held, np.array([shift, 0.0, 0.0]))
         assert (scores.recall, scores.placed) == (2 / 3, placed)
 
 
@@ -146,7 +147,7 @@ def test_a_wrong_merge_costs() -> None:
         for _ in range(60):
             infos = env.step(turning(env.agents))[4]
         episode = env.episode
-        claims = [episode.ledger.claims((r,), episode.belief.filter_map(r).ids) for r in range(2)]
+        claims = [episode.ledger.claims(r, episode.belief.filter_map(r).ids) for r in range(2)]
         true = true_alignment(*claims, *episode.true_starts)
         assert true is not None
         pose = true.transform + shift

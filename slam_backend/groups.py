@@ -1,0 +1,181 @@
+"""`Group`: robots that share a map frame, the filters by which they go, and how a merge of two groups is taken back."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from slam_backend.branches import Branch, fork, landmark_counts, missing, parts, replay
+from slam_backend.errors import IntArray
+from slam_backend.filter import FastSlam
+from slam_backend.records import Records
+from slam_backend.reports import MergeUndone
+from slam_backend.watching import Watch
+
+
+class Group:
+    """Robots in ascending order; their map frame is the start frame of the lowest.
+
+    Args:
+        trunk: The joint filter's branch.
+        forks: The branches of robots that are out of contact with it.
+
+    Attributes:
+        branches: The trunk, then the forks. Each robot goes by exactly one of them.
+    """
+
+    def __init__(self, trunk: Branch, forks: Sequence[Branch] = ()) -> None:
+        self.branches = [trunk, *forks]
+
+    @property
+    def trunk(self) -> Branch:
+        """The branch of the joint filter."""
+        return self.branches[0]
+
+    @property
+    def robots(self) -> tuple[int, ...]:
+        """All robots of the group."""
+        return self.branches[0].robots
+
+    def branch_of(self, robot: int) -> Branch:
+        """Return the branch that a robot of the group goes by."""
+        return next(branch for branch in self.branches if robot in branch.live)
+
+    # ------------------------------------------------------------------ contact lost and found
+
+    def regroup(self, networks: IntArray, records: Records) -> None:
+        """Fork filters whose robots have lost contact, and tell filters what returning robots have read.
+
+        Args:
+            networks: (K,) robots with the same number are in contact.
+            records: Of the team.
+        """
+        if len(self.robots) == 1:
+            return
+        for branch in list(self.branches):
+            for part in parts(branch.live, networks)[1:]:
+                copied = fork(branch, part, records.new_number(), records.rng)
+                records.copied(branch.number, copied.number)
+                branch.live = tuple(robot for robot in branch.live if robot not in part)
+                self.branches.append(copied)
+        if len(self.branches) > 1:
+            self._settle_trunk(networks)
+            for network in np.unique(networks[list(self.robots)]):
+                here = [branch for branch in self.branches if networks[branch.live[0]] == network]
+                if len(here) > 1:
+                    self._reunite(here, records)
+
+    def _settle_trunk(self, networks: IntArray) -> None:
+        """Hand the joint filter to those who meet other groups, if those who have it meet none: so they can merge.
+
+        A fork can take its place unless the joint filter has lived through a merge or an undo since.
+        """
+        outside = set(np.delete(networks, self.robots).tolist())
+        meeting = [branch for branch in self.branches if networks[branch.live[0]] in outside]
+        meeting = [branch for branch in meeting if branch.epoch == self.trunk.epoch]
+        if meeting and self.trunk not in meeting:
+            old, new = self.trunk, meeting[0]
+            old.split_from, old.split_counts = new.number, dict(new.split_counts)
+            self.branches = [new, *(branch for branch in self.branches if branch is not new)]
+
+    def _reunite(self, here: list[Branch], records: Records) -> None:
+        """Let the best informed of some branches in contact take in what the others know, and end those it caught."""
+        main = max(here, key=self._rank)
+        others = [branch for branch in here if branch is not main and set(branch.live) <= set(main.robots)]
+        wanted: dict[int, int] = {}
+        for other in others:
+            for robot, last in missing(main, other).items():
+                wanted[robot] = max(last, wanted.get(robot, -1))
+        done = replay(main, records.log, wanted)
+        records.note_replay(main, done)
+        records.exchange.record_replay(done)
+        for other in others:
+            known = other.told_by(main, done)
+            if all(main.known[robot] == other.known[robot] for robot in other.live):
+                counts, size = landmark_counts(main.filter), main.filter.descriptor_size
+                records.exchange.record_return(main.live[0], known, counts, size)
+                main.live = tuple(sorted(main.live + other.live))
+                self.branches = [branch for branch in self.branches if branch is not other]
+
+    def _rank(self, branch: Branch) -> tuple[bool, int, int, int]:
+        """Return by what branches in contact are ranked: the trunk, then who has lived through more merges."""
+        return branch is self.trunk, branch.epoch, len(branch.live), -branch.live[0]
+
+    # ------------------------------------------------------------------ snapshots
+
+    def oldest_unknown(self, now: int) -> int:
+        """Return the first step that some filter may have to take in yet, `now` + 1 if there is none."""
+        return min(_oldest_unknown(branch, now) for branch in self.branches)
+
+    def numbers(self) -> set[int]:
+        """Return the numbers of all maps that the group uses or may take up again."""
+        watches = [watch for branch in self.branches for watch in branch.watches]
+        return {branch.number for branch in self.branches}.union(*map(_numbers, watches))
+
+    def get_state(self) -> tuple[dict[str, Any], ...]:
+        """Return all that decides how the group goes on: the states of its branches."""
+        return tuple(branch.get_state() for branch in self.branches)
+
+    @classmethod
+    def from_state(
+        cls, state: Sequence[Mapping[str, Any]], at_hand: Mapping[tuple[int, ...], FastSlam] | None = None
+    ) -> "Group":
+        """Build a group from `get_state`; a filter at hand for the trunk, by its robots, is filled."""
+        at_hand = {} if at_hand is None else at_hand
+        trunk = Branch.from_state(state[0], at_hand.get(state[0]["robots"]))
+        return cls(trunk, [Branch.from_state(branch) for branch in state[1:]])
+
+
+def _oldest_unknown(branch: Branch, now: int) -> int:
+    held = [1 + last for robot, last in branch.known.items() if robot not in branch.live]
+    return min([now + 1, *held, *(_oldest_of(watch) for watch in branch.watches)])
+
+
+def _oldest_of(watch: Watch) -> int:
+    """Return the first step that an undo of a merge, or of earlier ones in its sides, would take in."""
+    own: list[int] = [1 + min(side.trunk["known"].values()) for side in watch.sides]
+    return min([*own, *(_oldest_of(older) for side in watch.sides for older in side.watches)])
+
+
+def _numbers(watch: Watch) -> set[int]:
+    older = [_numbers(one) for side in watch.sides for one in side.watches]
+    return {side.trunk["number"] for side in watch.sides}.union(*older)
+
+
+def undone(group: Group, records: Records, epoch: int) -> tuple[Group, Group]:
+    """Take back the last merge of a group, which is watched: both sides go on as if it had not been.
+
+    Each side's joint filter is taken up again as it was, and takes in what the group's joint filter knows of its
+    robots since, in order of time. Robots out of contact keep their forks until they return.
+
+    Args:
+        group: Not to be used any more.
+        records: Of the team.
+        epoch: Of the restored filters.
+    """
+    now = group.trunk
+    watch = now.watches[-1]
+    number_a, number_b = (side.trunk["number"] for side in watch.sides)
+    records.entries.append(MergeUndone((number_a, number_b, now.number)))
+    restored = []
+    for side in watch.sides:
+        trunk = Branch.from_state(side.trunk)
+        trunk.live, trunk.epoch = tuple(robot for robot in trunk.robots if robot in now.live), epoch
+        wanted = {robot: now.known[robot] for robot in trunk.robots if now.known[robot] > trunk.known[robot]}
+        records.note_replay(trunk, replay(trunk, records.log, wanted, most=None))
+        restored.append(Group(trunk))
+    for branch in group.branches[1:]:
+        _hand_over(branch, restored, records)
+    return restored[0], restored[1]
+
+
+def _hand_over(branch: Branch, restored: list[Group], records: Records) -> None:
+    """Give a fork to the restored group of its robots; one that both need is copied."""
+    homes = [group for group in restored if any(robot in group.robots for robot in branch.live)]
+    for group in homes[1:]:
+        own = tuple(robot for robot in branch.live if robot in group.robots)
+        copied = fork(branch, own, records.new_number(), records.rng)
+        records.copied(branch.number, copied.number)
+        group.branches.append(copied)
+    branch.live = tuple(robot for robot in branch.live if robot in homes[0].robots)
+    homes[0].branches.append(branch)

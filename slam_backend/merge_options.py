@@ -1,0 +1,42 @@
+"""`MergeOptions`: how two groups' filters become one, and how long the team doubts that it was right."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from slam_backend.errors import check_choice, check_float, check_int
+
+METHODS = ("particles", "mixture")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MergeOptions:
+    """How filters are merged, and when a merge is undone.
+
+    Attributes:
+        method: `"particles"`: each new particle pairs one of either group, whose maps are aligned by themselves; the
+            correlation of maps and paths survives. `"mixture"`: both maps' mixture covariances are fused into one map
+            that all particles share (Sec. 3.2, see ERRATA).
+        merged_particles: Of the joint filter; None: as many as the larger of the two.
+        watch_steps: A merge is watched for so many steps in which robots of both sides are in contact, and can be
+            undone so long; then its snapshot is freed. 0: merges are final.
+        watch_every: In so many steps the evidence is weighed once.
+        barred_steps: After an undo the two sides do not try again for so long.
+        max_agreement: A merge is undone if another motion between what either side alone has seen is believed, and
+            the landmarks by which the merge has proved itself since are at most this times that motion's inliers [-].
+    """
+
+    method: Literal["particles", "mixture"] = "particles"
+    merged_particles: int | None = None
+    watch_steps: int = 200
+    watch_every: int = 10
+    barred_steps: int = 200
+    max_agreement: float = 0.5
+
+    def __post_init__(self) -> None:
+        check_choice("merging.method", self.method, METHODS)
+        if self.merged_particles is not None:
+            check_int("merging.merged_particles", self.merged_particles, 1, "Use None for the larger of the two.")
+        check_int("merging.watch_steps", self.watch_steps, 0, "Use 0 to make merges final.")
+        check_int("merging.watch_every", self.watch_every, 1, "Weigh the evidence at every step or less often.")
+        check_int("merging.barred_steps", self.barred_steps, 0, "Use 0 to let them try at once.")
+        check_float("merging.max_agreement", self.max_agreement, "Give a share.", at_least=0.0, at_most=1.0)

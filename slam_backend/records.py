@@ -1,0 +1,73 @@
+"""`Records`: what the groups of a team write down in common: readings, bytes, and what becomes of their maps."""
+
+import copy
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from slam_backend.branches import Branch, ReplayedStep
+from slam_backend.exchange import ExchangeLedger
+from slam_backend.input_log import InputLog
+from slam_backend.reports import LandmarksCreated, MapCopied, MapEntry, StepReport
+
+
+class Records:
+    """The common records of a team.
+
+    Args:
+        num_robots: K; the first K maps are those of the robots alone.
+        seed: Of the streams from which forks draw.
+
+    Attributes:
+        log: What was read and may have to be taken in again.
+        exchange: Counts bytes.
+        rng: From which forks get their own streams.
+        entries: What happened to maps since the last report.
+    """
+
+    def __init__(self, num_robots: int, seed: np.random.SeedSequence) -> None:
+        self.log = InputLog()
+        self.exchange = ExchangeLedger(num_robots)
+        self.rng = np.random.default_rng(seed)
+        self.entries: list[MapEntry] = []
+        self._next_number = num_robots
+
+    def new_number(self) -> int:
+        """Return a number that no map has had."""
+        self._next_number += 1
+        return self._next_number - 1
+
+    def copied(self, source: int, copy: int) -> None:
+        """Write down that a filter forked."""
+        self.entries.append(MapCopied(source, copy))
+
+    def note_created(self, branch: Branch, robots: Sequence[int], step: int, report: StepReport) -> None:
+        """Write down which landmarks a step of a filter created."""
+        for robot in robots:
+            ids = report.created[branch.robots.index(robot)]
+            if len(ids) and ids.max() >= 0:
+                self.entries.append(LandmarksCreated(branch.number, robot, step, ids))
+
+    def note_replay(self, branch: Branch, replayed: Sequence[ReplayedStep]) -> None:
+        """Write down which landmarks a replay created."""
+        for done in replayed:
+            self.note_created(branch, done.robots, done.step, done.report)
+
+    def get_state(self) -> dict[str, Any]:
+        """Return all that decides how the records go on."""
+        return {
+            "log": self.log.get_state(),
+            "exchange": self.exchange.get_state(),
+            "rng": copy.deepcopy(self.rng.bit_generator.state),
+            "entries": tuple(self.entries),
+            "next_number": self._next_number,
+        }
+
+    def set_state(self, state: Mapping[str, Any]) -> None:
+        """Go on with what `get_state` returned."""
+        self.log.set_state(state["log"])
+        self.exchange.set_state(state["exchange"])
+        self.rng.bit_generator.state = copy.deepcopy(state["rng"])
+        self.entries = list(state["entries"])
+        self._next_number = state["next_number"]

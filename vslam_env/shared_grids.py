@@ -1,0 +1,162 @@
+"""`SharedGrids`: the robots' seen grids, what they tell each other of the floor, and how a wrong merge is wiped out."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+from slam_backend.errors import FloatArray
+from slam_backend.geometry import compose, inverse
+from slam_backend.reports import MapDropped, MapEntry, MergeUndone, Renaming
+from vslam_env.navigation import SeenGrid
+from vslam_env.robot_belief import Body
+
+
+class Stroke(NamedTuple):
+    """What one robot's readings of one tick wrote into the grid of another, or its own.
+
+    Attributes:
+        tick: Of the readings.
+        owner: Whose grid.
+        robot: Who scanned.
+        pose: (3,) [m, m, rad], start frame of the owner. Where it was believed to be.
+        scan: (R,) [m].
+        bump: Whether it bumped into something.
+    """
+
+    tick: int
+    owner: int
+    robot: int
+    pose: FloatArray
+    scan: FloatArray
+    bump: bool
+
+
+class Kept(NamedTuple):
+    """Grids as they were just before a merge.
+
+    Attributes:
+        tick: Of the merge; what was painted later is not in them.
+        sides: The robots of either group.
+        maps: Numbers of a's map, of b's and of the joint one.
+        grids: State of each robot's grid.
+    """
+
+    tick: int
+    sides: tuple[tuple[int, ...], tuple[int, ...]]
+    maps: tuple[int, int, int]
+    grids: dict[int, dict[str, Any]]
+
+
+class SharedGrids:
+    """The seen grids of a team, each in its robot's own start frame.
+
+    Robots that go by one filter paint what each of them scans into all of their grids. Those that come together, by a
+    merge or on return, absorb each other's grids; evidence is bounded, so that what both had already only gets firmer.
+    While a merge can be undone the grids from before it are kept, with what was painted since; an undo restores them
+    and paints again what the robots of each side scanned.
+
+    Args:
+        num_robots: K.
+        body: The robots' hardware.
+    """
+
+    def __init__(self, num_robots: int, body: Body) -> None:
+        self._grids = [SeenGrid() for _ in range(num_robots)]
+        self._body = body
+        self._mates: list[tuple[int, ...]] = [(robot,) for robot in range(num_robots)]
+        self._kept: list[Kept] = []
+        self._strokes: list[Stroke] = []
+
+    def __getitem__(self, robot: int) -> SeenGrid:
+        return self._grids[robot]
+
+    def follow(self, tick: int, entries: Sequence[MapEntry], merged: Sequence[Renaming]) -> None:
+        """Keep grids for an undo, undo, and forget what can no longer be undone.
+
+        Args:
+            tick: Whose readings are painted next.
+            entries: What happened to maps, in order.
+            merged: The merges of this tick.
+        """
+        for entry in entries:
+            if isinstance(entry, Renaming) and entry in merged:
+                sides = entry.robots_a, entry.robots_b
+                grids = {robot: self._grids[robot].get_state() for robot in sides[0] + sides[1]}
+                self._kept.append(Kept(tick, sides, entry.maps, grids))
+            elif isinstance(entry, MergeUndone):
+                self._undo(entry)
+            elif isinstance(entry, MapDropped):
+                self._kept = [kept for kept in self._kept if entry.number not in kept.maps[:2]]
+        oldest = min((kept.tick for kept in self._kept), default=None)
+        self._strokes = [stroke for stroke in self._strokes if oldest is not None and stroke.tick >= oldest]
+
+    def _undo(self, undone: MergeUndone) -> None:
+        """Restore the grids from before a merge and paint again what the robots of each side have scanned since."""
+        kept = next((kept for kept in self._kept if kept.maps == undone.maps), None)
+        if kept is None:
+            return  # it was made and undone within a tick
+        self._kept.remove(kept)
+        for side in kept.sides:
+            for robot in side:
+                self._grids[robot].set_state(kept.grids[robot])
+                self._mates[robot] = tuple(mate for mate in self._mates[robot] if mate in side)
+            own = [s for s in self._strokes if s.tick >= kept.tick and s.owner in side and s.robot in side]
+            for stroke in own:
+                self._apply(stroke)
+
+    def meet(self, mates: Sequence[tuple[int, ...]], starts: FloatArray) -> None:
+        """Let robots that have come together absorb what the others have seen.
+
+        Args:
+            mates: Per robot those that go by the same filter now, itself included.
+            starts: (K, 3) [m, m, rad]. The motion from the map frame to each robot's start frame.
+        """
+        for now in sorted(set(mates)):
+            before = sorted({tuple(mate for mate in self._mates[robot] if mate in now) for robot in now})
+            if len(before) > 1:
+                # Robots that were together have seen the same already, so that one of each part stands for all of it.
+                grids = [self._grids[part[0]].copy() for part in before]
+                for part in before:
+                    for other, grid in zip(before, grids, strict=True):
+                        if other is not part:
+                            for robot in part:
+                                own_from_other = compose(starts[robot], inverse(starts[other[0]]))
+                                self._grids[robot].absorb(grid, own_from_other)
+        self._mates = list(mates)
+
+    def paint(self, tick: int, owner: int, robots: Sequence[int], poses: FloatArray, readings: Any) -> None:
+        """Paint what some robots scan into the grid of one of them.
+
+        Args:
+            tick: Of the readings.
+            owner: Whose grid.
+            robots: Who scanned, in this order.
+            poses: (n, 3) [m, m, rad], start frame of the owner. Where they are believed to be.
+            readings: (K,) `Readings` of this tick.
+        """
+        for robot, pose in zip(robots, poses, strict=True):
+            stroke = Stroke(tick, owner, robot, pose, readings[robot].scan, readings[robot].bump)
+            self._apply(stroke)
+            if self._kept:
+                self._strokes.append(stroke)
+
+    def _apply(self, stroke: Stroke) -> None:
+        grid, body = self._grids[stroke.owner], self._body
+        grid.paint_scan(stroke.pose, stroke.scan, body.ray_angles, body.scan_range)
+        grid.clear_disc(stroke.pose, body.radius)
+        if stroke.bump:
+            grid.bump(stroke.pose, body.radius)
+
+    def get_state(self) -> dict[str, Any]:
+        """Return all that decides how the grids go on; what is never written to is shared."""
+        return {
+            "grids": [grid.get_state() for grid in self._grids],
+            "mates": tuple(self._mates),
+            "kept": tuple(self._kept),
+            "strokes": tuple(self._strokes),
+        }
+
+    def set_state(self, state: Mapping[str, Any]) -> None:
+        """Go on as the grids that gave `state`, in place: views of them follow."""
+        for grid, seen in zip(self._grids, state["grids"], strict=True):
+            grid.set_state(seen)
+        self._mates, self._kept, self._strokes = (list(state[name]) for name in ("mates", "kept", "strokes"))
