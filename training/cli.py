@@ -6,11 +6,13 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
+from training.bench_alignment_command import bench_alignment
 from training.bench_command import bench
 from training.bench_filter_command import bench_filter
 from training.paper_command import paper
 from training.replay_command import replay_mrclam
 from training.replay_one_command import replay_kitti, replay_victoria
+from training.replay_pairs_command import replay_stereo
 from training.run import run
 from training.worlds_command import worlds
 
@@ -26,8 +28,10 @@ replay = typer.Typer(help="Run the backend on the log of real robots.", no_args_
 replay.command("mrclam")(replay_mrclam)
 replay.command("victoria")(replay_victoria)
 replay.command("kitti")(replay_kitti)
+replay.command("stereo")(replay_stereo)
 app.add_typer(replay, name="replay")
 bench.command("filter")(bench_filter)
+bench.command("alignment")(bench_alignment)
 app.add_typer(bench, name="bench")
 app.add_typer(paper, name="paper")
 app.add_typer(worlds, name="worlds")

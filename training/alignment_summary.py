@@ -1,0 +1,101 @@
+"""What the trials of `vslam bench alignment` come to, and whether they meet what was set out."""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from scipy.stats import chi2
+
+CELL = ("kind", "case", "overlap", "outliers", "method")
+CONFIDENCE = 0.95
+# On the grid all trials succeed, errors are at most so many times what the Cramer-Rao bound allows, in so many ms.
+OVER_BOUND, MEDIAN_MS = 1.1, 5.0
+LEAST_ACCEPTED = 0.95  # of the identifiable
+
+
+def summarise(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Return a line for each cell and method, in order of appearance, and for each kind and method as a whole.
+
+    Returns:
+        Lines of `CELL` (None where they are pooled), `trials`, `accepted`, `right` (accepted and not false), `false`,
+        `reasons` (how often each), `translation` and `rotation` (RMS error over the root of the mean Cramer-Rao bound,
+        accepted trials), `anees` with `anees_low` and `anees_high`, between which it lies with 95 % if covariances are
+        honest, `worst_m`, `worst_deg`; computing time `median_ms`, `p95_ms`, `max_ms`, and `passed_ms`, the median of
+        what passed, which other processes lengthen.
+    """
+    cells: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
+    for row in rows:
+        cells.setdefault(tuple(row[name] for name in CELL), []).append(row)
+    for row in rows:
+        cells.setdefault((row["kind"], None, None, None, row["method"]), []).append(row)
+    return [dict(zip(CELL, cell, strict=True)) | _describe(own) for cell, own in cells.items()]
+
+
+def _describe(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the figures of one line."""
+    found = [row for row in rows if "error_m" in row]
+    milliseconds = 1e3 * np.array([row["cpu_seconds"] for row in rows])
+    line: dict[str, Any] = {
+        "trials": len(rows),
+        "accepted": sum(row["success"] for row in rows) / len(rows),
+        "right": sum(row["success"] and not row["false"] for row in rows) / len(rows),
+        "false": sum(row["false"] for row in rows),
+        "reasons": dict(Counter(row["reason"] for row in rows if row["reason"]).most_common()),
+        "median_ms": float(np.median(milliseconds)),
+        "p95_ms": float(np.quantile(milliseconds, 0.95)),
+        "max_ms": float(milliseconds.max()),
+        "passed_ms": 1e3 * float(np.median([row["seconds"] for row in rows])),
+    }
+    figures = ("translation", "rotation", "anees", "anees_low", "anees_high", "worst_m", "worst_deg")
+    line |= dict.fromkeys(figures)
+    if found:
+        column = {name: np.array([row[name] for row in found]) for name in ("error_m", "error_rad", "nees")}
+        dof = 3 * len(found)
+        low, high = (float(chi2.ppf(0.5 + 0.5 * side * CONFIDENCE, dof)) / dof for side in (-1.0, 1.0))
+        line |= {
+            "translation": _over_bound(column["error_m"], [row["bound_m2"] for row in found]),
+            "rotation": _over_bound(column["error_rad"], [row["bound_rad2"] for row in found]),
+            "anees": float(column["nees"].mean() / 3.0),
+            "anees_low": low,
+            "anees_high": high,
+            "worst_m": float(column["error_m"].max()),
+            "worst_deg": float(np.rad2deg(column["error_rad"].max())),
+        }
+    return line
+
+
+def _over_bound(errors: Any, bounds: Sequence[float]) -> float:
+    """Return the RMS error over the root of the mean bound."""
+    return float(np.sqrt((np.asarray(errors) ** 2).mean() / np.mean(bounds)))
+
+
+def check_goals(lines: Sequence[Mapping[str, Any]], method: str) -> list[dict[str, Any]]:
+    """Return what was set out for a method, beside what the lines say: `goal`, `measured`, `wanted`, `met`."""
+    goals: list[dict[str, Any]] = []
+
+    def add(goal: str, measured: float, low: float | None, high: float | None) -> None:
+        met = (low is None or measured >= low) and (high is None or measured <= high)
+        shown = [f"at least {low:.3g}"] if low is not None else []
+        shown += [f"at most {high:.3g}"] if high is not None else []
+        goals.append({"goal": goal, "measured": measured, "wanted": ", ".join(shown), "met": met})
+
+    own = [line for line in lines if line["method"] == method]
+    grid = [line for line in own if line["kind"] == "grid" and line["overlap"] is not None]
+    if grid:
+        add("grid: share right, worst cell", min(line["right"] for line in grid), 1.0, None)
+        for name in ("translation", "rotation"):
+            values = [np.inf if line[name] is None else line[name] for line in grid]
+            add(f"grid: {name} error over the bound, worst cell", max(values), None, OVER_BOUND)
+        add("grid: median computing time [ms], slowest cell", max(line["median_ms"] for line in grid), None, MEDIAN_MS)
+    for line in own:
+        if line["overlap"] is not None:
+            continue
+        if line["kind"] == "grid" and line["anees"] is not None:
+            add("grid: ANEES of the motion, all cells", line["anees"], line["anees_low"], line["anees_high"])
+        if line["kind"] == "U":
+            add("U: accepted", line["accepted"], None, 0.0)
+        if line["kind"] == "I":
+            add("I: share accepted", line["accepted"], LEAST_ACCEPTED, None)
+            add("I: accepted and false", line["false"], None, 0.0)
+    return goals
