@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 from rich.console import Console
@@ -11,12 +11,15 @@ from rich.table import Table
 
 from training.command_options import Config, Duration, Estimator, Json, Out, Particles, Seed, finish, gather
 from training.compiling import prepare
+from training.replay_images_command import replay_folder_of_images
 from training.replay_paths import default_path
 
 if TYPE_CHECKING:  # what computes is imported when the command runs, so that --help answers at once
     from slam_backend.trajectory import Trajectory
     from training.replay_one import OneReplay
     from training.run_folder import RunFolder
+
+Result = TypeVar("Result")
 
 VICTORIA = Path("victoria_park")
 KITTI = Path("kitti_landmarks")
@@ -50,10 +53,10 @@ def replay_victoria(
     folder = RunFolder.create(out, command, chosen.to_mapping(), chosen.seed)
     prepare()
     console = Console()
-    result = _with_progress(console, lambda on_step: replay(log, chosen, on_step))
+    result = with_progress(console, lambda on_step: replay(log, chosen, on_step))
     scored = score(result, log)
     metrics = plain(summarise(result, scored))
-    _print_table(console, metrics, result)
+    print_table(console, metrics, result)
     gps = metrics["gps"]
     console.print(
         f"At {gps['fixes']} GPS fixes: median {gps['median_m']:.2f} m, 95 % within {gps['percentile_95_m']:.2f} m, "
@@ -69,17 +72,19 @@ def replay_victoria(
         scored.fixes,
         "GPS",
     )
-    _write(folder, result)
+    write_paths(folder, result)
     finish(console, folder, folder.write_metrics(metrics), json)
 
 
 def replay_kitti(
     path: Annotated[
         Path | None,
-        typer.Option(help="Archive of features, or a folder with one.", show_default=f"{KITTI} in $VSLAM_DATA"),
+        typer.Option(
+            help="Archive of features, folder with one, or folder of images.", show_default=f"{KITTI} in $VSLAM_DATA"
+        ),
     ] = None,
     truth: Annotated[
-        Path | None, typer.Option(help="File of the true poses.", show_default="that in poses beside the archive")
+        Path | None, typer.Option(help="File of the true poses.", show_default="that beside the data")
     ] = None,
     duration: Duration = None,
     particles: Particles = None,
@@ -89,8 +94,9 @@ def replay_kitti(
     json: Json = None,
     config: Config = None,
 ) -> None:
-    """A car in a town: stereo features whose tracks are the landmarks, the motion taken to be in the plane."""
+    """A car in a town: stereo images, or stereo features whose tracks are the landmarks; motion taken to be planar."""
     from slam_backend.readers.kitti import load_kitti
+    from slam_backend.readers.kitti_images import holds_images
     from training.figures_replay_one import draw_one
     from training.replay_kitti import KittiConfig, replay, score, summarise
     from training.run_folder import RunFolder, plain
@@ -100,15 +106,18 @@ def replay_kitti(
     values = gather(command, given | {"seed": seed}, config, json, out)
     if "path" not in values:
         values["path"] = default_path(KITTI, "KITTI features")
+    if holds_images(values["path"]):
+        replay_folder_of_images(values, out, json)
+        return
     chosen = KittiConfig.from_mapping(values)
     log = load_kitti(chosen.path, chosen.truth, chosen.duration)
     folder = RunFolder.create(out, command, chosen.to_mapping(), chosen.seed)
     prepare()
     console = Console()
-    result = _with_progress(console, lambda on_step: replay(log, chosen, on_step))
+    result = with_progress(console, lambda on_step: replay(log, chosen, on_step))
     scored = score(result, log)
     metrics = plain(summarise(result, scored))
-    _print_table(console, metrics, result)
+    print_table(console, metrics, result)
     if scored is not None and scored.loop is not None:
         seconds = [float(result.times[step] - result.times[0]) for step in scored.loop]
         console.print(
@@ -125,11 +134,11 @@ def replay_kitti(
         (scored.estimate, scored.odometry) if scored else None,
         scored.truth[:, :2] if scored else None,
     )
-    _write(folder, result, log.truth)
+    write_paths(folder, result, log.truth)
     finish(console, folder, folder.write_metrics(metrics), json)
 
 
-def _with_progress(console: Console, work: Callable[[Callable[[float], None]], "OneReplay"]) -> "OneReplay":
+def with_progress(console: Console, work: Callable[[Callable[[float], None]], Result]) -> Result:
     """Run a replay under a progress bar."""
     columns = (
         TextColumn("replay"), BarColumn(), TextColumn("{task.percentage:>3.0f} %"), TimeElapsedColumn(),
@@ -140,7 +149,7 @@ def _with_progress(console: Console, work: Callable[[Callable[[float], None]], "
         return work(lambda done: progress.update(task, completed=done))
 
 
-def _print_table(console: Console, metrics: dict[str, Any], result: "OneReplay") -> None:
+def print_table(console: Console, metrics: dict[str, Any], result: "OneReplay") -> None:
     """Print how far path and dead reckoning are off, what became of the measurements, and the speed."""
     table = Table(title="RMS distance to the truth [m]")
     for name in ("", "after the best rigid fit", "from the start, no fit"):
@@ -159,7 +168,7 @@ def _print_table(console: Console, metrics: dict[str, Any], result: "OneReplay")
     )
 
 
-def _write(folder: "RunFolder", result: "OneReplay", truth: "Trajectory | None" = None) -> None:
+def write_paths(folder: "RunFolder", result: "OneReplay", truth: "Trajectory | None" = None) -> None:
     """Write the paths, and how long the filter took, which no two runs share."""
     from slam_backend.trajectory import Trajectory
     from training.run_folder import to_json

@@ -98,7 +98,7 @@ def load_kitti(path: str | Path, truth: str | Path | None = None, duration: floa
         baseline=float(baseline.ravel()[0]),
         unit_from_camera=camera[:3, :3].T.copy(),
         mount=camera[:3, 3].copy(),
-        truth=_read_truth(_find_truth(file, truth), times),
+        truth=None if (poses := _find_truth(file, truth)) is None else read_truth(poses, times),
     )
 
 
@@ -138,10 +138,16 @@ def _read(file: Path) -> dict[str, FloatArray]:
     return content
 
 
-def _read_truth(file: Path | None, times: FloatArray) -> Trajectory | None:
-    """Return the true path in the plane: KITTI's z is ahead, its x to the right, its heading that of the z axis."""
-    if file is None:
-        return None
+def read_truth(file: Path, times: FloatArray) -> Trajectory:
+    """Return the true path in the plane: KITTI's z is ahead, its x to the right, its heading that of the z axis.
+
+    Args:
+        file: Rows of a 3 x 4 matrix, perhaps after a time; one for each frame, the first of them at least.
+        times: (T,) float64 [s]. Of the frames.
+
+    Raises:
+        ValueError: If it is no such file.
+    """
     expected = f"{file.name} with rows of 12 numbers, or 13 with a time, one for each frame"
     cure = f"Correct {str(file)!r}."
     try:

@@ -1,0 +1,126 @@
+"""A folder of KITTI's odometry benchmark: rectified stereo images, their calibration, and perhaps true poses."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from slam_backend.errors import FloatArray, bad_argument, check_float
+from slam_backend.frontend.images import Image
+from slam_backend.readers.calibration import RectifiedPair, load_kitti_calibration
+from slam_backend.readers.kitti import read_truth
+from slam_backend.trajectory import Trajectory
+
+EYES = (("image_0", "image_1"), ("image_l", "image_r"))  # folders of the left and the right eye
+PERIOD = 0.1  # [s] between frames where no times are given: KITTI's cameras run at 10 Hz
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KittiImages:
+    """A drive as stereo images.
+
+    Attributes:
+        times: (T,) float64 [s]. Strictly increasing.
+        left: T files.
+        right: T files.
+        pair: Their calibration.
+        width: Of the images [px].
+        height: Likewise.
+        truth: Poses of the left camera in the plane of its first one, x ahead, y left; None where not known.
+    """
+
+    times: FloatArray
+    left: tuple[Path, ...]
+    right: tuple[Path, ...]
+    pair: RectifiedPair
+    width: int
+    height: int
+    truth: Trajectory | None
+
+    def images(self, frame: int) -> tuple[Image, Image]:
+        """Read the left and the right image of a frame.
+
+        Raises:
+            ValueError: If a file is no image.
+        """
+        return read_grey(self.left[frame]), read_grey(self.right[frame])
+
+
+def holds_images(path: str | Path) -> bool:
+    """Tell whether a folder has images of two eyes, as `load_kitti_images` reads them."""
+    return _eyes(Path(path)) is not None
+
+
+def load_kitti_images(
+    path: str | Path, truth: str | Path | None = None, duration: float | None = None
+) -> KittiImages:
+    """Read a folder with `image_0` and `image_1` (or `image_l` and `image_r`), `calib.txt` and perhaps `poses.txt`.
+
+    Args:
+        path: The folder. Seconds of the frames are in `times.txt`, or 0.1 s apart.
+        truth: File of the true poses; None: `poses.txt` of the folder, if it is there.
+        duration: Keep this many seconds [s]. None: all.
+
+    Raises:
+        ValueError: If a file is missing or cannot be read, or the eyes have different images.
+    """
+    folder = Path(path)
+    eyes = _eyes(folder)
+    if eyes is None:
+        names = " or ".join(f"{left} and {right}" for left, right in EYES)
+        raise bad_argument("path", f"a folder with {names}", "a different one", f"Check {str(folder)!r}.")
+    left, right = (sorted(eye.glob("*.png")) for eye in eyes)
+    if [file.name for file in left] != [file.name for file in right] or len(left) < 2:
+        got = f"a pair of folders with {len(left)} and {len(right)}"
+        raise bad_argument("path", "two or more images of the same names in both eyes", got, f"Check {str(folder)!r}.")
+    times = _times(folder / "times.txt", len(left))
+    keep = len(times)
+    if duration is not None:
+        end = times[0] + check_float("duration", duration, "Give seconds.", above=0.0)
+        keep = max(2, int(np.searchsorted(times, end, side="right")))
+    file = folder / "poses.txt" if truth is None else Path(truth)
+    if truth is not None and not file.is_file():
+        raise bad_argument("truth", "a file of true poses", "no such file", f"Check {str(file)!r}.")
+    height, width = read_grey(left[0]).shape
+    return KittiImages(
+        times=times[:keep],
+        left=tuple(left[:keep]),
+        right=tuple(right[:keep]),
+        pair=load_kitti_calibration(folder / "calib.txt"),
+        width=width,
+        height=height,
+        truth=read_truth(file, times) if file.is_file() else None,
+    )
+
+
+def read_grey(file: Path) -> Image:
+    """Read an image file as grey levels (H, W) uint8.
+
+    Raises:
+        ValueError: If it is none.
+    """
+    image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
+    if image is None:
+        got = "a file that is none" if file.is_file() else "no such file"
+        raise bad_argument("path", "an image file", got, f"Get {str(file)!r} again.")
+    return np.asarray(image, dtype=np.uint8)
+
+
+def _eyes(folder: Path) -> tuple[Path, Path] | None:
+    for left, right in EYES:
+        if (folder / left).is_dir() and (folder / right).is_dir():
+            return folder / left, folder / right
+    return None
+
+
+def _times(file: Path, count: int) -> FloatArray:
+    if not file.is_file():
+        return np.arange(count, dtype=np.float64) * PERIOD
+    try:
+        times = np.array([float(word) for word in file.read_text("utf-8").split()])
+    except ValueError:
+        times = np.empty(0)
+    if len(times) < count or not (np.diff(times) > 0.0).all():
+        raise bad_argument("path", f"times.txt with {count} rising times", "another file", f"Correct {str(file)!r}.")
+    return times[:count]

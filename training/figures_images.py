@@ -1,0 +1,91 @@
+"""Pictures of what a camera saw: corners and landmarks drawn over images, and two images with what they share."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from slam_backend.errors import FloatArray, IntArray, bad_argument
+from slam_backend.frontend.images import Image
+from slam_backend.geometry import inverse, transform_points
+
+KNOWN, NEW, REFUSED, EXPECTED = (90, 200, 90), (60, 170, 250), (70, 70, 230), (230, 190, 90)  # blue, green, red
+
+
+def draw_frame(
+    file: Path,
+    image: Image,
+    pixels: FloatArray,
+    ids: IntArray,
+    counts: dict[int, int],
+    expected: FloatArray,
+) -> None:
+    """Draw what a filter made of a frame into a PNG file.
+
+    Args:
+        file: Where to write.
+        image: (H, W) uint8, the left one.
+        pixels: (n, 3) float64 [px]. Column, row and disparity of the points that the filter got.
+        ids: (n,) int64. Their landmarks, -1 = refused.
+        counts: How often each landmark was measured.
+        expected: (m, 2) float64 [px]. Where landmarks that stand in view are expected.
+    """
+    canvas = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
+    for column, row in expected:
+        cv2.circle(canvas, _fine(column, row), 5 * 16, EXPECTED, 1, cv2.LINE_AA, 4)
+    for (column, row, disparity), name in zip(pixels, ids.tolist(), strict=True):
+        colour = REFUSED if name < 0 else KNOWN if counts.get(name, 0) > 1 else NEW
+        cv2.line(canvas, _fine(column, row), _fine(column - disparity, row), colour, 1, cv2.LINE_AA, 4)
+        cv2.circle(canvas, _fine(column, row), 2 * 16, colour, -1, cv2.LINE_AA, 4)
+    _write(file, canvas)
+
+
+def draw_matches(file: Path, left: Image, right: Image, a: FloatArray, b: FloatArray, right_ones: IntArray) -> None:
+    """Draw two images one above the other with lines between points (n, 2) [px] that were matched.
+
+    Args:
+        file: Where to write.
+        left: (H, W) uint8, drawn above.
+        right: (H', W') uint8, drawn below.
+        a: Points of the first image.
+        b: Their partners in the second one.
+        right_ones: Rows of the matches that are right; the others are drawn in red.
+    """
+    width = max(left.shape[1], right.shape[1])
+    canvas = np.zeros((left.shape[0] + right.shape[0], width), np.uint8)
+    canvas[: left.shape[0], : left.shape[1]] = left
+    canvas[left.shape[0] :, : right.shape[1]] = right
+    picture = cv2.cvtColor(canvas, cv2.COLOR_GRAY2BGR)
+    good = set(right_ones.tolist())
+    for row in sorted(range(len(a)), key=lambda n: n in good):
+        colour = KNOWN if row in good else REFUSED
+        ends = _fine(*a[row]), _fine(b[row, 0], b[row, 1] + left.shape[0])
+        cv2.line(picture, *ends, colour, 1, cv2.LINE_AA, 4)
+    _write(file, picture)
+
+
+def expected_pixels(
+    landmarks: FloatArray, pose: FloatArray, focal_px: float, centre_px: FloatArray, reach: float
+) -> FloatArray:
+    """Return where landmarks appear to a level camera, (m, 2) [px]; those behind it or beyond `reach` are left out.
+
+    Args:
+        landmarks: (N, 3) [m], start frame: x ahead, y left, z above the camera.
+        pose: (3,) [m, m, rad], start frame. Of the camera.
+        focal_px: Focal length [px].
+        centre_px: (2,) [px]. Column and row of the optical axis.
+        reach: Greatest depth [m].
+    """
+    local = transform_points(inverse(pose), landmarks)
+    local = local[(local[:, 0] > 1.0) & (local[:, 0] < reach)]
+    return np.asarray(centre_px - focal_px * local[:, 1:] / local[:, :1])
+
+
+def _fine(column: float, row: float) -> tuple[int, int]:
+    """Return a point in sixteenths of a pixel, as OpenCV draws it."""
+    return round(16.0 * float(column)), round(16.0 * float(row))
+
+
+def _write(file: Path, picture: np.ndarray) -> None:
+    if not cv2.imwrite(str(file), picture):
+        raise bad_argument("out", "a folder that can be written", str(file), "Choose another one.")

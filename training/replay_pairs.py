@@ -1,0 +1,177 @@
+"""Two local visual maps of one room, each of a single stereo pair, are aligned in space: the EuRoC pairs."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, Self
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from slam_backend.errors import FloatArray, bad_argument, check_choice, check_float, check_int
+from slam_backend.frontend import DESCRIPTORS, KINDS, CornerOptions, FrontEndOptions, StereoFrame, StereoFrontEnd
+from slam_backend.frontend.images import Image
+from slam_backend.frontend.odometry import CameraMotion, camera_motion
+from slam_backend.readers.calibration import Rectifier, load_euroc_calibration
+from slam_backend.readers.kitti_images import read_grey
+from slam_backend.rigid import rotation_angle
+from training.replay_config import from_plain, to_plain
+
+CORNERS = 1500
+SIGMA_PX, SIGMA_DISPARITY_PX = 0.5, 0.3
+ITERATIONS = 2000
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PairsConfig:
+    """All that decides the alignment of two pairs.
+
+    Attributes:
+        path: Folder with `left_img_0.png`, `right_img_0.png`, the same of 1, `sensorLeft.yaml`, `sensorRight.yaml` and
+            perhaps `poses_dev.txt`.
+        seed: Of RANSAC's samples.
+        descriptor: "usurf", "sift" or "orb".
+        max_range: Points farther than this are dropped [m].
+    """
+
+    path: str
+    seed: int = 0
+    descriptor: Literal["usurf", "sift", "orb"] = "usurf"
+    max_range: float = 12.0
+
+    def __post_init__(self) -> None:
+        check_int("seed", self.seed, 0, "Use 0 or a positive number.")
+        check_choice("descriptor", self.descriptor, DESCRIPTORS)
+        check_float("max_range", self.max_range, "Give metres.", above=0.0)
+
+    @classmethod
+    def from_mapping(cls, values: Mapping[str, Any]) -> Self:
+        """Build a config from plain values, as `to_mapping` gives them; unknown names are refused."""
+        return from_plain(cls, values, {})
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return the plain values that repeat this, the seed apart."""
+        return to_plain(self)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RoomPairs:
+    """Two raw stereo pairs of one room.
+
+    Attributes:
+        images: Per place the raw left and right image.
+        rectifier: Of the rig.
+        poses: Per place (4, 4) float64 [m], the body in the world; None where not known.
+    """
+
+    images: tuple[tuple[Image, Image], tuple[Image, Image]]
+    rectifier: Rectifier
+    poses: tuple[FloatArray, FloatArray] | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PairsResult:
+    """How two local maps fit together.
+
+    Attributes:
+        images: Per place the rectified left image.
+        frames: Per place its points.
+        motion: From the second camera to the first; None if no motion was found.
+        error_m: Of the translation [m]; NaN where not known.
+        error_deg: Of the rotation [degrees]; likewise.
+        true_m: Distance between the places [m]; likewise.
+        true_deg: Angle between them [degrees]; likewise.
+    """
+
+    images: tuple[Image, Image]
+    frames: tuple[StereoFrame, StereoFrame]
+    motion: CameraMotion | None
+    error_m: float
+    error_deg: float
+    true_m: float
+    true_deg: float
+
+
+def load_pairs(path: str | Path) -> RoomPairs:
+    """Read two raw pairs, their calibration and, if they are there, their poses.
+
+    Raises:
+        ValueError: If a file is missing or ill-formed; the text names it.
+    """
+    folder = Path(path)
+    if not folder.is_dir():
+        raise bad_argument("path", "a folder with two stereo pairs", "no such folder", f"Check {str(folder)!r}.")
+    images = [tuple(read_grey(folder / f"{eye}_img_{i}.png") for eye in ("left", "right")) for i in (0, 1)]
+    file = folder / "poses_dev.txt"
+    return RoomPairs(
+        images=((images[0][0], images[0][1]), (images[1][0], images[1][1])),
+        rectifier=load_euroc_calibration(folder / "sensorLeft.yaml", folder / "sensorRight.yaml"),
+        poses=_read_poses(file) if file.is_file() else None,
+    )
+
+
+def align_pairs(log: RoomPairs, config: PairsConfig) -> PairsResult:
+    """Measure both pairs, match their points by appearance, and find the motion between the cameras."""
+    rectifier = log.rectifier
+    size = rectifier.camera
+    camera = rectifier.pair.camera(
+        size.width,
+        size.height,
+        max_range=config.max_range,
+        sigma_px=SIGMA_PX,
+        sigma_disparity_px=SIGMA_DISPARITY_PX,
+    )
+    seen = FrontEndOptions(descriptor=config.descriptor, corners=CornerOptions(most=CORNERS))
+    eye = StereoFrontEnd(camera, seen, rectifier.pair.centre_px)
+    rectified = [rectifier.rectify(*pair) for pair in log.images]
+    first, second = (eye.measure(*pair) for pair in rectified)
+    rng = np.random.default_rng(config.seed)
+    gate = 2.0 * KINDS[config.descriptor].gate  # places far apart look less alike; RANSAC tells
+    motion = camera_motion(first.measurements, second.measurements, camera, gate, rng, ITERATIONS)
+    nan = float("nan")
+    error_m, error_deg, true_m, true_deg = nan, nan, nan, nan
+    if log.poses is not None:
+        world = [pose @ rectifier.body_from_camera for pose in log.poses]
+        true: FloatArray = np.asarray(np.linalg.solve(world[0], world[1]), dtype=np.float64)
+        true_m, true_deg = float(np.linalg.norm(true[:3, 3])), float(np.degrees(rotation_angle(true[:3, :3])))
+        if motion is not None:
+            error_m = float(np.linalg.norm(motion.translation - true[:3, 3]))
+            error_deg = float(np.degrees(rotation_angle(motion.rotation.T @ true[:3, :3])))
+    images = (rectified[0][0], rectified[1][0])
+    return PairsResult(images, (first, second), motion, error_m, error_deg, true_m, true_deg)
+
+
+def summarise_pairs(results: Mapping[str, PairsResult]) -> dict[str, Any]:
+    """Return the content of `metrics.json`: a row for each descriptor."""
+    rows = {}
+    for name, result in results.items():
+        motion = result.motion
+        rows[name] = {
+            "points": [len(frame.measurements) for frame in result.frames],
+            "matches": 0 if motion is None else len(motion.pairs),
+            "inliers": 0 if motion is None else int(motion.inliers.sum()),
+            "error_m": result.error_m,
+            "error_deg": result.error_deg,
+            "true_m": result.true_m,
+            "true_deg": result.true_deg,
+        }
+    return {"alignments": rows, "robots": [], "merges": [], "groups": [], "coverage": float("nan")}
+
+
+def _read_poses(file: Path) -> tuple[FloatArray, FloatArray]:
+    """Read two poses: image, quaternion w x y z, position x y z."""
+    rows = [line.split() for line in file.read_text("utf-8").splitlines() if line and not line.startswith("#")]
+    try:
+        values = np.array(rows, dtype=np.float64)
+    except ValueError:
+        values = np.empty(0)
+    if values.shape != (2, 8) or not np.isfinite(values).all():
+        expected = f"{file.name} with two rows of 8 numbers"
+        raise bad_argument("path", expected, "a different one", f"Correct {str(file)!r}.")
+    poses = []
+    for row in values:
+        pose = np.eye(4)
+        pose[:3, :3] = Rotation.from_quat(row[[2, 3, 4, 1]]).as_matrix()
+        pose[:3, 3] = row[5:]
+        poses.append(pose)
+    return poses[0], poses[1]
