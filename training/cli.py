@@ -13,7 +13,6 @@ from training.paper_command import paper
 from training.replay_command import replay_mrclam
 from training.replay_one_command import replay_kitti, replay_victoria
 from training.replay_pairs_command import replay_stereo
-from training.replay_pairs_command import replay_stereo
 from training.run import run
 from training.worlds_command import worlds
 
@@ -29,7 +28,6 @@ replay = typer.Typer(help="Run the backend on the log of real robots.", no_args_
 replay.command("mrclam")(replay_mrclam)
 replay.command("victoria")(replay_victoria)
 replay.command("kitti")(replay_kitti)
-replay.command("stereo")(replay_stereo)
 replay.command("stereo")(replay_stereo)
 app.add_typer(replay, name="replay")
 bench.command("filter")(bench_filter)
