@@ -17,12 +17,13 @@ BUSY = 1.2  # load of the last minute above which another process was running
 def print_result(console: Console, result: BenchResult, goals: Sequence[Goal]) -> None:
     """Print rows, goals, and what else was measured."""
     machine = result.machine
+    for proposal in dict.fromkeys(row.load.proposal for row in result.rows):
+        console.print(_rows(result, proposal))
     if result.rows:
-        console.print(_rows(result))
         console.print(
-            "x bytes: over the copy of 2 B M (72 + 4) bytes in a working set as large as the maps. x arithmetic: over "
-            f"B M times {MULTIPLY_ADDS['fastslam1']} (fastslam1) or {MULTIPLY_ADDS['fastslam2']} (fastslam2) "
-            "multiply-adds and the descriptors' product, at the rate of a matrix product. right: measurements given to "
+            "Unknown association, resampling at every step. bytes: how many times the copy of 2 B M (72 + 4) bytes in a "
+            f"working set as large as the maps. arith: likewise B M {MULTIPLY_ADDS['fastslam1']} (fastslam1) or B M "
+            f"{MULTIPLY_ADDS['fastslam2']} (fastslam2) multiply-adds and the descriptors' product, at the rate of a matrix product. right: measurements given to "
             f"the landmark they are of. plain: the reference with {PLAIN_PARTICLES} particles, times M / "
             f"{PLAIN_PARTICLES}.",
             highlight=False,
@@ -59,25 +60,23 @@ def print_result(console: Console, result: BenchResult, goals: Sequence[Goal]) -
         console.print("Stopped early; the rest was not measured.")
 
 
-def _rows(result: BenchResult) -> Table:
-    """Return the table of times: one line for each number of particles, landmarks and measurements."""
-    robots = sorted({row.load.robots for row in result.rows})
-    first, *more = robots
-    table = Table(title="One step of the filter, unknown association, resampling at every step: median in ms")
-    for heading in ("proposal", "M", "N", "B", f"K={first}", "10-90 %", "least", *(f"K={k}" for k in more)):
-        table.add_column(heading, justify="left" if heading == "proposal" else "right")
-    for heading in ("x bytes", "x arithmetic", "right", "plain"):
-        table.add_column(heading, justify="right")
+def _rows(result: BenchResult, proposal: str) -> Table:
+    """Return the table of one proposal's times: a line for each number of particles, landmarks and measurements."""
+    first, *more = sorted({row.load.robots for row in result.rows})
+    table = Table(title=f"One step of {proposal}: median in ms", box=None, padding=(0, 1, 0, 0))
+    headings = ("M", "N", "B", f"K={first}", "10-90 %", "least", *(f"K={k}" for k in more))
+    for heading in (*headings, "bytes", "arith", "right", "plain"):
+        table.add_column(heading, justify="right", no_wrap=True)
     for row in result.rows:
-        if row.load.robots != first:
+        if row.load.robots != first or row.load.proposal != proposal:
             continue
         others = [result.find(**_numbers(row, robots=k)) for k in more]
         timing, load, plain = row.timing, row.load, result.plain_ms(row.load)
         table.add_row(
-            load.proposal, str(load.particles), str(load.landmarks), str(load.measurements),
+            str(load.particles), str(load.landmarks), str(load.measurements),
             _ms(timing.median_ms), f"{_ms(timing.low_ms)}-{_ms(timing.high_ms)}", _ms(timing.min_ms),
             *("" if other is None else _ms(other.timing.median_ms) for other in others),
-            f"{timing.median_ms / row.copy_bound_ms:.1f}", f"{timing.median_ms / row.arithmetic_bound_ms:.1f}",
+            f"{timing.median_ms / row.copy_bound_ms:.3g}", f"{timing.median_ms / row.arithmetic_bound_ms:.3g}",
             f"{row.right:.0%}", "" if plain is None else f"{plain:.0f}",
         )  # fmt: skip
     return table
