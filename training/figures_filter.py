@@ -68,11 +68,11 @@ def _draw_panel(ax: Axes, rows: Sequence[Row], name: str) -> None:
         ax.fill_between(x, low, high, color=colour, alpha=0.15, lw=0)
         ax.plot(x, bound, color=colour, ls=":", lw=1.2)
         if particles:
-            for values in (median, bound):
-                ax.annotate(
-                    f"M={particles:,}", (x[-1], values[-1]), xytext=(5, 0), textcoords="offset points", fontsize=7,
-                    color=colour, va="center",
-                )  # fmt: skip
+            above = proposal == "fastslam2"  # the slower one, so that labels keep apart
+            ax.annotate(
+                f"M={particles:,}", (x[-1], median[-1]), xytext=(5, 2 if above else -2), textcoords="offset points",
+                fontsize=7, color=colour, va="bottom" if above else "top",
+            )  # fmt: skip
 
 
 def _draw_references(ax: Axes, rows: Sequence[Row], result: BenchResult) -> None:

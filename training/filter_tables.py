@@ -21,10 +21,11 @@ def print_result(console: Console, result: BenchResult, goals: Sequence[Goal]) -
         console.print(_rows(result, proposal))
     if result.rows:
         console.print(
-            "Unknown association, resampling at every step. bytes: how many times the copy of 2 B M (72 + 4) bytes in a "
-            f"working set as large as the maps. arith: likewise B M {MULTIPLY_ADDS['fastslam1']} (fastslam1) or B M "
-            f"{MULTIPLY_ADDS['fastslam2']} (fastslam2) multiply-adds and the descriptors' product, at the rate of a matrix product. right: measurements given to "
-            f"the landmark they are of. plain: the reference with {PLAIN_PARTICLES} particles, times M / "
+            "Unknown association, resampling at every step. bytes: how many times the copy of 2 B M (72 + 4) bytes in "
+            f"a working set as large as the maps. arith: likewise B M {MULTIPLY_ADDS['fastslam1']} (fastslam1) or B M "
+            f"{MULTIPLY_ADDS['fastslam2']} (fastslam2) multiply-adds and the descriptors' product, at the rate of a "
+            "matrix product. right: measurements given to the landmark they are of. plain: the reference with "
+            f"{PLAIN_PARTICLES} particles, times M / "
             f"{PLAIN_PARTICLES}.",
             highlight=False,
         )
