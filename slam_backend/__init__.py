@@ -7,6 +7,7 @@ from slam_backend.alignment import Alignment, AlignmentOptions, align_maps
 from slam_backend.attempts import AttemptOptions
 from slam_backend.camera import StereoCamera
 from slam_backend.compilation import log_compilation
+from slam_backend.duplicates import DuplicateOptions, find_duplicates, fuse_duplicates
 from slam_backend.filter import FastSlam
 from slam_backend.filter_options import FilterOptions
 from slam_backend.fusion import fuse_landmarks, fuse_maps
@@ -22,6 +23,7 @@ __all__ = [
     "Alignment",
     "AlignmentOptions",
     "AttemptOptions",
+    "DuplicateOptions",
     "FastSlam",
     "FilterOptions",
     "LandmarkMap",
@@ -36,6 +38,8 @@ __all__ = [
     "TeamSlam",
     "Trajectory",
     "align_maps",
+    "find_duplicates",
+    "fuse_duplicates",
     "fuse_landmarks",
     "fuse_maps",
     "warm_up",
