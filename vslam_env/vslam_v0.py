@@ -17,7 +17,6 @@ from vslam_env.world import World, WorldSource
 
 def parallel_env(
     world: WorldSource | None = None,
-    world_split: str | None = None,
     num_robots: int | None = None,
     sensor: str | None = None,
     action_type: str | None = None,
@@ -26,7 +25,6 @@ def parallel_env(
     max_cycles: int | None = None,
     preset: str | None = None,
     reward: RewardSpec | None = None,
-    shared_reward: bool | None = None,
     observation_type: str | None = None,
     oracle_pose: bool | None = None,
     oracle_association: bool | None = None,
@@ -34,6 +32,8 @@ def parallel_env(
     stop_at_recall: float | None = None,
     render_mode: str | None = None,
     config: EnvConfig | str | Path | None = None,
+    world_split: str | None = None,
+    shared_reward: bool | None = None,
 ) -> ExplorationEnv:
     """Make the parallel environment. An argument that is None leaves what the configuration or preset says.
 
@@ -41,8 +41,6 @@ def parallel_env(
         world: `"office"` (default), `"maze"`, `"loops"`, `"hall"`, `"fig5"`; the path of a floor plan (.png, .jpg,
             .pgm), of a ROS map (.yaml), of a .json file of walls or of a folder of these; a `World`; or a function of
             a generator that returns one.
-        world_split: `"train"`, `"validation"` or `"test"`: worlds of that range of world seeds only, or files of a
-            folder by turns; default any.
         num_robots: 1 to 8; default 3.
         sensor: `"landmark"`.
         action_type: `"continuous"` (default): (speed, turn) in [-1, 1], zeros stand still. `"discrete"`: stay, ahead,
@@ -52,7 +50,6 @@ def parallel_env(
         max_cycles: Steps until the episode is truncated; default 1000.
         preset: `"easy"`, `"standard"` (default) or `"hard"`; see `preset_config`.
         reward: Weights of terms by name (default `{"map_error": 1.0}`), or a list of terms of your own.
-        shared_reward: Each robot gets the mean of all robots' rewards; default its own.
         observation_type: `"dict"` (default) or `"flat"`.
         oracle_pose: The robots know their poses in their own start frames.
         oracle_association: They know which landmark is which.
@@ -60,6 +57,9 @@ def parallel_env(
         stop_at_recall: Terminate when each map holds this share of the landmarks; default never.
         render_mode: `"human"`, `"rgb_array"` or None.
         config: An `EnvConfig` or the path of its TOML file, instead of a preset.
+        world_split: `"train"`, `"validation"` or `"test"`: worlds of that range of world seeds only, or files of a
+            folder by turns; default any.
+        shared_reward: Each robot gets the mean of all robots' rewards; default its own.
 
     Raises:
         ValueError: If an argument is refused; the text names it, what was expected and the cure.
