@@ -217,6 +217,8 @@ class FastSlam:
         know of the start, after a merge, does not blur it.
         """
         starts = self._starts[self._check_robot(robot), :, : self.num_particles]
+        if not starts.any():  # the map frame is its own start frame
+            return self._estimates[robot]
         if (starts == starts[:, :1]).all():
             estimate = self._estimates[robot]
             pose = between(starts[:, 0], estimate.mean)

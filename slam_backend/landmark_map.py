@@ -114,7 +114,8 @@ class LandmarkMap:
     def subset(self, indices: ArrayLike) -> Self:
         """Return the landmarks at `indices`: (k,) integers, each at most once, or an (N,) mask of bools."""
         chosen = np.asarray(indices)
-        chosen = np.flatnonzero(chosen) if chosen.dtype == np.bool_ and chosen.shape == (len(self),) else chosen
+        if chosen.dtype == np.bool_ and chosen.shape == (len(self),):
+            return self._trusted(*(getattr(self, name)[chosen] for name in FIELDS))
         cure = f"Give integers from 0 to {len(self) - 1}, or a mask of shape ({len(self)},)."
         if chosen.ndim != 1 or not (chosen.size == 0 or np.issubdtype(chosen.dtype, np.integer)):
             raise bad_argument("indices", "(k,) integers or a mask", f"an array {chosen.dtype} {chosen.shape}", cure)

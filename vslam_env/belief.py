@@ -16,12 +16,13 @@ from slam_backend.reports import MergeEvent, Renaming, TeamReport
 from slam_backend.team import TeamSlam
 from vslam_env.navigation import CandidateSlots
 from vslam_env.readings import Readings
-from vslam_env.robot_belief import Belief, BeliefConfig, Body, Candidates, Teammate
+from vslam_env.robot_belief import Belief, BeliefConfig, Body, Candidates, Glimpse, Teammate
 from vslam_env.shared_grids import SharedGrids
 
 __all__ = ["Belief", "BeliefConfig", "Body", "Candidates", "TeamBelief", "Teammate"]
 
 CANDIDATE_TICKS = 10  # once a second
+NO_POSES = np.empty((0, 3))
 
 
 class TeamBelief:
@@ -162,6 +163,29 @@ class TeamBelief:
         if robot not in self._beliefs:
             self._beliefs[robot] = self._make_belief(robot)
         return self._beliefs[robot]
+
+    def glimpse(self, robot: int) -> Glimpse:
+        """Return the part of a robot's belief that its observation shows; it shares memory with the filters."""
+        own, start, slots = self._estimates[robot], self._starts[robot], self._slots[robot]
+        mates = [mate for mate in self._members[robot] if mate != robot]
+        seen = [self._team.pose(mate, seen_by=robot) for mate in mates]
+        poses = compose(start, np.array([estimate.mean for estimate in seen])) if mates else NO_POSES
+        squares = [0.5 * (estimate.covariance[0, 0] + estimate.covariance[1, 1]) for estimate in seen]
+        return Glimpse(
+            robot=robot,
+            group_size=1 + len(mates),
+            pose=own.mean,
+            covariance=own.covariance,
+            ess=self._team.ess(robot) / len(self._team.particles(robot)[1]),
+            start_from_group=start,
+            group_map=self.group_map(robot),
+            cells=self._grids[robot].cells,
+            features=slots.features(own.mean, poses[:, :2]),
+            valid=slots.valid,
+            mates=np.array(mates, np.int64),
+            mate_poses=poses,
+            mate_sigmas=np.sqrt(np.array(squares)),
+        )
 
     def get_state(self) -> dict[str, Any]:
         """Return all that decides how the beliefs go on; it shares nothing with them."""

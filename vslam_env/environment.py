@@ -16,7 +16,7 @@ from vslam_env.belief import Belief
 from vslam_env.config import EnvConfig
 from vslam_env.episode import Episode, Recorder
 from vslam_env.errors_of_maps import MapScores
-from vslam_env.observation import flatten, observation_space, observe
+from vslam_env.observation import flatten, observation_space, observe_glimpse
 from vslam_env.readings import Readings
 from vslam_env.rendering import Scene, draw_frame
 from vslam_env.reward import RewardSpec, Standing, evaluate, make_terms
@@ -376,7 +376,7 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         goal = config.action_type == "goal"
         observations: dict[AgentID, Any] = {}
         for robot, agent in enumerate(self.agents):
-            observation = observe(episode.belief.belief(robot), episode.readings[robot].scan, goal)
+            observation = observe_glimpse(episode.belief.glimpse(robot), episode.readings[robot].scan, goal)
             if config.observation_type == "dict":
                 observations[agent] = observation
             elif goal:

@@ -7,10 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend._jit import jit
-from slam_backend.errors import FloatArray
-from slam_backend.geometry import compose, inverse
-from vslam_env.belief import Belief
 from vslam_env.navigation import CELL, FREE, GRID_SIZE, OCCUPIED
+from vslam_env.robot_belief import Glimpse
 
 SIZE = 48
 CHANNELS = ("free", "occupied", "landmarks")
@@ -18,10 +16,11 @@ MARK = 255
 
 
 @jit
-def _paint(cells: Any, x: float, y: float, theta: float, robot_from_map: FloatArray, means: FloatArray) -> Any:
+def _paint(cells: Any, pose: Any, start_from_group: Any, means: Any) -> Any:
     """Sample the seen grid at the centres of the local cells, and mark the cells that hold landmarks."""
     local = np.zeros((3, SIZE, SIZE), np.uint8)
-    c, s = math.cos(theta), math.sin(theta)
+    x, y = pose[0], pose[1]
+    c, s = math.cos(pose[2]), math.sin(pose[2])
     middle = 0.5 * SIZE
     for row in range(SIZE):
         ahead = (middle - 0.5 - row) * CELL
@@ -34,24 +33,23 @@ def _paint(cells: Any, x: float, y: float, theta: float, robot_from_map: FloatAr
                     local[0, row, col] = MARK
                 elif cells[i, j] == OCCUPIED:
                     local[1, row, col] = MARK
-    c, s = math.cos(robot_from_map[2]), math.sin(robot_from_map[2])
+    start_c, start_s = math.cos(start_from_group[2]), math.sin(start_from_group[2])
     for k in range(len(means)):
-        ahead = robot_from_map[0] + c * means[k, 0] - s * means[k, 1]
-        left = robot_from_map[1] + s * means[k, 0] + c * means[k, 1]
-        row, col = math.floor(middle - ahead / CELL), math.floor(middle - left / CELL)
+        dx = start_from_group[0] + start_c * means[k, 0] - start_s * means[k, 1] - x
+        dy = start_from_group[1] + start_s * means[k, 0] + start_c * means[k, 1] - y
+        row = math.floor(middle - (c * dx + s * dy) / CELL)
+        col = math.floor(middle - (c * dy - s * dx) / CELL)
         if 0 <= row < SIZE and 0 <= col < SIZE:
             local[2, row, col] = MARK
     return local
 
 
-def local_grid(belief: Belief) -> NDArray[np.uint8]:
+def local_grid(glimpse: Glimpse) -> NDArray[np.uint8]:
     """Return the robot's surroundings as it believes them to be.
 
     Returns:
         (3, 48, 48) uint8, robot frame, cells of 0.2 m that are 0 or 255. Channels free, occupied, landmarks. Rows go
         from 4.8 m ahead to 4.8 m behind, columns from 4.8 m to the left to 4.8 m to the right. A fresh array.
     """
-    x, y, theta = belief.pose.tolist()
-    robot_from_map = compose(inverse(belief.pose), belief.start_from_group)
-    grid: NDArray[np.uint8] = _paint(belief.grid.cells, x, y, theta, robot_from_map, belief.group_map.means)
+    grid: NDArray[np.uint8] = _paint(glimpse.cells, glimpse.pose, glimpse.start_from_group, glimpse.group_map.means)
     return grid

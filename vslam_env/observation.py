@@ -16,17 +16,18 @@ Rows of `teammates` belong to the other robots by rising index, whatever the gro
 one sigma of a landmark is the root of its mean variance. Values beyond the bounds are clipped.
 """
 
+import math
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from slam_backend.errors import FloatArray
-from slam_backend.geometry import between
-from vslam_env.belief import Belief
+from slam_backend._jit import jit
+from slam_backend.errors import BoolArray, FloatArray
 from vslam_env.local_grid import CHANNELS, MARK, SIZE, local_grid
 from vslam_env.navigation.frontiers import NUM_SLOTS
+from vslam_env.robot_belief import Belief, Glimpse
 
 MOST_TEAMMATES = 7
 NUM_ACTIONS = 1 + NUM_SLOTS
@@ -48,23 +49,51 @@ def observe(belief: Belief, scan: FloatArray, goal_actions: bool) -> Observation
     Returns:
         Fresh arrays by name, as the table of this module says.
     """
+    return observe_glimpse(Glimpse.of(belief), scan, goal_actions)
+
+
+def observe_glimpse(glimpse: Glimpse, scan: FloatArray, goal_actions: bool) -> Observation:
+    """Return what `observe` returns, from the part of the belief that it shows."""
+    numbers, candidates = np.empty(12, np.float32), np.empty((NUM_SLOTS, 5), np.float32)
+    teammates, present = np.zeros((MOST_TEAMMATES, 5), np.float32), np.zeros(MOST_TEAMMATES, np.int8)
+    landmarks = glimpse.group_map
+    _fill(
+        glimpse.pose,
+        glimpse.covariance,
+        landmarks.covariances,
+        landmarks.counts,
+        glimpse.ess,
+        glimpse.group_size,
+        glimpse.features,
+        glimpse.robot,
+        glimpse.mates,
+        glimpse.mate_poses,
+        glimpse.mate_sigmas,
+        numbers,
+        candidates,
+        teammates,
+        present,
+    )
     observation: Observation = {
-        "pose": _clipped(belief.pose, -POSE_LIMIT, POSE_LIMIT),
-        "pose_std": _clipped(np.sqrt(np.diagonal(belief.covariance)), 0.0, POSE_LIMIT),
-        "map_stats": _clipped(_map_stats(belief), 0.0, MAP_STATS_LIMIT),
-        "local_grid": local_grid(belief),
+        "pose": numbers[:3],
+        "pose_std": numbers[3:6],
+        "map_stats": numbers[6:],
+        "local_grid": local_grid(glimpse),
         "scan": scan.astype(np.float32),
-        "candidates": _clipped(belief.candidates.features, -FAR, FAR),
-        **_teammates(belief),
+        "candidates": candidates,
+        "teammates": teammates,
+        "teammates_mask": present,
     }
     if goal_actions:
-        observation["action_mask"] = action_mask(belief)
+        observation["action_mask"] = action_mask(glimpse.valid)
     return observation
 
 
-def action_mask(belief: Belief) -> NDArray[np.int8]:
-    """Return which `goal` actions are valid (17,) int8: staying always is, the others if their slot is filled."""
-    return np.concatenate([[True], belief.candidates.valid]).astype(np.int8)
+def action_mask(valid: BoolArray) -> NDArray[np.int8]:
+    """Return which `goal` actions are valid (17,) int8: staying always is, the others where `valid` (16,) says so."""
+    mask = np.ones(NUM_ACTIONS, np.int8)
+    mask[1:] = valid
+    return mask
 
 
 def flatten(observation: Observation) -> NDArray[np.float32]:
@@ -108,30 +137,77 @@ def observation_space(num_rays: int, scan_range: float, goal_actions: bool, flat
     return spaces.Dict({"observation": vector, "action_mask": mask}) if goal_actions else vector
 
 
-def _map_stats(belief: Belief) -> FloatArray:
-    landmarks = belief.group_map
-    if not len(landmarks):
-        return np.array([0.0, 0.0, 0.0, 0.0, belief.ess, len(belief.group)])
-    sigmas = np.sqrt(np.trace(landmarks.covariances, axis1=1, axis2=2) / 3.0)
-    counts = landmarks.counts.mean()
-    return np.array([len(landmarks), sigmas.mean(), sigmas.max(), counts, belief.ess, len(belief.group)])
+@jit
+def _clip(value: float, low: float, high: float) -> Any:
+    """Clip to bounds that are rounded as those of the space are."""
+    return min(max(np.float32(value), np.float32(low)), np.float32(high))
 
 
-def _teammates(belief: Belief) -> Observation:
-    rows = np.zeros((MOST_TEAMMATES, 5))
-    mask = np.zeros(MOST_TEAMMATES, np.int8)
-    for mate in belief.teammates:
-        row = mate.robot - (mate.robot > belief.robot)
-        x, y, theta = between(belief.pose, mate.pose).tolist()
-        sigma = np.sqrt(0.5 * (mate.covariance[0, 0] + mate.covariance[1, 1]))
-        rows[row] = x, y, np.cos(theta), np.sin(theta), sigma
-        mask[row] = 1
-    return {"teammates": _clipped(rows, -FAR, FAR), "teammates_mask": mask}
+@jit
+def _fill(
+    pose: Any,
+    covariance: Any,
+    landmark_covariances: Any,
+    counts: Any,
+    ess: float,
+    group_size: int,
+    features: Any,
+    robot: int,
+    mates: Any,
+    mate_poses: Any,
+    mate_sigmas: Any,
+    numbers: Any,
+    candidates: Any,
+    teammates: Any,
+    present: Any,
+) -> None:
+    """Write the parts of an observation that are neither a picture nor a scan.
 
-
-def _clipped(values: Any, low: Any, high: Any) -> NDArray[np.float32]:
-    """Return a fresh float32 array within bounds, which are rounded as those of the space are."""
-    return np.asarray(np.clip(np.asarray(values, np.float32), np.float32(low), np.float32(high)))
+    Args:
+        pose: As in `Glimpse`, like all up to `mate_sigmas`.
+        covariance: The same.
+        landmark_covariances: (N, 3, 3) float64 [m].
+        counts: (N,) int64.
+        ess: The same.
+        group_size: The same.
+        features: The same.
+        robot: The same.
+        mates: The same.
+        mate_poses: The same.
+        mate_sigmas: The same.
+        numbers: (12,) float32: `pose`, `pose_std`, `map_stats`. Written to, as all that follow.
+        candidates: (16, 5) float32.
+        teammates: (7, 5) float32, zeros before.
+        present: (7,) int8, zeros before.
+    """
+    for i in range(3):
+        numbers[i] = _clip(pose[i], -POSE_LIMIT[i], POSE_LIMIT[i])
+        numbers[3 + i] = _clip(math.sqrt(covariance[i, i]), 0.0, POSE_LIMIT[i])
+    mean = largest = seen = 0.0
+    for k in range(len(counts)):
+        trace = landmark_covariances[k, 0, 0] + landmark_covariances[k, 1, 1] + landmark_covariances[k, 2, 2]
+        sigma = math.sqrt(trace / 3.0)
+        mean += sigma / len(counts)
+        largest = max(largest, sigma)
+        seen += counts[k] / len(counts)
+    numbers[6] = _clip(len(counts), 0.0, MAP_STATS_LIMIT[0])
+    numbers[7] = _clip(mean, 0.0, MAP_STATS_LIMIT[1])
+    numbers[8] = _clip(largest, 0.0, MAP_STATS_LIMIT[2])
+    numbers[9] = _clip(seen, 0.0, MAP_STATS_LIMIT[3])
+    numbers[10] = _clip(ess, 0.0, MAP_STATS_LIMIT[4])
+    numbers[11] = _clip(group_size, 0.0, MAP_STATS_LIMIT[5])
+    for i in range(len(features)):
+        for j in range(5):
+            candidates[i, j] = _clip(features[i, j], -FAR, FAR)
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    for m in range(len(mates)):
+        row = mates[m] - (mates[m] > robot)
+        dx, dy = mate_poses[m, 0] - pose[0], mate_poses[m, 1] - pose[1]
+        turn = mate_poses[m, 2] - pose[2]
+        teammates[row, 0], teammates[row, 1] = _clip(c * dx + s * dy, -FAR, FAR), _clip(c * dy - s * dx, -FAR, FAR)
+        teammates[row, 2], teammates[row, 3] = np.float32(math.cos(turn)), np.float32(math.sin(turn))
+        teammates[row, 4] = _clip(mate_sigmas[m], -FAR, FAR)
+        present[row] = 1
 
 
 def _box(low: FloatArray, high: FloatArray) -> spaces.Box:

@@ -1,5 +1,6 @@
 """`Belief`: what one robot believes after a tick, and `BeliefConfig`: what it assumes."""
 
+import math
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Any
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 from slam_backend.alignment import AlignmentOptions
 from slam_backend.attempts import AttemptOptions
 from slam_backend.camera import StereoCamera
-from slam_backend.errors import BoolArray, FloatArray, check_int
+from slam_backend.errors import BoolArray, FloatArray, IntArray, check_int
 from slam_backend.filter_options import FilterOptions
 from slam_backend.landmark_map import LandmarkMap
 from slam_backend.merge_options import MergeOptions
@@ -85,6 +86,11 @@ class Teammate:
     def __post_init__(self) -> None:
         _freeze_arrays(self)
 
+    @property
+    def position_sigma(self) -> float:
+        """One sigma of its position [m], averaged over directions."""
+        return math.sqrt(0.5 * (self.covariance[0, 0] + self.covariance[1, 1]))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Candidates:
@@ -153,6 +159,61 @@ class Belief:
     def map(self) -> LandmarkMap:
         """The confirmed landmarks of the group's most probable particle."""
         return self.group_map.moved(self.start_from_group)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Glimpse:
+    """The part of a belief that an observation shows, gathered without copies: read it before the next step.
+
+    Attributes:
+        robot: Its index.
+        group_size: Robots that share the map, itself included.
+        pose: (3,) float64 [m, m, rad], start frame.
+        covariance: (3, 3) float64 [m, m, rad].
+        ess: Effective sample size, as a share of M.
+        start_from_group: (3,) float64 [m, m, rad]. Moves the group's map frame to the own start frame.
+        group_map: The confirmed landmarks in the group's frame.
+        cells: (300, 300) uint8. Of the seen grid.
+        features: (16, 5) float32 [m], robot frame. Of the candidates.
+        valid: (16,) bool. Which candidates there are.
+        mates: (m,) int64. The other robots of the group.
+        mate_poses: (m, 3) float64 [m, m, rad], start frame.
+        mate_sigmas: (m,) float64 [m]. One sigma of their positions, averaged over directions.
+    """
+
+    robot: int
+    group_size: int
+    pose: FloatArray
+    covariance: FloatArray
+    ess: float
+    start_from_group: FloatArray
+    group_map: LandmarkMap
+    cells: NDArray[np.uint8]
+    features: NDArray[np.float32]
+    valid: BoolArray
+    mates: IntArray
+    mate_poses: FloatArray
+    mate_sigmas: FloatArray
+
+    @classmethod
+    def of(cls, belief: Belief) -> "Glimpse":
+        """Return what an observation shows of a belief."""
+        mates = belief.teammates
+        return cls(
+            robot=belief.robot,
+            group_size=len(belief.group),
+            pose=belief.pose,
+            covariance=belief.covariance,
+            ess=belief.ess,
+            start_from_group=belief.start_from_group,
+            group_map=belief.group_map,
+            cells=belief.grid.cells,
+            features=belief.candidates.features,
+            valid=belief.candidates.valid,
+            mates=np.array([mate.robot for mate in mates], np.int64),
+            mate_poses=np.array([mate.pose for mate in mates]).reshape(-1, 3),
+            mate_sigmas=np.array([mate.position_sigma for mate in mates]),
+        )
 
 
 def _freeze_arrays(record: Any) -> None:

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from small_env import MEETING, small_env, turning, wander
 
+from slam_backend.geometry import between
 from vslam_env import ExplorationEnv
 from vslam_env.belief import TeamBelief
 from vslam_env.observation import flatten, observe
@@ -162,3 +163,29 @@ def test_teammates_appear_with_the_merge() -> None:
         c, s = np.cos(me[2]), np.sin(me[2])
         ahead, left = c * offset[0] + s * offset[1], c * offset[1] - s * offset[0]
         assert np.allclose(seen["teammates"][0, :2], [ahead, left], atol=0.5)
+
+
+def test_numbers_follow_from_the_belief() -> None:
+    """Pose, map figures, candidates and teammates are the belief's own, clipped and rounded to float32."""
+    env = small_env(max_cycles=400)
+    env.reset(seed=5, options={"start_poses": MEETING})
+    for step in range(160):
+        observations = env.step(turning(env.agents))[0]
+        if step % 40:
+            continue
+        for agent in env.agents:
+            belief, observation = env.belief(agent), observations[agent]
+            landmarks = belief.map
+            sigmas = np.sqrt(np.trace(landmarks.covariances, axis1=1, axis2=2) / 3.0)
+            sizes = [len(landmarks), sigmas.mean(), sigmas.max(), landmarks.counts.mean()]
+            np.testing.assert_array_equal(observation["pose"], belief.pose.astype(np.float32))
+            np.testing.assert_allclose(observation["pose_std"], np.sqrt(np.diagonal(belief.covariance)), rtol=1e-6)
+            np.testing.assert_allclose(observation["map_stats"], [*sizes, belief.ess, len(belief.group)], rtol=1e-6)
+            np.testing.assert_allclose(observation["candidates"], belief.candidates.features, rtol=1e-6)
+            rows = np.zeros((7, 5))
+            for mate in belief.teammates:
+                x, y, theta = between(belief.pose, mate.pose)
+                sigma = np.sqrt(0.5 * np.trace(mate.covariance[:2, :2]))
+                rows[mate.robot - (mate.robot > belief.robot)] = x, y, np.cos(theta), np.sin(theta), sigma
+            np.testing.assert_allclose(observation["teammates"], rows, rtol=1e-5, atol=1e-6)
+    assert len(env.belief("robot_0").teammates) == 1
