@@ -48,27 +48,6 @@ def updated_log_odds(log_odds: float, seen: bool, expected: bool, sighting: floa
 
 
 @jit
-def carry_odds(slots: IntArray, odds: FloatArray, map_of: IntArray, maps: Int32Array) -> None:
-    """Copy log-odds from where each particle's ancestor left them to its own place; `refresh` does the rest.
-
-    Args:
-        slots: Landmarks that are about to be brought up to date.
-        odds: (slots, P), changed.
-        map_of, maps: As yet of the old places, see `ParticleMaps`.
-    """
-    before = np.empty(odds.shape[1])
-    for k in range(len(slots)):
-        slot = slots[k]
-        if map_of[slot] == 0:
-            continue
-        own = maps[map_of[slot]]
-        for m in range(len(before)):
-            before[m] = odds[slot, own[m]]
-        for m in range(len(before)):
-            odds[slot, m] = before[m]
-
-
-@jit
 def landmarks_told_of(
     ids: IntArray, row_of: IntArray, map_of: IntArray, maps: Int32Array, values: FloatArray, counts: Int32Array,
     num_particles: int, best: int, poses: FloatArray, cosines: FloatArray, sines: FloatArray, mount: FloatArray,

@@ -12,6 +12,7 @@ from slam_backend.errors import FloatArray, IntArray
 from slam_backend.measurements import Measurements
 
 UPPER = np.triu_indices(3)  # where the six stored elements of a covariance stand in the full matrix
+CANDIDATES = 64  # of one frame for which there is working space; more get their own each time
 EMPTY = Measurements.empty(0)
 NO_COVARIANCES = np.zeros((0, 3, 3))
 NO_COVARIANCES.setflags(write=False)
@@ -45,17 +46,6 @@ class Turn(NamedTuple):
     new_slots: IntArray
 
 
-class Candidates(NamedTuple):
-    """What `find_candidates` returns."""
-
-    starts: IntArray
-    slots: IntArray
-    squares: FloatArray
-    owners: IntArray
-    same: IntArray
-    unique: IntArray
-
-
 class FrameBuffers:
     """Arrays that are used again at each step.
 
@@ -68,7 +58,7 @@ class FrameBuffers:
         self.used = 0  # measurements of this step so far
         self.log_likelihood: FloatArray = np.zeros(padded)
         self.work: FloatArray = aligned((_kernels.WORK_ROWS * LANES,), np.float64)
-        self.records: FloatArray = aligned((0, _kernels.CANDIDATE_ROWS * LANES), np.float64)
+        self.records: FloatArray = aligned((CANDIDATES, _kernels.CANDIDATE_ROWS * LANES), np.float64)
         self._found: NDArray[np.int32] = np.zeros((0, padded), dtype=np.int32)
         self._distances: FloatArray = np.zeros((0, padded))
         self._new_slots: IntArray = np.zeros(0, dtype=np.int64)
@@ -81,11 +71,6 @@ class FrameBuffers:
             self._found = np.zeros((2 * most, self.padded), dtype=np.int32)
             self._distances = np.zeros((2 * most, self.padded))
             self._new_slots = np.zeros(2 * most, dtype=np.int64)
-
-    def make_room(self, candidates: int) -> None:
-        """Provide working space for so many candidates."""
-        if candidates > len(self.records):
-            self.records = aligned((2 * candidates, _kernels.CANDIDATE_ROWS * LANES), np.float64)
 
     def take(self, robot: int, frame: Measurements | None, names: IntArray | None) -> Turn:
         """Return a robot's readings as the kernels take them, with room for what becomes of them."""
@@ -102,10 +87,11 @@ class FrameBuffers:
                     array.setflags(write=False)  # as those of a frame: kernels are compiled once
         else:
             keep = np.arange(size)
-        points, noises = _kernels.to_robot_axes(points, NO_COVARIANCES if covariances is None else covariances)
         first, num = self.used, len(points)
+        turned, noises = np.empty((num, 3)), np.empty((num, 6))
+        _kernels.to_robot_axes(points, NO_COVARIANCES if covariances is None else covariances, turned, noises)
         self.used = last = first + num
         return Turn(
-            size, keep, points, noises, covariances is not None, descriptors, names,
+            size, keep, turned, noises, covariances is not None, descriptors, names,
             self._found[first:last], self._distances[first:last], self._new_slots[first:last],
         )  # fmt: skip

@@ -34,6 +34,7 @@ MIN_CONTRADICTIONS = 3.0  # three points fix a pose with one to spare
 WIDE_HEADING = 0.03  # [rad]; where the heading is less sure, one step of Gauss-Newton is not enough
 YOUNG = 4  # a landmark seen up to so many times is updated by the iterated EKF: its depth is still vague
 ZERO_PIVOT = 1e-12  # relative to the variance: below it a direction is taken to be exact
+FARTHEST = float(np.finfo(np.float64).max)  # the largest squared distance that is not infinite
 FAR = np.float32(1e18)  # no descriptor comes near a free slot's
 LOG_2PI = math.log(2.0 * math.pi)
 HALF_PI_HIGH = 1.5707963267341256  # pi / 2 in two parts: the first has 33 bits, so that small multiples are exact
@@ -217,37 +218,71 @@ def _innovate(
             work[DEPTH + i] = depth
 
 
-@lanes
-def _evaluate(work: FloatArray, tile: FloatArray, record: FloatArray) -> None:
-    """Write what a match would add to the system of xi, and its gate, from the innovation in `work`."""
-    for i in range(LANES):
-        rx, ry, rz = work[R0 + i], work[R1 + i], work[R2 + i]
-        depth = work[DEPTH + i]
-        s00, s01 = tile[3 * LANES + i] + work[N00 + i], tile[4 * LANES + i] + work[N01 + i]
-        s02, s11 = tile[5 * LANES + i] + work[N02 + i], tile[6 * LANES + i] + work[N11 + i]
-        s12, s22 = tile[7 * LANES + i] + work[N12 + i], tile[8 * LANES + i] + work[N22 + i]
-        i00, i01, i02, i11, i12, i22, det = _invert(s00, s01, s02, s11, s12, s22)  # Eq. 7
-        hx, hy = work[Y + i] - tile[LANES + i], tile[i] - work[X + i]
-        a0, a1, a2 = work[C00 + i] + hx * work[C20 + i], work[C01 + i] + hx * work[C21 + i], hx * work[C22 + i]
-        b0, b1, b2 = work[C10 + i] + hy * work[C20 + i], work[C11 + i] + hy * work[C21 + i], hy * work[C22 + i]
-        sx = i00 * rx + i01 * ry + i02 * rz
-        sy = i01 * rx + i11 * ry + i12 * rz
-        square = sx * rx + sy * ry + (i02 * rx + i12 * ry + i22 * rz) * rz
-        g0, g1, g2 = a0 * sx + b0 * sy, a1 * sx + b1 * sy, a2 * sx + b2 * sy
-        u0, u1, u2 = i00 * a0 + i01 * b0, i00 * a1 + i01 * b1, i00 * a2 + i01 * b2
-        w0, w1, w2 = i01 * a0 + i11 * b0, i01 * a1 + i11 * b1, i01 * a2 + i11 * b2
-        j00, j01, j02 = a0 * u0 + b0 * w0, a0 * u1 + b0 * w1, a0 * u2 + b0 * w2
-        j11, j12, j22 = a1 * u1 + b1 * w1, a1 * u2 + b1 * w2, a2 * u2 + b2 * w2
-        # S + A P A^T, with P the covariance of xi: what the pose adds to the doubt about x and y.
+@lanes_inlined
+def _match_terms(
+    work: FloatArray, tile: FloatArray, i: int, refined: bool
+) -> tuple[
+    float, float, float, float, float, float, float, float, float, float, float, float, float, float, float
+]:  # fmt: skip
+    """Return what a match would add to the system of xi, and its gate, from the innovation in `work`.
+
+    A robot turns about the vertical, so the pose says nothing of heights: r_z is eliminated first, and what is left is
+    two by two. With T = S_xy - S_xz S_zz^-1 S_zx and p = r_xy - S_xz S_zz^-1 r_z: A^T S^-1 A = A_xy^T T^-1 A_xy,
+    A^T S^-1 r = A_xy^T T^-1 p, and the gate takes T + A_xy P A_xy^T.
+
+    Args:
+        refined: Whether the covariance P of xi is that of the rows SPREAD00 ..; else it is the identity.
+
+    Returns:
+        J (6), g (3), r^T S^-1 r, |S|, |S + A P A^T|, the predicted depth, r^T r, and the squared distance of the gate,
+        infinite behind the camera.
+    """
+    rx, ry, rz = work[R0 + i], work[R1 + i], work[R2 + i]
+    depth = work[DEPTH + i]
+    s00, s01 = tile[3 * LANES + i] + work[N00 + i], tile[4 * LANES + i] + work[N01 + i]
+    s02, s11 = tile[5 * LANES + i] + work[N02 + i], tile[6 * LANES + i] + work[N11 + i]
+    s12, s22 = tile[7 * LANES + i] + work[N12 + i], tile[8 * LANES + i] + work[N22 + i]
+    per_s22 = 1.0 / s22
+    k0, k1 = s02 * per_s22, s12 * per_s22
+    t00, t01, t11 = s00 - k0 * s02, s01 - k0 * s12, s11 - k1 * s12
+    px, py, height = rx - k0 * rz, ry - k1 * rz, rz * rz * per_s22
+    det = t00 * t11 - t01 * t01
+    per_det = 1.0 / det
+    i00, i01, i11 = t11 * per_det, -t01 * per_det, t00 * per_det  # Eq. 7
+    sx, sy = i00 * px + i01 * py, i01 * px + i11 * py
+    hx, hy = work[Y + i] - tile[LANES + i], tile[i] - work[X + i]
+    c20, c21, c22 = work[C20 + i], work[C21 + i], work[C22 + i]
+    a0, a1, a2 = work[C00 + i] + hx * c20, work[C01 + i] + hx * c21, hx * c22
+    b0, b1, b2 = work[C10 + i] + hy * c20, work[C11 + i] + hy * c21, hy * c22
+    u0, u1, u2 = i00 * a0 + i01 * b0, i00 * a1 + i01 * b1, i00 * a2 + i01 * b2
+    w0, w1, w2 = i01 * a0 + i11 * b0, i01 * a1 + i11 * b1, i01 * a2 + i11 * b2
+    if refined:
         q00, q01, q02 = work[SPREAD00 + i], work[SPREAD01 + i], work[SPREAD02 + i]
         q11, q12, q22 = work[SPREAD11 + i], work[SPREAD12 + i], work[SPREAD22 + i]
-        u0, u1, u2 = q00 * a0 + q01 * a1 + q02 * a2, q01 * a0 + q11 * a1 + q12 * a2, q02 * a0 + q12 * a1 + q22 * a2
-        w0, w1, w2 = q00 * b0 + q01 * b1 + q02 * b2, q01 * b0 + q11 * b1 + q12 * b2, q02 * b0 + q12 * b1 + q22 * b2
-        p00, p01, p02, p11, p12, p22, det_pose = _invert(
-            s00 + a0 * u0 + a1 * u1 + a2 * u2, s01 + a0 * w0 + a1 * w1 + a2 * w2, s02,
-            s11 + b0 * w0 + b1 * w1 + b2 * w2, s12, s22,
+        e0, e1, e2 = q00 * a0 + q01 * a1 + q02 * a2, q01 * a0 + q11 * a1 + q12 * a2, q02 * a0 + q12 * a1 + q22 * a2
+        f0, f1, f2 = q00 * b0 + q01 * b1 + q02 * b2, q01 * b0 + q11 * b1 + q12 * b2, q02 * b0 + q12 * b1 + q22 * b2
+    else:
+        e0, e1, e2, f0, f1, f2 = a0, a1, a2, b0, b1, b2
+    d00, d01, d11 = (
+        t00 + a0 * e0 + a1 * e1 + a2 * e2, t01 + a0 * f0 + a1 * f1 + a2 * f2, t11 + b0 * f0 + b1 * f1 + b2 * f2
+    )
+    det_pose = d00 * d11 - d01 * d01
+    distance = height + (d11 * px * px - 2.0 * d01 * px * py + d00 * py * py) / det_pose
+    return (
+        a0 * u0 + b0 * w0, a0 * u1 + b0 * w1, a0 * u2 + b0 * w2, a1 * u1 + b1 * w1, a1 * u2 + b1 * w2,
+        a2 * u2 + b2 * w2, a0 * sx + b0 * sy, a1 * sx + b1 * sy, a2 * sx + b2 * sy,
+        height + px * sx + py * sy, det * s22, det_pose * s22, depth, rx * rx + ry * ry + rz * rz,
+        distance if depth >= MIN_DEPTH else np.inf,
+    )
+
+
+@lanes
+def _evaluate(work: FloatArray, tile: FloatArray, record: FloatArray, refined: bool) -> None:
+    """Write the terms of a match, see `_match_terms`."""
+    for i in range(LANES):
+        j00, j01, j02, j11, j12, j22, g0, g1, g2, square, det, det_pose, depth, metres2, distance = _match_terms(
+            work, tile, i, refined
         )
-        distance = _form(p00, p01, p02, p11, p12, p22, rx, ry, rz)
         record[QJ00 + i], record[QJ01 + i], record[QJ02 + i] = j00, j01, j02
         record[QJ11 + i], record[QJ12 + i], record[QJ22 + i] = j11, j12, j22
         record[QG0 + i], record[QG1 + i], record[QG2 + i] = g0, g1, g2
@@ -255,81 +290,110 @@ def _evaluate(work: FloatArray, tile: FloatArray, record: FloatArray) -> None:
         record[Q_DET + i] = det
         record[Q_DET_POSE + i] = det_pose
         record[Q_DEPTH + i] = depth
-        record[Q_METRES2 + i] = rx * rx + ry * ry + rz * rz
-        record[Q_D + i] = distance if depth >= MIN_DEPTH else np.inf
+        record[Q_METRES2 + i] = metres2
+        record[Q_D + i] = distance
+
+
+@lanes_inlined
+def _updated(
+    work: FloatArray, tile: FloatArray, i: int, i00: float, i01: float, i02: float, i11: float, i12: float, i22: float,
+    match: bool,
+) -> None:
+    """Update a landmark where `match`, S^-1 given (Eqs. 8-10)."""
+    p00, p01, p02 = tile[3 * LANES + i], tile[4 * LANES + i], tile[5 * LANES + i]
+    p11, p12, p22 = tile[6 * LANES + i], tile[7 * LANES + i], tile[8 * LANES + i]
+    n00, n01, n02 = work[N00 + i], work[N01 + i], work[N02 + i]
+    n11, n12, n22 = work[N11 + i], work[N12 + i], work[N22 + i]
+    rx, ry, rz = work[R0 + i], work[R1 + i], work[R2 + i]
+    k00, k01, k02 = p00 * i00 + p01 * i01 + p02 * i02, p00 * i01 + p01 * i11 + p02 * i12, (
+        p00 * i02 + p01 * i12 + p02 * i22
+    )  # Eq. 8
+    k10, k11, k12 = p01 * i00 + p11 * i01 + p12 * i02, p01 * i01 + p11 * i11 + p12 * i12, (
+        p01 * i02 + p11 * i12 + p12 * i22
+    )
+    k20, k21, k22 = p02 * i00 + p12 * i01 + p22 * i02, p02 * i01 + p12 * i11 + p22 * i12, (
+        p02 * i02 + p12 * i12 + p22 * i22
+    )
+    tile[i] += k00 * rx + k01 * ry + k02 * rz if match else 0.0  # Eq. 9
+    tile[LANES + i] += k10 * rx + k11 * ry + k12 * rz if match else 0.0
+    tile[2 * LANES + i] += k20 * rx + k21 * ry + k22 * rz if match else 0.0
+    # Eq. 10, (I - K) Sigma, written as K R: no difference of nearly equal numbers, and made symmetric.
+    q01 = 0.5 * (k00 * n01 + k01 * n11 + k02 * n12 + k10 * n00 + k11 * n01 + k12 * n02)
+    q02 = 0.5 * (k00 * n02 + k01 * n12 + k02 * n22 + k20 * n00 + k21 * n01 + k22 * n02)
+    q12 = 0.5 * (k10 * n02 + k11 * n12 + k12 * n22 + k20 * n01 + k21 * n11 + k22 * n12)
+    tile[3 * LANES + i] = k00 * n00 + k01 * n01 + k02 * n02 if match else p00
+    tile[4 * LANES + i] = q01 if match else p01
+    tile[5 * LANES + i] = q02 if match else p02
+    tile[6 * LANES + i] = k10 * n01 + k11 * n11 + k12 * n12 if match else p11
+    tile[7 * LANES + i] = q12 if match else p12
+    tile[8 * LANES + i] = k20 * n02 + k21 * n12 + k22 * n22 if match else p22
+
+
+@lanes_inlined
+def _inverse_of_sum(
+    work: FloatArray, tile: FloatArray, i: int
+) -> tuple[float, float, float, float, float, float, float]:
+    """Return S^-1 and |S|, S = Sigma + R (Eq. 7)."""
+    return _invert(
+        tile[3 * LANES + i] + work[N00 + i], tile[4 * LANES + i] + work[N01 + i], tile[5 * LANES + i] + work[N02 + i],
+        tile[6 * LANES + i] + work[N11 + i], tile[7 * LANES + i] + work[N12 + i], tile[8 * LANES + i] + work[N22 + i],
+    )
+
+
+@lanes
+def _update(work: FloatArray, tile: FloatArray, mask: FloatArray) -> None:
+    """At a known pose: update the landmark where `mask` is 1 and it lies ahead of the camera (Eqs. 5-10)."""
+    for i in range(LANES):
+        i00, i01, i02, i11, i12, i22, _ = _inverse_of_sum(work, tile, i)
+        match = mask[i] > 0.0 and work[DEPTH + i] >= MIN_DEPTH
+        _updated(work, tile, i, i00, i01, i02, i11, i12, i22, match)
+
+
+@lanes_inlined
+def _count_likelihood(work: FloatArray, i: int, on: bool, square: float, det: float, depth: float) -> None:
+    """Where `on`, add a match's part of the log-likelihood: r^T S^-1 r, and |S| and the depth as products."""
+    work[SUM_D + i] += square if on else 0.0
+    work[MATCHED + i] += 1.0 if on else 0.0
+    mantissa, exponent = _split(work[DET + i] * (det if on else 1.0))
+    work[DET + i] = mantissa
+    work[DET_EXP + i] += exponent
+    mantissa, exponent = _split(work[DEPTHS + i] * (depth if on else 1.0))
+    work[DEPTHS + i] = mantissa
+    work[DEPTHS_EXP + i] += exponent
 
 
 @lanes
 def _gate_and_update(
-    work: FloatArray, tile: FloatArray, record: FloatArray, admit: FloatArray, gate: float
-) -> int:
-    """At a known pose: gate, and where admitted and inside the gate, weigh and update the landmark (Eqs. 5-11).
+    work: FloatArray, tile: FloatArray, record: FloatArray, chosen: FloatArray, seen: Int32Array, q: float,
+    admit: FloatArray, gate: float,
+) -> None:
+    """At a known pose: where admitted and inside the gate, weigh and update the landmark (Eqs. 5-11).
 
-    `admit` (LANES) is 1 where the lane may match; it becomes 1 where it did. The squared distance is left in `record`.
-
-    Returns:
-        How many lanes matched.
+    Args:
+        chosen: (LANES,) becomes q where the lane matched.
+        seen: (LANES,) is counted up there.
+        admit: (LANES,) 1 where the lane may match.
+        record: Row Q_D is written.
     """
-    count = 0
     for i in range(LANES):
-        p00, p01, p02 = tile[3 * LANES + i], tile[4 * LANES + i], tile[5 * LANES + i]
-        p11, p12, p22 = tile[6 * LANES + i], tile[7 * LANES + i], tile[8 * LANES + i]
-        n00, n01, n02, n11, n12, n22 = (
-            work[N00 + i], work[N01 + i], work[N02 + i], work[N11 + i], work[N12 + i], work[N22 + i]
-        )
-        rx, ry, rz, depth = work[R0 + i], work[R1 + i], work[R2 + i], work[DEPTH + i]
-        i00, i01, i02, i11, i12, i22, det = _invert(
-            p00 + n00, p01 + n01, p02 + n02, p11 + n11, p12 + n12, p22 + n22
-        )  # Eq. 7
-        distance = _form(i00, i01, i02, i11, i12, i22, rx, ry, rz)
+        i00, i01, i02, i11, i12, i22, det = _inverse_of_sum(work, tile, i)
+        distance = _form(i00, i01, i02, i11, i12, i22, work[R0 + i], work[R1 + i], work[R2 + i])
+        depth = work[DEPTH + i]
         match = admit[i] > 0.0 and distance <= gate and depth >= MIN_DEPTH
-        k00, k01, k02 = p00 * i00 + p01 * i01 + p02 * i02, p00 * i01 + p01 * i11 + p02 * i12, (
-            p00 * i02 + p01 * i12 + p02 * i22
-        )  # Eq. 8
-        k10, k11, k12 = p01 * i00 + p11 * i01 + p12 * i02, p01 * i01 + p11 * i11 + p12 * i12, (
-            p01 * i02 + p11 * i12 + p12 * i22
-        )
-        k20, k21, k22 = p02 * i00 + p12 * i01 + p22 * i02, p02 * i01 + p12 * i11 + p22 * i12, (
-            p02 * i02 + p12 * i12 + p22 * i22
-        )
-        tile[i] += k00 * rx + k01 * ry + k02 * rz if match else 0.0  # Eq. 9
-        tile[LANES + i] += k10 * rx + k11 * ry + k12 * rz if match else 0.0
-        tile[2 * LANES + i] += k20 * rx + k21 * ry + k22 * rz if match else 0.0
-        # Eq. 10, (I - K) Sigma, written as K R: no difference of nearly equal numbers, and made symmetric.
-        q00 = k00 * n00 + k01 * n01 + k02 * n02
-        q01 = 0.5 * (k00 * n01 + k01 * n11 + k02 * n12 + k10 * n00 + k11 * n01 + k12 * n02)
-        q02 = 0.5 * (k00 * n02 + k01 * n12 + k02 * n22 + k20 * n00 + k21 * n01 + k22 * n02)
-        q11 = k10 * n01 + k11 * n11 + k12 * n12
-        q12 = 0.5 * (k10 * n02 + k11 * n12 + k12 * n22 + k20 * n01 + k21 * n11 + k22 * n12)
-        q22 = k20 * n02 + k21 * n12 + k22 * n22
-        tile[3 * LANES + i] = q00 if match else p00
-        tile[4 * LANES + i] = q01 if match else p01
-        tile[5 * LANES + i] = q02 if match else p02
-        tile[6 * LANES + i] = q11 if match else p11
-        tile[7 * LANES + i] = q12 if match else p12
-        tile[8 * LANES + i] = q22 if match else p22
+        _updated(work, tile, i, i00, i01, i02, i11, i12, i22, match)
+        _count_likelihood(work, i, match, distance, det, depth)
         record[Q_D + i] = distance
-        record[Q_DET + i] = det if match else 1.0
-        record[Q_DEPTH + i] = depth if match else 1.0
-        record[Q_SQUARE + i] = distance if match else 0.0
-        admit[i] = 1.0 if match else 0.0
-        count += 1 if match else 0
-    return count
+        chosen[i] = q if match else chosen[i]
+        seen[i] += np.int32(1) if match else np.int32(0)
 
 
 @lanes
 def _add_likelihood(work: FloatArray, record: FloatArray, mask: FloatArray) -> None:
-    """Add a match's part of the log-likelihood where `mask` is 1: r^T S^-1 r, |S| and the depth, as products."""
+    """Add a match's part of the log-likelihood where `mask` is 1."""
     for i in range(LANES):
-        on = mask[i] > 0.0
-        work[SUM_D + i] += record[Q_SQUARE + i] if on else 0.0
-        work[MATCHED + i] += 1.0 if on else 0.0
-        mantissa, exponent = _split(work[DET + i] * (record[Q_DET + i] if on else 1.0))
-        work[DET + i] = mantissa
-        work[DET_EXP + i] += exponent
-        mantissa, exponent = _split(work[DEPTHS + i] * (record[Q_DEPTH + i] if on else 1.0))
-        work[DEPTHS + i] = mantissa
-        work[DEPTHS_EXP + i] += exponent
+        _count_likelihood(
+            work, i, mask[i] > 0.0, record[Q_SQUARE + i], record[Q_DET + i], record[Q_DEPTH + i]
+        )
 
 
 @lanes
@@ -355,21 +419,32 @@ def _log_likelihood(work: FloatArray, i: int) -> float:
     return total
 
 
+@lanes_inlined
+def _add_terms(
+    work: FloatArray, i: int, on: bool, w: float, j00: float, j01: float, j02: float, j11: float, j12: float,
+    j22: float, g0: float, g1: float, g2: float,
+) -> None:
+    """Where `on`, add a match's share of the Gauss-Newton system, times w; elsewhere it may be NaN."""
+    work[J00 + i] += w * j00 if on else 0.0
+    work[J01 + i] += w * j01 if on else 0.0
+    work[J02 + i] += w * j02 if on else 0.0
+    work[J11 + i] += w * j11 if on else 0.0
+    work[J12 + i] += w * j12 if on else 0.0
+    work[J22 + i] += w * j22 if on else 0.0
+    work[G0 + i] += w * g0 if on else 0.0
+    work[G1 + i] += w * g1 if on else 0.0
+    work[G2 + i] += w * g2 if on else 0.0
+
+
 @lanes
 def _sum_matches(work: FloatArray, record: FloatArray, weights: FloatArray) -> None:
-    """Add a candidate's share of the Gauss-Newton system, times `weights` (LANES); where that is 0 it may be NaN."""
+    """Add a candidate's share of the Gauss-Newton system, times `weights` (LANES)."""
     for i in range(LANES):
-        w = weights[i]
-        on = w > 0.0
-        work[J00 + i] += w * record[QJ00 + i] if on else 0.0
-        work[J01 + i] += w * record[QJ01 + i] if on else 0.0
-        work[J02 + i] += w * record[QJ02 + i] if on else 0.0
-        work[J11 + i] += w * record[QJ11 + i] if on else 0.0
-        work[J12 + i] += w * record[QJ12 + i] if on else 0.0
-        work[J22 + i] += w * record[QJ22 + i] if on else 0.0
-        work[G0 + i] += w * record[QG0 + i] if on else 0.0
-        work[G1 + i] += w * record[QG1 + i] if on else 0.0
-        work[G2 + i] += w * record[QG2 + i] if on else 0.0
+        _add_terms(
+            work, i, weights[i] > 0.0, weights[i],
+            record[QJ00 + i], record[QJ01 + i], record[QJ02 + i], record[QJ11 + i], record[QJ12 + i], record[QJ22 + i],
+            record[QG0 + i], record[QG1 + i], record[QG2 + i],
+        )
 
 
 @lanes
@@ -510,40 +585,46 @@ def _factorise(work: FloatArray, i: int) -> None:
 
 
 @lanes
-def _match_alone(record: FloatArray, match: FloatArray, q: float, named: bool, gate: float, weights: FloatArray) -> int:
-    """Pass A for a measurement with one candidate: write its match and robust weight; return how many matched."""
-    count = 0
-    for i in range(len(match)):
-        distance = record[Q_D + i]
-        ok = record[Q_HELD + i] > 0.0 and (distance <= gate or (named and distance < np.inf))
+def _match_alone(
+    work: FloatArray, tile: FloatArray, record: FloatArray, seen: Int32Array, match: FloatArray, q: float,
+    reach: float, gate: float,
+) -> None:
+    """Pass A for a measurement with one candidate: match, weigh by Cauchy's 1 / (1 + D / gate), sum, and judge.
+
+    `reach` is the largest D that may match: the gate, or any where the caller names the landmarks.
+    """
+    for i in range(LANES):
+        j00, j01, j02, j11, j12, j22, g0, g1, g2, _, _, _, _, _, distance = _match_terms(work, tile, i, False)
+        held = seen[i] > 0
+        inside = distance <= gate
+        ok = held and distance <= reach
         match[i] = q if ok else -1.0
-        weights[i] = 1.0 / (1.0 + distance / gate) if ok else 0.0
-        count += 1 if ok else 0
-    return count
+        _add_terms(work, i, ok, gate / (gate + distance), j00, j01, j02, j11, j12, j22, g0, g1, g2)
+        record[Q_FIRST_D + i] = distance
+        work[CONTRADICT + i] += 1.0 if held and not inside else 0.0
 
 
 @lanes
 def _decide_alone(
-    work: FloatArray, record: FloatArray, match: FloatArray, q: float, named: bool, taken: bool,
-    gate: float, dead_zone: float, dead_radius: float, log_clutter: float, mask: FloatArray,
-) -> int:
-    """Pass B for a measurement with one candidate: match, reject or start; return how many matched.
+    work: FloatArray, tile: FloatArray, seen: Int32Array, match: FloatArray, q: float,
+    reach: float, dead_zone: float, dead_radius: float, log_clutter: float,
+) -> None:
+    """Pass B for a measurement with one candidate: match, reject or start, and sum.
 
-    `taken` tells whether row TAKEN says where an earlier measurement has taken the landmark.
+    Row TAKEN says where an earlier measurement has taken the landmark; for `reach` see `_match_alone`.
     """
-    count = 0
     radius2 = dead_radius * dead_radius
-    for i in range(len(match)):
-        distance = record[Q_D + i]
-        front = record[Q_HELD + i] > 0.0 and distance < np.inf
-        distance = gate if named and distance > gate else distance
-        near = front and (distance <= dead_zone or record[Q_METRES2 + i] <= radius2)
-        ok = front and distance <= gate and not (taken and work[TAKEN + i] > 0.0)
+    for i in range(LANES):
+        j00, j01, j02, j11, j12, j22, g0, g1, g2, square, det, _, depth, metres2, distance = _match_terms(
+            work, tile, i, True
+        )
+        front = seen[i] > 0 and distance < np.inf
+        near = front and (distance <= dead_zone or metres2 <= radius2)
+        ok = front and distance <= reach and work[TAKEN + i] == 0.0
         match[i] = q if ok else (-1.0 if near else -2.0)
         work[CLUTTER + i] += 0.0 if ok else log_clutter
-        mask[i] = 1.0 if ok else 0.0
-        count += 1 if ok else 0
-    return count
+        _add_terms(work, i, ok, 1.0, j00, j01, j02, j11, j12, j22, g0, g1, g2)
+        _count_likelihood(work, i, ok, square, det, depth)
 
 
 @lanes
@@ -557,11 +638,11 @@ def _begin_choice(work: FloatArray) -> None:
 
 
 @lanes
-def _consider(work: FloatArray, record: FloatArray, q: float, look: float, named: bool, gate: float) -> None:
+def _consider(work: FloatArray, record: FloatArray, q: float, look: float, reach: float) -> None:
     """Let candidate q compete for the measurement in pass A; `look` is what its descriptor costs."""
     for i in range(LANES):
         distance = record[Q_D + i]
-        ok = record[Q_HELD + i] > 0.0 and (distance <= gate or (named and distance < np.inf))
+        ok = record[Q_HELD + i] > 0.0 and distance <= reach
         depth = record[Q_DEPTH + i]
         log_det = _log(record[Q_DET_POSE + i] if ok else 1.0) - 8.0 * _log(depth if ok else 1.0)
         cost = distance + log_det + look if ok else np.inf
@@ -602,15 +683,18 @@ def _clear_taken(work: FloatArray) -> None:
 
 @lanes
 def _consider_again(
-    work: FloatArray, record: FloatArray, q: float, look: float, named: bool,
-    gate: float, dead_zone: float, dead_radius: float,
+    work: FloatArray, record: FloatArray, q: float, look: float, cap: float, gate: float, dead_zone: float,
+    dead_radius: float,
 ) -> None:
-    """Let candidate q compete for the measurement in pass B, unless row TAKEN says that its landmark is taken."""
+    """Let candidate q compete for the measurement in pass B, unless row TAKEN says that its landmark is taken.
+
+    D counts no more than `cap`: the gate where the caller names the landmarks.
+    """
     radius2 = dead_radius * dead_radius
     for i in range(LANES):
         distance = record[Q_D + i]
         front = record[Q_HELD + i] > 0.0 and distance < np.inf
-        distance = gate if named and distance > gate else distance
+        distance = cap if distance > cap else distance
         near = front and (distance <= dead_zone or record[Q_METRES2 + i] <= radius2)
         ok = front and distance <= gate and work[TAKEN + i] == 0.0
         work[DEAD + i] = 1.0 if near else work[DEAD + i]
@@ -683,13 +767,17 @@ def _count_explained(work: FloatArray, gate: float) -> None:
 
 
 @lanes
-def _widen_suspects(work: FloatArray, recovery: FloatArray) -> int:
-    """Try the factor T diag(recovery), T the turn by the predicted heading, where enough is unexplained; keep the old.
-
-    Returns:
-        How many lanes try.
-    """
+def _any_suspect(work: FloatArray) -> int:
+    """Return in how many lanes enough is unexplained."""
     count = 0
+    for i in range(LANES):
+        count += 1 if work[CONTRADICT + i] >= MIN_CONTRADICTIONS else 0
+    return count
+
+
+@lanes
+def _widen_suspects(work: FloatArray, recovery: FloatArray) -> None:
+    """Keep the factor C, and where enough is unexplained try T diag(recovery), T the turn by the predicted heading."""
     for i in range(LANES):
         work[KEPT00 + i], work[KEPT01 + i] = work[C00 + i], work[C01 + i]
         work[KEPT10 + i], work[KEPT11 + i] = work[C10 + i], work[C11 + i]
@@ -706,8 +794,6 @@ def _widen_suspects(work: FloatArray, recovery: FloatArray) -> int:
         work[C20 + i] = 0.0 if suspect else work[C20 + i]
         work[C21 + i] = 0.0 if suspect else work[C21 + i]
         work[C22 + i] = recovery[2] if suspect else work[C22 + i]
-        count += 1 if suspect else 0
-    return count
 
 
 @lanes
@@ -840,7 +926,7 @@ def refresh(
 
     One free row is needed: the row that a landmark leaves is taken by the next, while it is still in the cache.
     """
-    padded = counts.shape[1]
+    size = 9 * counts.shape[1]
     for k in range(len(slots)):
         slot = slots[k]
         e = map_of[slot]
@@ -849,39 +935,53 @@ def refresh(
         row = row_of[slot]
         tops[0] -= 1
         target = free_rows[tops[0]]
-        whole = values[row * 9 * padded : (row + 1) * 9 * padded]
-        own = maps[e]
-        for block in range(padded // LANES):
-            first = block * LANES
-            out = values[target * 9 * padded + block * TILE : target * 9 * padded + (block + 1) * TILE]
-            stay = 0
-            for i in range(LANES):
-                stay += 1 if own[first + i] == first + i else 0
-            if stay == LANES:
-                source = whole[block * TILE : (block + 1) * TILE]
-                for j in range(TILE):
-                    out[j] = source[j]
-                for i in range(LANES):
-                    counts[target, first + i] = counts[row, first + i]
-            else:
-                for i in range(LANES):
-                    m = np.int64(own[first + i])
-                    at = (m >> SHIFT) * TILE + (m & (LANES - 1))
-                    out[i] = whole[at]
-                    out[LANES + i] = whole[at + LANES]
-                    out[2 * LANES + i] = whole[at + 2 * LANES]
-                    out[3 * LANES + i] = whole[at + 3 * LANES]
-                    out[4 * LANES + i] = whole[at + 4 * LANES]
-                    out[5 * LANES + i] = whole[at + 5 * LANES]
-                    out[6 * LANES + i] = whole[at + 6 * LANES]
-                    out[7 * LANES + i] = whole[at + 7 * LANES]
-                    out[8 * LANES + i] = whole[at + 8 * LANES]
-                    counts[target, first + i] = counts[row, m]
+        _copy_row(values[row * size : (row + 1) * size], values[target * size : (target + 1) * size], maps[e])
+        for m in range(counts.shape[1]):
+            counts[target, m] = counts[row, maps[e, m]]
         free_rows[tops[0]] = row
         tops[0] += 1
         row_of[slot] = target
         users[e] -= 1
         map_of[slot] = 0
+
+
+@jit
+def carry_odds(slots: IntArray, odds: FloatArray, map_of: IntArray, maps: Int32Array) -> None:
+    """Copy log-odds from where each particle's ancestor left them to its own place; `refresh` does the rest.
+
+    Args:
+        slots: Landmarks that are about to be brought up to date.
+        odds: (slots, P), changed.
+        map_of, maps: As yet of the old places, see `ParticleMaps`.
+    """
+    before = np.empty(odds.shape[1])
+    for k in range(len(slots)):
+        slot = slots[k]
+        if map_of[slot] == 0:
+            continue
+        own = maps[map_of[slot]]
+        for m in range(len(before)):
+            before[m] = odds[slot, own[m]]
+        for m in range(len(before)):
+            odds[slot, m] = before[m]
+
+
+@lanes
+def _copy_row(source: FloatArray, target: FloatArray, ancestors: Int32Array) -> None:
+    """Copy a row, each particle's values from its ancestor's place.
+
+    Most particles are their own ancestors, and memory is fast where it is read and written in order: so first all of
+    the row as it lies, then those that moved.
+    """
+    for j in range(len(target)):
+        target[j] = source[j]
+    for m in range(len(ancestors)):
+        ancestor = np.int64(ancestors[m])
+        if ancestor != m:
+            at = (ancestor >> SHIFT) * TILE + (ancestor & (LANES - 1))
+            to = (m >> SHIFT) * TILE + (m & (LANES - 1))
+            for c in range(9):
+                target[to + c * LANES] = source[at + c * LANES]
 
 
 @lanes_inlined
@@ -929,21 +1029,21 @@ def extent(points: FloatArray) -> tuple[float, float]:
 
 
 @jit
-def to_robot_axes(points: FloatArray, covariances: FloatArray) -> tuple[FloatArray, FloatArray]:
+def to_robot_axes(points: FloatArray, covariances: FloatArray, turned: FloatArray, noises: FloatArray) -> None:
     """Turn points (n, 3) and covariances (n, 3, 3), or none (0, 3, 3), from camera axes to the robot's.
 
-    Returns:
-        (n, 3) relative to the camera centre, x ahead, y left, z up; (n, 6) upper triangles by rows, zeros for none.
+    Args:
+        points, covariances: As measured.
+        turned: (n, 3), written: relative to the camera centre, x ahead, y left, z up.
+        noises: (n, 6), written: upper triangles by rows, zeros for none.
     """
     n = len(points)
-    turned = np.empty((n, 3))
-    noises = np.zeros((n, 6))
     for i in range(n):
         turned[i, 0], turned[i, 1], turned[i, 2] = points[i, 2], -points[i, 0], -points[i, 1]
+        noises[i] = 0.0
     for i in range(len(covariances)):
         noises[i, 0], noises[i, 1], noises[i, 2] = covariances[i, 2, 2], -covariances[i, 2, 0], -covariances[i, 2, 1]
         noises[i, 3], noises[i, 4], noises[i, 5] = covariances[i, 0, 0], covariances[i, 0, 1], covariances[i, 1, 1]
-    return turned, noises
 
 
 @lanes
@@ -1072,12 +1172,13 @@ def find_candidates(
 
 @lanes
 def update_fastslam1(
-    poses: FloatArray, moved: bool, odometry: FloatArray, sigmas: FloatArray, normals: FloatArray,
-    values: FloatArray, counts: Int32Array, row_of: IntArray, map_of: IntArray, maps: Int32Array, users: IntArray,
-    free_rows: IntArray, free_slots: IntArray, tops: IntArray,
-    points: FloatArray, noises: FloatArray, given: bool, camera: FloatArray,
-    starts: IntArray, slots: IntArray, owners: IntArray, same: IntArray, unique: IntArray,
-    named: bool, position_gate: float, log_p0: float, one_to_one: bool,
+    poses: FloatArray, means: FloatArray, covariances: FloatArray, moved: bool, odometry: FloatArray,
+    sigmas: FloatArray, normals: FloatArray,
+    values: FloatArray, counts: Int32Array, odds: FloatArray, row_of: IntArray, map_of: IntArray, maps: Int32Array,
+    users: IntArray, free_rows: IntArray, free_slots: IntArray, tops: IntArray, ids: IntArray, identities: IntArray,
+    stored: Float32Array, heads: Float32Array,
+    points: FloatArray, noises: FloatArray, given: bool, camera: FloatArray, descriptors: Float32Array, names: IntArray,
+    named: bool, descriptor_gate: float, position_gate: float, log_p0: float, one_to_one: bool,
     work: FloatArray, records: FloatArray,
     found: Int32Array, distances: FloatArray, new_slots: IntArray, log_likelihood: FloatArray,
 ) -> None:
@@ -1085,16 +1186,18 @@ def update_fastslam1(
 
     Args:
         poses: (3, P) rows x, y, theta of the particles, padded to P; replaced by the sampled ones if `moved`.
+        means, covariances: (3, P), (6, P), written: the samples themselves, and zeros.
         odometry: (3,) u, previous robot frame.
         sigmas: (3,) standard deviations of u.
         normals: (M, 3) standard normal draws.
-        values, counts, row_of, map_of, maps, users, free_rows, free_slots, tops: The store, see `ParticleMaps`.
+        values, counts, odds, ..., heads: The store, see `ParticleMaps`. B + 1 rows and B slots are free.
         points: (B, 3) measured points relative to the camera centre, robot axes.
         noises: (B, 6) their covariances in robot axes if `given`.
         given: Whether the covariances come with the measurements.
         camera: (7,) focal, baseline, sigma_px, sigma_disparity, mount.
-        starts, slots, owners, same, unique: Candidates, see `find_candidates`.
-        named: Whether the candidate is the landmark by the caller's word, gates aside.
+        descriptors: (B, d).
+        names: (B,) the caller's names of the landmarks measured, if `named`; gates then play no part.
+        descriptor_gate: Largest admitted squared distance E0.
         position_gate: D0.
         log_p0: Log-density of a measurement that starts a new landmark.
         one_to_one: Whether a landmark is matched at most once in a frame.
@@ -1106,10 +1209,17 @@ def update_fastslam1(
     """
     num_particles, padded = normals.shape[0], poses.shape[1]
     num = points.shape[0]
+    starts, slots, _, owners, same, unique = find_candidates(
+        descriptors, stored, heads, ids, names, identities, named, descriptor_gate
+    )
+    if len(odds) > 0:
+        carry_odds(unique, odds, map_of, maps)
     refresh(unique, values, counts, row_of, map_of, maps, users, free_rows, tops)
+    if len(slots) > len(records):
+        records = np.empty((len(slots), CANDIDATE_ROWS * LANES))
     new_rows = np.empty(num, dtype=np.int64)
     match = np.empty((num, LANES))
-    mask = np.empty(LANES)
+    mask, draws = np.empty(LANES), np.zeros(3 * LANES)
     gate = np.inf if named else position_gate
     for b in range(num):
         new_slots[b] = REJECTED
@@ -1117,7 +1227,8 @@ def update_fastslam1(
         first = block * LANES
         real = min(LANES, num_particles - first)
         if moved:
-            _sample_motion(work, poses, first, real, odometry, sigmas, normals)
+            _take_draws(draws, normals, first, real)
+            _sample_motion(work, poses, first, odometry, sigmas, draws)
         _enter_pose(work, poses, first)
         _clear_likelihood(work)
         for b in range(num):
@@ -1133,9 +1244,7 @@ def update_fastslam1(
                     _bar_taken(match[owners[p]], float(p), mask)
                     p = same[p]
                 _innovate(work, tile, points, noises, b, given, camera)
-                if _gate_and_update(work, tile, record, mask, gate) > 0:  # l. 33-37
-                    _add_likelihood(work, record, mask)  # l. 39, from before the update
-                    _record_matches(chosen, seen, float(q), mask)
+                _gate_and_update(work, tile, record, chosen, seen, float(q), mask, gate)  # l. 33-37, 39
             log_clutter = log_p0 + (0.0 if given else 4.0 * math.log(points[b, 0]))
             if _mask_of(chosen, -2.0, mask) > 0:  # l. 28-32
                 if new_slots[b] == REJECTED:
@@ -1152,6 +1261,12 @@ def update_fastslam1(
             )
         for i in range(LANES):
             log_likelihood[first + i] += _log_likelihood(work, i)
+        for i in range(LANES):
+            for c in range(3):
+                means[c, first + i] = poses[c, first + i]
+            for c in range(6):
+                covariances[c, first + i] = 0.0
+    name_new(new_slots, descriptors, names, named, ids, identities, stored, heads, tops)
 
 
 @lanes
@@ -1165,14 +1280,6 @@ def _admit(chosen: FloatArray, seen: Int32Array, mask: FloatArray) -> None:
 def _bar_taken(earlier: FloatArray, p: float, mask: FloatArray) -> None:
     for i in range(len(earlier)):
         mask[i] = 0.0 if earlier[i] == p else mask[i]
-
-
-@lanes
-def _record_matches(chosen: FloatArray, seen: Int32Array, q: float, mask: FloatArray) -> None:
-    for i in range(len(chosen)):
-        on = mask[i] > 0.0
-        chosen[i] = q if on else chosen[i]
-        seen[i] += np.int32(1) if on else np.int32(0)
 
 
 @lanes
@@ -1234,19 +1341,26 @@ def _enter_pose(work: FloatArray, poses: FloatArray, first: int) -> None:
 
 
 @lanes
+def _take_draws(draws: FloatArray, normals: FloatArray, first: int, real: int) -> None:
+    """Write a block's rows of normal draws (M, 3) as (3 LANES,); surplus lanes keep theirs."""
+    for i in range(real):
+        for c in range(3):
+            draws[c * LANES + i] = normals[first + i, c]
+
+
+@lanes
 def _sample_motion(
-    work: FloatArray, poses: FloatArray, first: int, real: int, odometry: FloatArray, sigmas: FloatArray,
-    normals: FloatArray,
+    work: FloatArray, poses: FloatArray, first: int, odometry: FloatArray, sigmas: FloatArray, draws: FloatArray
 ) -> None:
     """Replace poses by draws from p(x_t | x_{t-1}, u_t), each particle from its own past (Eq. 4)."""
     _enter_pose(work, poses, first)
-    for i in range(real):
-        dx = odometry[0] + normals[first + i, 0] * sigmas[0]
-        dy = odometry[1] + normals[first + i, 1] * sigmas[1]
+    for i in range(LANES):
+        dx = odometry[0] + draws[i] * sigmas[0]
+        dy = odometry[1] + draws[LANES + i] * sigmas[1]
         c, s = work[COS + i], work[SIN + i]
-        poses[0, first + i] += c * dx - s * dy
-        poses[1, first + i] += s * dx + c * dy
-        poses[2, first + i] = _wrap(work[T + i] + odometry[2] + normals[first + i, 2] * sigmas[2])
+        poses[0, first + i] = work[X + i] + (c * dx - s * dy)
+        poses[1, first + i] = work[Y + i] + (s * dx + c * dy)
+        poses[2, first + i] = _wrap(work[T + i] + odometry[2] + draws[2 * LANES + i] * sigmas[2])
 
 
 @lanes
@@ -1263,8 +1377,7 @@ def move_blind(
         work: Working space.
     """
     num_particles = normals.shape[0]
-    mean = np.empty(3 * LANES)
-    covariance = np.empty(6 * LANES)
+    mean, covariance, draws = np.empty(3 * LANES), np.empty(6 * LANES), np.zeros(3 * LANES)
     for block in range(poses.shape[1] // LANES):
         first = block * LANES
         real = min(LANES, num_particles - first)
@@ -1276,7 +1389,8 @@ def move_blind(
             covariances[0, first + i], covariances[1, first + i] = work[N00 + i], work[N01 + i]
             covariances[2, first + i], covariances[3, first + i] = work[N02 + i], work[N11 + i]
             covariances[4, first + i], covariances[5, first + i] = work[N12 + i], work[N22 + i]
-        _sample_motion(work, poses, first, real, odometry, sigmas, normals)
+        _take_draws(draws, normals, first, real)
+        _sample_motion(work, poses, first, odometry, sigmas, draws)
 
 
 @lanes
@@ -1296,11 +1410,12 @@ def _prior(
 def update_fastslam2(
     poses: FloatArray, means: FloatArray, covariances: FloatArray, blind: bool,
     odometry: FloatArray, sigmas: FloatArray, normals: FloatArray,
-    values: FloatArray, counts: Int32Array, row_of: IntArray, map_of: IntArray, maps: Int32Array, users: IntArray,
-    free_rows: IntArray, free_slots: IntArray, tops: IntArray,
-    points: FloatArray, noises: FloatArray, given: bool, camera: FloatArray,
-    starts: IntArray, slots: IntArray, looks: FloatArray, owners: IntArray, same: IntArray,
-    unique: IntArray, named: bool, position_gate: float, dead_zone: float, dead_radius: float, ambiguity: float,
+    values: FloatArray, counts: Int32Array, odds: FloatArray, row_of: IntArray, map_of: IntArray, maps: Int32Array,
+    users: IntArray, free_rows: IntArray, free_slots: IntArray, tops: IntArray, ids: IntArray, identities: IntArray,
+    stored: Float32Array, heads: Float32Array,
+    points: FloatArray, noises: FloatArray, given: bool, camera: FloatArray, descriptors: Float32Array, names: IntArray,
+    named: bool, descriptor_gate: float, descriptor_variance: float, position_gate: float, dead_zone: float,
+    dead_radius: float, ambiguity: float,
     recovery: FloatArray, log_p0: float, one_to_one: bool,
     work: FloatArray, records: FloatArray,
     found: Int32Array, distances: FloatArray, new_slots: IntArray, log_likelihood: FloatArray,
@@ -1316,7 +1431,7 @@ def update_fastslam2(
         poses: (3, P), the samples before the motion; replaced by the sampled ones.
         means, covariances: (3, P), (6, P), written: N(x^, P^) of each particle before sampling; read if `blind`.
         blind: Whether the robot has not been sampled at a sighting since N(x^, P^) was propagated.
-        looks: (q,) what each candidate's descriptor adds to its cost.
+        descriptor_variance: What squared distances between descriptors are divided by, to be weighed against D.
         dead_zone: Between `position_gate` and this D a measurement is neither matched nor new.
         dead_radius: Nor is it new this near to a landmark that looks like it [m].
         ambiguity: A runner-up within this cost makes a measurement ambiguous: it is held back.
@@ -1324,12 +1439,22 @@ def update_fastslam2(
         The others are as in `update_fastslam1`; rejected measurements are found at -1.
     """
     num_particles, padded = normals.shape[0], poses.shape[1]
-    num, total = points.shape[0], len(slots)
+    num = points.shape[0]
+    starts, slots, looks, owners, same, unique = find_candidates(
+        descriptors, stored, heads, ids, names, identities, named, descriptor_gate
+    )
+    for q in range(len(looks)):
+        looks[q] /= descriptor_variance
+    if len(odds) > 0:
+        carry_odds(unique, odds, map_of, maps)
     refresh(unique, values, counts, row_of, map_of, maps, users, free_rows, tops)
+    if len(slots) > len(records):
+        records = np.empty((len(slots), CANDIDATE_ROWS * LANES))
     new_rows = np.empty(num, dtype=np.int64)
     log_clutter = np.empty(num)
     match = np.empty((num, LANES))
     mask, young, before = np.empty(LANES), np.empty(LANES), np.empty(TILE)
+    reach, cap = (FARTHEST, position_gate) if named else (position_gate, FARTHEST)
     mean, covariance, draws, out = np.empty(3 * LANES), np.empty(6 * LANES), np.zeros(3 * LANES), np.empty(12 * LANES)
     for b in range(num):
         new_slots[b] = REJECTED
@@ -1338,65 +1463,37 @@ def update_fastslam2(
         first = block * LANES
         real = min(LANES, num_particles - first)
         _prior(poses, means, covariances, blind, first, mean, covariance)
-        for i in range(real):
-            for c in range(3):
-                draws[c * LANES + i] = normals[first + i, c]
+        _take_draws(draws, normals, first, real)
         _predict(work, mean, covariance, odometry, sigmas)
         _begin_pose(work)
         _place(work)
         _clear_likelihood(work)
 
         # Pass A: refine the pose with what is beyond doubt.
-        for q in range(total):
-            row = row_of[slots[q]]
-            tile = _tile(values, padded, row, block)
-            _mark_held(records[q], counts[row, first : first + LANES])
-            _innovate(work, tile, points, noises, owners[q], given, camera)
-            _evaluate(work, tile, records[q])
-        if recovery[0] > 0.0:
+        _match_first(
+            work, records, match, mask, values, counts, row_of, block, points, noises, given, camera,
+            starts, slots, looks, owners, same, named, position_gate, ambiguity, one_to_one,
+        )
+        if recovery[0] > 0.0 and _any_suspect(work) > 0:
+            _widen_suspects(work, recovery)
             _begin_judging(work)
             for b in range(num):
                 for q in range(starts[b], starts[b + 1]):
+                    row = row_of[slots[q]]
+                    tile = _tile(values, padded, row, block)
+                    if starts[b + 1] - starts[b] > 1 or not (same[q] < 0 or not one_to_one):
+                        _keep_distance(records[q])
+                    _mark_held(records[q], counts[row, first : first + LANES])
+                    _innovate(work, tile, points, noises, b, given, camera)
+                    _evaluate(work, tile, records[q], False)
                     _nearest(work, records[q], q == starts[b])
                 if starts[b] < starts[b + 1]:
-                    _count_unexplained(work, position_gate)
-            if _widen_suspects(work, recovery) > 0:
-                for q in range(total):
-                    _keep_distance(records[q])
-                    tile = _tile(values, padded, row_of[slots[q]], block)
-                    _innovate(work, tile, points, noises, owners[q], given, camera)
-                    _evaluate(work, tile, records[q])
-                _begin_judging(work)
-                for b in range(num):
-                    for q in range(starts[b], starts[b + 1]):
-                        _nearest(work, records[q], q == starts[b])
-                    if starts[b] < starts[b + 1]:
-                        _count_explained(work, position_gate)
-                if _acquit(work) > 0:
-                    for q in range(total):
-                        tile = _tile(values, padded, row_of[slots[q]], block)
-                        _innovate(work, tile, points, noises, owners[q], given, camera)
-                        _evaluate(work, tile, records[q])
-        _clear_sums(work)
-        for b in range(num):
-            low, high = starts[b], starts[b + 1]
-            if high - low == 1 and (same[low] < 0 or not one_to_one):
-                if _match_alone(records[low], match[b], float(low), named, position_gate, mask) > 0:
-                    _sum_matches(work, records[low], mask)
-            else:
-                _begin_choice(work)
-                for q in range(low, high):
-                    _consider(work, records[q], float(q), looks[q], named, position_gate)
-                _end_choice(work, match[b], ambiguity)
-                for q in range(low, high):
-                    p = same[q] if one_to_one else REJECTED
-                    while p >= 0:
-                        _drop_taken(match[b], float(q), match[owners[p]], float(p))
-                        p = same[p]
-                    if _robust_weights(records[q], match[b], float(q), position_gate, mask) > 0:
-                        _sum_matches(work, records[q], mask)
-            for q in range(low, high):
-                _keep_distance(records[q])
+                    _count_explained(work, position_gate)
+            _acquit(work)
+            _match_first(
+                work, records, match, mask, values, counts, row_of, block, points, noises, given, camera,
+                starts, slots, looks, owners, same, named, position_gate, ambiguity, one_to_one,
+            )
         _step_pose(work, False)
         if _any_wide(work) > 0:  # a wide prior is a long way for one iteration
             for _ in range(3):
@@ -1407,35 +1504,29 @@ def update_fastslam2(
                         if _mask_of(match[b], float(q), mask) > 0:
                             tile = _tile(values, padded, row_of[slots[q]], block)
                             _innovate(work, tile, points, noises, b, given, camera)
-                            _evaluate(work, tile, records[q])
+                            _evaluate(work, tile, records[q], True)
                             _robust_weights(records[q], match[b], float(q), position_gate, mask)
                             _sum_matches(work, records[q], mask)
                 _step_pose(work, True)
         _place(work)
 
         # Pass B: decide at the refined pose.
-        for q in range(total):
-            tile = _tile(values, padded, row_of[slots[q]], block)
-            _innovate(work, tile, points, noises, owners[q], given, camera)
-            _evaluate(work, tile, records[q])
         _clear_sums(work)
         for b in range(num):
             low, high = starts[b], starts[b + 1]
             if high - low == 1:
+                row = row_of[slots[low]]
+                tile = _tile(values, padded, row, block)
                 p = same[low] if one_to_one else REJECTED
-                taken = p >= 0
-                if taken:
-                    _clear_taken(work)
+                _clear_taken(work)
                 while p >= 0:
                     _mark_taken(work, match[owners[p]], float(p))
                     p = same[p]
-                matched = _decide_alone(
-                    work, records[low], match[b], float(low), named, taken,
-                    position_gate, dead_zone, dead_radius, log_clutter[b], mask,
+                _innovate(work, tile, points, noises, b, given, camera)
+                _decide_alone(
+                    work, tile, counts[row, first : first + LANES], match[b], float(low), reach,
+                    FARTHEST if named else dead_zone, dead_radius, log_clutter[b],
                 )
-                if matched > 0:
-                    _sum_matches(work, records[low], mask)
-                    _add_likelihood(work, records[low], mask)
             else:
                 _begin_choice(work)
                 for q in range(low, high):
@@ -1444,8 +1535,11 @@ def update_fastslam2(
                     while p >= 0:
                         _mark_taken(work, match[owners[p]], float(p))
                         p = same[p]
+                    tile = _tile(values, padded, row_of[slots[q]], block)
+                    _innovate(work, tile, points, noises, b, given, camera)
+                    _evaluate(work, tile, records[q], True)
                     _consider_again(
-                        work, records[q], float(q), looks[q], named, position_gate, dead_zone, dead_radius
+                        work, records[q], float(q), looks[q], cap, position_gate, dead_zone, dead_radius
                     )
                 _decide(work, match[b], ambiguity, log_clutter[b])
                 for q in range(low, high):
@@ -1476,10 +1570,10 @@ def update_fastslam2(
                     _innovate(work, tile, points, noises, b, given, camera)
                     if num_young > 0:
                         before[:] = tile
-                        _gate_and_update(work, tile, records[q], young, np.inf)
+                        _update(work, tile, young)
                         _innovate(work, tile, points, noises, b, given, camera)
                         _relinearise(work, tile, before)
-                    _gate_and_update(work, tile, records[q], mask, np.inf)
+                    _update(work, tile, mask)
             if _mask_of(match[b], -2.0, mask) > 0:
                 if new_slots[b] == REJECTED:
                     _open_slot(b, new_slots, new_rows, row_of, map_of, values, counts, free_rows, free_slots, tops)
@@ -1491,6 +1585,52 @@ def update_fastslam2(
                 found[b, first : first + LANES], distances[b, first : first + LANES], match[b], starts[b],
                 starts[b + 1], slots, records, True, new_slots[b],
             )
+    name_new(new_slots, descriptors, names, named, ids, identities, stored, heads, tops)
+
+
+@lanes
+def _match_first(
+    work: FloatArray, records: FloatArray, match: FloatArray, mask: FloatArray, values: FloatArray, counts: Int32Array,
+    row_of: IntArray, block: int, points: FloatArray, noises: FloatArray, given: bool, camera: FloatArray,
+    starts: IntArray, slots: IntArray, looks: FloatArray, owners: IntArray, same: IntArray, named: bool,
+    position_gate: float, ambiguity: float, one_to_one: bool,
+) -> None:
+    """Pass A for one block: match at the predicted pose what is beyond doubt, sum it, and count what is unexplained."""
+    padded, first = counts.shape[1], block * LANES
+    reach = FARTHEST if named else position_gate
+    _clear_sums(work)
+    _begin_judging(work)
+    for b in range(len(starts) - 1):
+        low, high = starts[b], starts[b + 1]
+        if high - low == 1 and (same[low] < 0 or not one_to_one):
+            row = row_of[slots[low]]
+            tile = _tile(values, padded, row, block)
+            _innovate(work, tile, points, noises, b, given, camera)
+            _match_alone(
+                work, tile, records[low], counts[row, first : first + LANES], match[b], float(low), reach, position_gate
+            )
+            continue
+        _begin_choice(work)
+        for q in range(low, high):
+            row = row_of[slots[q]]
+            tile = _tile(values, padded, row, block)
+            _mark_held(records[q], counts[row, first : first + LANES])
+            _innovate(work, tile, points, noises, b, given, camera)
+            _evaluate(work, tile, records[q], False)
+            _consider(work, records[q], float(q), looks[q], reach)
+        _end_choice(work, match[b], ambiguity)
+        for q in range(low, high):
+            p = same[q] if one_to_one else REJECTED
+            while p >= 0:
+                _drop_taken(match[b], float(q), match[owners[p]], float(p))
+                p = same[p]
+            if _robust_weights(records[q], match[b], float(q), position_gate, mask) > 0:
+                _sum_matches(work, records[q], mask)
+            _keep_distance(records[q])
+        for q in range(low, high):  # the choice is made: rows BEST and CHOSEN are free
+            _nearest(work, records[q], q == low)
+        if low < high:
+            _count_unexplained(work, position_gate)
 
 
 @lanes
@@ -1545,8 +1685,10 @@ def weigh(
 
 
 @lanes
-def mixture(means: FloatArray, covariances: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return mean (3,) and covariance (3, 3) of a weighted mixture of Gaussian poses.
+def mixture(
+    means: FloatArray, covariances: FloatArray, weights: FloatArray, mean: FloatArray, covariance: FloatArray
+) -> None:
+    """Write mean (3,) and covariance (3, 3) of a weighted mixture of Gaussian poses.
 
     Args:
         means: (3, P), headings averaged on the circle.
@@ -1566,8 +1708,8 @@ def mixture(means: FloatArray, covariances: FloatArray, weights: FloatArray) -> 
             sums[1, i] += w[i] * means[1, first + i]
             sums[2, i] += w[i] * sine
             sums[3, i] += w[i] * cosine
-    mean = np.array([sums[0].sum(), sums[1].sum(), math.atan2(sums[2].sum(), sums[3].sum())])
-    mean[2] = _wrap(mean[2])
+    mean[0], mean[1] = sums[0].sum(), sums[1].sum()
+    mean[2] = _wrap(math.atan2(sums[2].sum(), sums[3].sum()))
     spread = np.zeros((6, LANES))
     for first in range(0, m, LANES):
         real = min(LANES, m - first)
@@ -1582,14 +1724,12 @@ def mixture(means: FloatArray, covariances: FloatArray, weights: FloatArray) -> 
             spread[3, i] += w[i] * (y * y + covariances[3, first + i])
             spread[4, i] += w[i] * (y * t + covariances[4, first + i])
             spread[5, i] += w[i] * (t * t + covariances[5, first + i])
-    covariance = np.empty((3, 3))
     covariance[0, 0] = spread[0].sum()
     covariance[0, 1] = covariance[1, 0] = spread[1].sum()
     covariance[0, 2] = covariance[2, 0] = spread[2].sum()
     covariance[1, 1] = spread[3].sum()
     covariance[1, 2] = covariance[2, 1] = spread[4].sum()
     covariance[2, 2] = spread[5].sum()
-    return mean, covariance
 
 
 @jit
@@ -1620,8 +1760,9 @@ def name_new(
 
 @jit
 def summarise(
-    found: Int32Array, distances: FloatArray, new_slots: IntArray, keep: IntArray, size: int, best: int, ids: IntArray
-) -> tuple[IntArray, IntArray, int, int, int, float, int]:
+    found: Int32Array, distances: FloatArray, new_slots: IntArray, keep: IntArray, best: int, ids: IntArray,
+    associations: IntArray, created: IntArray,
+) -> tuple[int, int, float, int]:
     """Tell what became of one robot's measurements.
 
     Args:
@@ -1629,17 +1770,17 @@ def summarise(
         distances: (n, P) squared distances of matches.
         new_slots: (n,) slots of the landmarks that were started, -1 = none.
         keep: (n,) which of the caller's measurements were used.
-        size: How many the caller gave.
         best: The most probable particle.
         ids: (slots,) stable names.
+        associations: Written: the id to which the most probable particle gave each measurement, -1 = rejected.
+        created: Written: the id of the landmark that each measurement created in any particle, -1 = none.
 
     Returns:
-        The id to which the most probable particle gave each measurement (size,), -1 = rejected; the id of the landmark
-        that it created in any particle (size,), -1 = none; how many the most probable particle started, matched and
-        rejected; and the sum and number of its squared distances, without what it predicted behind the camera.
+        How many the most probable particle started and matched, and the sum and number of its squared distances,
+        without what it predicted behind the camera.
     """
-    associations = np.full(size, REJECTED, dtype=np.int64)
-    created = np.full(size, REJECTED, dtype=np.int64)
+    associations[:] = REJECTED
+    created[:] = REJECTED
     num_new, num_matched, squares, judged = 0, 0, 0.0, 0
     for b in range(len(keep)):
         slot = found[b, best]
@@ -1655,7 +1796,7 @@ def summarise(
             if distances[b, best] < np.inf:
                 squares += distances[b, best]
                 judged += 1
-    return associations, created, num_new, num_matched, size - num_new - num_matched, squares, judged
+    return num_new, num_matched, squares, judged
 
 
 # ------------------------------------------------------------------------------------------- lazy resampling

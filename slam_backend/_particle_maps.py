@@ -191,7 +191,7 @@ class ParticleMaps:
     def carry_odds(self, slots: IntArray) -> None:
         """Bring the log-odds of slots up to date, just before a kernel does so with all else that they hold."""
         if self.log_odds_prior is not None:
-            _existence_kernels.carry_odds(slots, self.odds, self.map_of, self.maps)
+            _kernels.carry_odds(slots, self.odds, self.map_of, self.maps)
 
     def start_odds(self, new_slots: IntArray) -> None:
         """Give landmarks that were just started their prior; -1 among `new_slots` stands for none."""

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from slam_backend import _kernels
 from slam_backend._existence_step import ExistenceStep
-from slam_backend._frame_buffers import UPPER, Candidates, FrameBuffers, Turn
+from slam_backend._frame_buffers import UPPER, FrameBuffers, Turn
 from slam_backend._particle_maps import ParticleMaps, aligned
 from slam_backend._step_input import check_step
 from slam_backend.adaptation import AdaptiveParticles, next_num_particles
@@ -368,64 +368,44 @@ class FastSlam:
             else:
                 means[:], covariances[:] = poses, 0.0
             return used
-        candidates = self._candidates(used)
         if num:
             maps.make_room(num, used.descriptors.shape[1])
-        buffers.make_room(len(candidates.slots))
-        maps.carry_odds(candidates.unique)
-        starts, slots, squares, owners, same, unique = candidates
         named = used.names is not None
         store = (
-            maps.values, maps.counts, maps.row_of, maps.map_of, maps.maps, maps.users,
-            maps.free_rows, maps.free_slots, maps.tops,
+            maps.values, maps.counts, maps.odds, maps.row_of, maps.map_of, maps.maps, maps.users,
+            maps.free_rows, maps.free_slots, maps.tops, maps.ids, maps.identities, maps.descriptors, maps.heads,
         )  # fmt: skip
-        readings = (used.points, used.noises, used.given, self._camera)
+        names = NO_NAMES if used.names is None else used.names
+        readings = (used.points, used.noises, used.given, self._camera, used.descriptors, names, named)
         results = (buffers.work, buffers.records, used.found, used.distances, used.new_slots, buffers.log_likelihood)
-        arguments: tuple[Any, ...]
         if options.proposal == "fastslam1":
-            arguments = (
-                poses, exact is None, move, sigmas, normals, *store, *readings, starts, slots, owners, same, unique,
-                named, options.position_gate, self._log_p0, options.one_to_one, *results,
+            _kernels.update_fastslam1(
+                poses, means, covariances, exact is None, move, sigmas, normals, *store, *readings,
+                options.descriptor_gate**2, options.position_gate, self._log_p0, options.one_to_one, *results,
             )  # fmt: skip
-            _kernels.update_fastslam1(*arguments)
-            means[:], covariances[:] = poses, 0.0
         else:
-            arguments = (
+            _kernels.update_fastslam2(
                 poses, means, covariances, blind, move, sigmas, normals, *store, *readings,
-                starts, slots, squares / options.descriptor_sigma**2, owners, same, unique,
-                named, options.position_gate, options.dead_zone, options.dead_radius, options.ambiguity,
-                NOTHING if exact is not None else self._recovery, self._log_p0, options.one_to_one, *results,
+                options.descriptor_gate**2, options.descriptor_sigma**2, options.position_gate, options.dead_zone,
+                options.dead_radius, options.ambiguity, NOTHING if exact is not None else self._recovery,
+                self._log_p0, options.one_to_one, *results,
             )  # fmt: skip
-            _kernels.update_fastslam2(*arguments)
             self._blind[robot] = False
-        _kernels.name_new(
-            used.new_slots, used.descriptors, NO_NAMES if used.names is None else used.names, used.names is not None,
-            maps.ids, maps.identities, maps.descriptors, maps.heads, maps.tops,
-        )  # fmt: skip
         return used
-
-    def _candidates(self, used: Turn) -> Candidates:
-        """Return per measurement the slots that may have caused it: by the caller's names, else within E0."""
-        maps = self._maps
-        found = _kernels.find_candidates(
-            used.descriptors, maps.descriptors, maps.heads, maps.ids, NO_NAMES if used.names is None else used.names,
-            maps.identities, used.names is not None, self.options.descriptor_gate**2,
-        )  # fmt: skip
-        return Candidates(*found)
 
     def _report(self, turns: list[Turn], ess: float, resampled: bool) -> StepReport:
         best, ids = self.best_particle, self._maps.ids
         associations, created = [], []
         num_new, num_matched, num_rejected, total, num_judged = 0, 0, 0, 0.0, 0
         for turn in turns:
-            given_to, made, new, matched, rejected, squares, judged = _kernels.summarise(
-                turn.found, turn.distances, turn.new_slots, turn.keep, turn.size, best, ids
+            associations.append(np.empty(turn.size, dtype=np.int64))
+            created.append(np.empty(turn.size, dtype=np.int64))
+            new, matched, squares, judged = _kernels.summarise(
+                turn.found, turn.distances, turn.new_slots, turn.keep, best, ids, associations[-1], created[-1]
             )
-            associations.append(given_to)
-            created.append(made)
             num_new += new
             num_matched += matched
-            num_rejected += rejected
+            num_rejected += turn.size - new - matched
             total += squares
             num_judged += judged
         return StepReport(
@@ -525,4 +505,6 @@ def _copies(estimates: Sequence[PoseEstimate]) -> tuple[PoseEstimate, ...]:
 
 def _mixture(means: FloatArray, covariances: FloatArray, weights: FloatArray) -> PoseEstimate:
     """Return mean and covariance of a weighted mixture of Gaussian poses: means (3, P), covariances (6, P)."""
-    return PoseEstimate(*_kernels.mixture(means, covariances, weights))
+    mean, covariance = np.empty(3), np.empty((3, 3))
+    _kernels.mixture(means, covariances, weights, mean, covariance)
+    return PoseEstimate(mean, covariance)

@@ -37,7 +37,7 @@ class OdometryModel:
 
     def sigmas(self, odometry: FloatArray) -> FloatArray:
         """Return the standard deviations (3,) [m, m, rad] of an odometry reading (3,) [m, m, rad]."""
-        dx, dy, turn = (float(u) for u in odometry)
+        dx, dy, turn = odometry.tolist()
         distance = math.hypot(dx, dy)
         return np.array(
             [
