@@ -21,8 +21,8 @@ class MergeOptions:
             undone so long; then its snapshot is freed. 0: merges are final.
         watch_every: In so many steps the evidence is weighed once.
         barred_steps: After an undo the two sides do not try again for so long.
-        max_agreement: A merge is undone if another motion between what either side alone has seen is believed, and
-            the landmarks by which the merge has proved itself since are at most this times that motion's inliers [-].
+        max_moved: A merge is undone if a larger share of the landmarks of either side have left their places among
+            each other [-].
     """
 
     method: Literal["particles", "mixture"] = "particles"
@@ -30,7 +30,7 @@ class MergeOptions:
     watch_steps: int = 200
     watch_every: int = 10
     barred_steps: int = 200
-    max_agreement: float = 0.5
+    max_moved: float = 0.2
 
     def __post_init__(self) -> None:
         check_choice("merging.method", self.method, METHODS)
@@ -39,4 +39,4 @@ class MergeOptions:
         check_int("merging.watch_steps", self.watch_steps, 0, "Use 0 to make merges final.")
         check_int("merging.watch_every", self.watch_every, 1, "Weigh the evidence at every step or less often.")
         check_int("merging.barred_steps", self.barred_steps, 0, "Use 0 to let them try at once.")
-        check_float("merging.max_agreement", self.max_agreement, "Give a share.", at_least=0.0, at_most=1.0)
+        check_float("merging.max_moved", self.max_moved, "Give a share.", at_least=0.0, at_most=1.0)

@@ -332,7 +332,8 @@ class TeamSlam:
             new_ids = dict(renamed.tolist())
             older = [*(w.copy() for w in a.watches), *(w.copy(new_ids) for w in b.watches)]
             sides = (Side(a.get_state()), Side(b.get_state()))
-            fresh = begin_watch(number, alignment, *sides, ids_a, renamed, pairs)
+            before = (a.filter.map("mixture"), b.filter.map("mixture"))
+            fresh = begin_watch(number, alignment, sides, before, renamed, pairs)
             trunk.watches = [*sorted(older, key=lambda watch: watch.number), fresh]
         renaming = Renaming(a.robots, b.robots, renamed, (a.number, b.number, number))
         self._records.entries.append(renaming)
@@ -365,7 +366,7 @@ class TeamSlam:
             above = [newer for newer in trunk.watches if newer.number > watch.number]
             if joint is None or not all(newer.together(trunk.live) for newer in above):
                 continue
-            if watch.contradiction(joint, self._merging, self._alignment) is not None:
+            if watch.is_contradicted(joint, self._merging, self._alignment):
                 return watch
         return None
 

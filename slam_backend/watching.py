@@ -1,12 +1,15 @@
 """`Watch`: after a merge the team gathers evidence of whether it was right, and keeps what it takes to undo it.
 
-Descriptors make the filter's gates blind to a false merge: a robot goes on matching its own landmarks, which moved
-along with it, and takes those of the other side for new ones. The contradiction shows in what is NOT matched. A
-landmark that one side alone has measured, and one that the other side alone has measured, cannot be the same if the
-merge is right, for then both would have been matched to one. So the landmarks of one side alone are aligned with those
-of the other side alone, by the same strict test that every merge has to pass: innovations in Mahalanobis units against
-the chi-square gate, and consensus. If another motion than the one in force (0.5 m or 5 degrees off) passes it, with
-more than twice as many inliers as there are landmarks by which the merge has proved itself since, the merge is undone.
+A false merge hardly shows in the innovations of single measurements: descriptors tell landmarks apart, so that a robot
+goes on matching its own, and a filter that has to make two maps agree bends both. So two things are watched.
+
+*Shape.* Either side's map from before the merge is laid over the joint map as it is now, by the rigid motion that most
+landmarks agree on, and each landmark's innovation d^2 = r^T S^-1 r is held against its chi-square gate (99 %; S is
+the sum of both covariances and the floor that alignments have). What the other side knew can only move a landmark
+within its own uncertainty, so that beyond the gate lies next to nothing; where maps are bent to agree, much does.
+
+*Place.* Landmarks that either side found for itself are aligned with each other, by the test that every merge has to
+pass. If they are seen to fit by another motion than the one in force (0.5 m or 5 degrees off), the merge was wrong.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,10 +20,12 @@ import numpy as np
 
 from slam_backend.alignment import RIVAL_ANGLE, RIVAL_DISTANCE, Alignment, AlignmentOptions, align_maps
 from slam_backend.errors import FloatArray, IntArray
-from slam_backend.geometry import transform_points
+from slam_backend.geometry import rotate_covariances, rotation, transform_points
 from slam_backend.landmark_map import LandmarkMap
 from slam_backend.merge_options import MergeOptions
 from slam_backend.reports import StepReport
+
+FITS = 10  # rounds of fitting a rigid motion to the landmarks within the gate
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,71 +53,90 @@ class Side:
 
 @dataclass(slots=True, eq=False)
 class Watch:
-    """The evidence about one merge.
+    """The evidence about one merge. Landmarks bear their names in the joint map.
 
     Attributes:
         number: Of the joint map when it was made; it names the merge.
         alignment: By which the sides were merged.
         sides: As they were before.
-        seen: Landmarks (ids in the joint map) that each side has measured, before or since the merge.
-        fused: Those that the merge itself took for common; they prove nothing.
+        before: Each side's map just before the merge, in its own frame, with mixture covariances.
+        own: Landmarks that each side found for itself, before the merge or since, without those that the merge took
+            for common.
         steps: In which robots of both sides were in contact since.
     """
 
     number: int
     alignment: Alignment
     sides: tuple[Side, Side]
-    seen: tuple[set[int], set[int]]
-    fused: frozenset[int]
+    before: tuple[LandmarkMap, LandmarkMap]
+    own: tuple[set[int], set[int]]
     steps: int = field(default=0)
 
     def copy(self, new_ids: Mapping[int, int] | None = None) -> "Watch":
-        """Return a watch that goes on by itself, with landmarks renamed; snapshots are shared."""
-
-        def renamed(ids: set[int] | frozenset[int]) -> set[int]:
-            return set(ids) if new_ids is None else {new_ids[name] for name in ids if name in new_ids}
-
-        seen = (renamed(self.seen[0]), renamed(self.seen[1]))
-        return Watch(self.number, self.alignment, self.sides, seen, frozenset(renamed(self.fused)), self.steps)
+        """Return a watch that goes on by itself, with landmarks renamed if need be; what does not change is shared."""
+        before, own = self.before, (set(self.own[0]), set(self.own[1]))
+        if new_ids is not None:
+            before = (renamed_map(before[0], new_ids), renamed_map(before[1], new_ids))
+            own = ({new_ids[i] for i in own[0] if i in new_ids}, {new_ids[i] for i in own[1] if i in new_ids})
+        return Watch(self.number, self.alignment, self.sides, before, own, self.steps)
 
     def note(self, robots: Sequence[int], report: StepReport) -> None:
-        """Note which side has measured which landmarks, from a step of the joint filter of `robots`."""
-        for robot, ids in zip(robots, report.associations, strict=True):
+        """Note which side has found which landmarks, from a step of the joint filter of `robots`."""
+        for robot, ids in zip(robots, report.created, strict=True):
             if len(ids):
-                self.seen[robot not in self.sides[0].robots].update(ids[ids >= 0].tolist())
-
-    @property
-    def agreement(self) -> int:
-        """Landmarks that both sides have measured, without those that the merge itself took for common."""
-        return len((self.seen[0] & self.seen[1]) - self.fused)
+                self.own[robot not in self.sides[0].robots].update(ids[ids >= 0].tolist())
 
     def together(self, live: Sequence[int]) -> bool:
         """Tell whether robots of both sides are among those that go by the joint filter."""
         return all(any(robot in side.robots for robot in live) for side in self.sides)
 
-    def contradiction(self, joint: LandmarkMap, merging: MergeOptions, options: AlignmentOptions) -> Alignment | None:
-        """Return another motion between the sides than the one in force, if the evidence for it is better.
-
-        Args:
-            joint: The joint map with mixture covariances.
-            merging: How much better.
-            options: When an alignment is believed.
-
-        Returns:
-            Where b's landmarks should lie, seen from where they lie now; None: nothing contradicts the merge.
-        """
+    def is_contradicted(self, joint: LandmarkMap, merging: MergeOptions, options: AlignmentOptions) -> bool:
+        """Tell whether the joint map, with mixture covariances, contradicts the merge by its shape or by its places."""
+        if any(moved_share(old, joint, options) > merging.max_moved for old in self.before):
+            return True
         ids = joint.ids.tolist()
-        alone = [
-            np.array([name in own and name not in other for name in ids], dtype=np.bool_)
-            for own, other in (self.seen, self.seen[::-1])
-        ]
-        maps = [joint.subset(np.flatnonzero(rows)) for rows in alone]
-        if min(len(part) for part in maps) < options.min_inliers:
-            return None
-        rival = align_maps(maps[0], maps[1], options=options)
-        if not rival.success or self.agreement > merging.max_agreement * len(rival.inliers):
-            return None
-        return rival if differs(rival.transform, maps[1].means[rival.inliers[:, 1]]) else None
+        parts = [joint.subset(np.flatnonzero([name in own for name in ids])) for own in self.own]
+        if min(len(part) for part in parts) < options.min_inliers:
+            return False
+        rival = align_maps(parts[0], parts[1], options=options)
+        return rival.success and differs(rival.transform, parts[1].means[rival.inliers[:, 1]])
+
+
+def moved_share(old: LandmarkMap, joint: LandmarkMap, options: AlignmentOptions) -> float:
+    """Return the share of a map's landmarks that have left their places among each other.
+
+    Args:
+        old: The map as it was, in any planar frame.
+        joint: The map that holds it now; landmarks are found by their ids.
+        options: `position_gate` and `position_floor` of the innovations; with fewer than `min_inliers` landmarks left
+            the share is 0.
+
+    Returns:
+        In [0, 1]: of the landmarks that both maps hold, those beyond the gate at the rigid motion on which most agree.
+    """
+    _, rows, places = np.intersect1d(old.ids, joint.ids, return_indices=True)
+    if len(rows) < options.min_inliers:
+        return 0.0
+    points, targets = old.means[rows], joint.means[places]
+    floor = options.position_floor**2 * np.eye(3)
+    inside = np.ones(len(rows))
+    for _ in range(FITS):
+        motion = _rigid_motion(points, targets, inside)
+        covariances = rotate_covariances(motion[2], old.covariances[rows]) + joint.covariances[places] + floor
+        residuals = targets - transform_points(motion, points)
+        squares = np.einsum("ni,ni->n", residuals, np.linalg.solve(covariances, residuals[..., None])[..., 0])
+        outside = squares > options.position_gate
+        inside = np.where(outside, 1e-3, 1.0)  # never nothing: the fit stays defined
+    return float(np.mean(outside))
+
+
+def _rigid_motion(points: FloatArray, targets: FloatArray, weights: FloatArray) -> FloatArray:
+    """Return the planar motion (3,) that takes points (n, 3) to targets (n, 3) by weighted least squares."""
+    shares = weights / weights.sum()
+    here, there = shares @ points[:, :2], shares @ targets[:, :2]
+    spread = ((points[:, :2] - here) * shares[:, None]).T @ (targets[:, :2] - there)
+    angle = np.arctan2(spread[0, 1] - spread[1, 0], spread[0, 0] + spread[1, 1])
+    return np.array([*(there - rotation(angle) @ here), angle])
 
 
 def differs(motion: FloatArray, points: FloatArray) -> bool:
@@ -121,19 +145,31 @@ def differs(motion: FloatArray, points: FloatArray) -> bool:
     return bool(np.hypot(*moved.mean(axis=0)[:2]) > RIVAL_DISTANCE or abs(motion[2]) > RIVAL_ANGLE)
 
 
+def renamed_map(landmarks: LandmarkMap, new_ids: Mapping[int, int]) -> LandmarkMap:
+    """Return the landmarks that have new names, under these."""
+    kept = landmarks.subset(np.flatnonzero([name in new_ids for name in landmarks.ids.tolist()]))
+    names = np.array([new_ids[name] for name in kept.ids.tolist()], dtype=np.int64)
+    return LandmarkMap(kept.means, kept.covariances, kept.descriptors, kept.counts, names)
+
+
 def begin_watch(
-    number: int, alignment: Alignment, side_a: Side, side_b: Side, ids_a: IntArray, renamed: IntArray, pairs: IntArray
+    number: int,
+    alignment: Alignment,
+    sides: tuple[Side, Side],
+    before: tuple[LandmarkMap, LandmarkMap],
+    renamed: IntArray,
+    pairs: IntArray,
 ) -> Watch:
     """Return the watch of a fresh merge.
 
     Args:
         number: Of the joint map.
         alignment: By which the sides were merged.
-        side_a: Whose ids stay.
-        side_b: The other.
-        ids_a: (n,) int64. Landmarks of a's map.
+        sides: Whose ids stay, and the other.
+        before: Their maps with mixture covariances, under their own ids.
         renamed: (k, 2) int64 rows (id in b's map, id in the joint map).
         pairs: (j, 2) int64 rows (id in a, id in b) of landmarks taken for common.
     """
-    seen = (set(ids_a.tolist()), set(renamed[:, 1].tolist()))
-    return Watch(number, alignment, (side_a, side_b), seen, frozenset(pairs[:, 0].tolist()))
+    common = set(pairs[:, 0].tolist())
+    own = (set(before[0].ids.tolist()) - common, set(renamed[:, 1].tolist()) - common)
+    return Watch(number, alignment, sides, (before[0], renamed_map(before[1], dict(renamed.tolist()))), own)
