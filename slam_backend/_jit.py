@@ -43,6 +43,11 @@ def lanes_inlined(function: Callable[P, T]) -> Callable[P, T]:
     return _compiled(function, forceinline=True, **_LANES)
 
 
+def any_order(function: Callable[P, T]) -> Callable[P, T]:
+    """Compile a sum over an array that may be taken in any order, the same one each time, so that it is vectorised."""
+    return _compiled(function, forceinline=True, fastmath={"contract", "reassoc", "nsz"}, error_model="numpy")
+
+
 def _compiled(function: Callable[P, T], **options: Any) -> Callable[P, T]:
     """Compile without the interpreter lock and with the cache on disk, if there is a place for it."""
     try:

@@ -24,7 +24,7 @@ import math
 
 import numpy as np
 
-from slam_backend._jit import bits_float, float_bits, jit, lanes, lanes_inlined
+from slam_backend._jit import any_order, bits_float, float_bits, jit, lanes, lanes_inlined
 from slam_backend.errors import Float32Array, FloatArray, Int32Array, IntArray
 
 LANES = 64
@@ -935,9 +935,8 @@ def refresh(
         row = row_of[slot]
         tops[0] -= 1
         target = free_rows[tops[0]]
-        _copy_row(values[row * size : (row + 1) * size], values[target * size : (target + 1) * size], maps[e])
-        for m in range(counts.shape[1]):
-            counts[target, m] = counts[row, maps[e, m]]
+        source, copy = values[row * size : (row + 1) * size], values[target * size : (target + 1) * size]
+        _copy_row(source, copy, counts[row], counts[target], maps[e])
         free_rows[tops[0]] = row
         tops[0] += 1
         row_of[slot] = target
@@ -967,19 +966,24 @@ def carry_odds(slots: IntArray, odds: FloatArray, map_of: IntArray, maps: Int32A
 
 
 @lanes
-def _copy_row(source: FloatArray, target: FloatArray, ancestors: Int32Array) -> None:
-    """Copy a row, each particle's values from its ancestor's place.
+def _copy_row(
+    source: FloatArray, target: FloatArray, before: Int32Array, seen: Int32Array, ancestors: Int32Array
+) -> None:
+    """Copy a row of values and counts, each particle's from its ancestor's place.
 
     Most particles are their own ancestors, and memory is fast where it is read and written in order: so first all of
     the row as it lies, then those that moved.
     """
     for j in range(len(target)):
         target[j] = source[j]
+    for m in range(len(seen)):
+        seen[m] = before[m]
     for m in range(len(ancestors)):
-        ancestor = np.int64(ancestors[m])
+        ancestor = np.uint32(ancestors[m])  # unsigned: none counts from the end
         if ancestor != m:
             at = (ancestor >> SHIFT) * TILE + (ancestor & (LANES - 1))
             to = (m >> SHIFT) * TILE + (m & (LANES - 1))
+            seen[m] = before[ancestor]
             for c in range(9):
                 target[to + c * LANES] = source[at + c * LANES]
 
@@ -1053,12 +1057,30 @@ def _head_distances(
     """Write the squared distances over every `stride`-th component between a measured and all stored descriptors."""
     for slot in range(n):
         out[slot] = np.float32(0.0)
-    for k in range(heads.shape[0]):
+    whole = heads.shape[0] // 4 * 4
+    for k in range(0, whole, 4):
+        v0, v1 = measured[b, k * stride], measured[b, (k + 1) * stride]
+        v2, v3 = measured[b, (k + 2) * stride], measured[b, (k + 3) * stride]
+        row0, row1, row2, row3 = heads[k], heads[k + 1], heads[k + 2], heads[k + 3]
+        for slot in range(n):
+            d0, d1, d2, d3 = v0 - row0[slot], v1 - row1[slot], v2 - row2[slot], v3 - row3[slot]
+            out[slot] += (d0 * d0 + d1 * d1) + (d2 * d2 + d3 * d3)
+    for k in range(whole, heads.shape[0]):
         value = measured[b, k * stride]
         row = heads[k]
         for slot in range(n):
             difference = value - row[slot]
             out[slot] += difference * difference
+
+
+@any_order
+def _squared_distance(a: Float32Array, b: Float32Array) -> float:
+    """Return the squared distance of two descriptors, in double precision."""
+    total = 0.0
+    for j in range(len(a)):
+        difference = np.float64(a[j]) - np.float64(b[j])
+        total += difference * difference
+    return total
 
 
 @lanes
@@ -1129,10 +1151,7 @@ def find_candidates(
             slot = hits[k]
             if ids[slot] < 0:
                 continue
-            e = 0.0
-            for j in range(measured.shape[1]):
-                difference = float(measured[b, j]) - float(stored[slot, j])
-                e += difference * difference
+            e = _squared_distance(measured[b], stored[slot])
             if e > gate and not named:
                 continue
             if total == size:
@@ -1853,7 +1872,8 @@ def resample(
         How many maps are still free.
     """
     count = len(ancestors)
-    targets, sources = settle(ancestors, count)
+    places = settle(ancestors, count)
+    targets, sources = places[0].astype(np.uint32), places[1].astype(np.uint32)  # unsigned: none counts from the end
     moves = len(targets)
     for i in range(moves):
         path_log_weights[targets[i]] = path_log_weights[sources[i]]
