@@ -8,6 +8,7 @@ from rich.markup import escape
 
 from training.bench_alignment_command import bench_alignment
 from training.bench_command import bench
+from training.bench_env_command import bench_env
 from training.bench_filter_command import bench_filter
 from training.paper_command import paper
 from training.replay_command import replay_mrclam
@@ -31,6 +32,7 @@ replay.command("kitti")(replay_kitti)
 replay.command("stereo")(replay_stereo)
 app.add_typer(replay, name="replay")
 bench.command("filter")(bench_filter)
+bench.command("env")(bench_env)
 bench.command("alignment")(bench_alignment)
 app.add_typer(bench, name="bench")
 app.add_typer(paper, name="paper")

@@ -1,0 +1,154 @@
+"""`vslam bench env`: its rows, the budget of a step, and what it says where something is missing."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from training import env_budget, env_timing
+from training.bench_env import EnvBenchConfig, run_bench
+from training.cli import app
+from training.env_timing import StepTimes, record_actions, time_peer
+from vslam_env import vslam_v0
+
+runner = CliRunner()
+
+
+class _Nested:
+    """A class with a slow method that calls another slow one, by a clock of its own [ns]."""
+
+    now = 0
+
+    def outer(self) -> None:
+        """Take 2 us, and what `inner` takes."""
+        _Nested.now += 2000
+        self.inner()
+
+    def inner(self) -> None:
+        """Take 4 us."""
+        _Nested.now += 4000
+
+
+def test_nested_phases_are_not_counted_twice(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What an inner phase takes is taken off the outer one; the rest is what is in no phase; the plan sums to 500."""
+    phases = tuple(env_budget.Phase(name, 100.0, ((_Nested, name),)) for name in ("outer", "inner"))
+    monkeypatch.setattr(env_budget, "PHASES", phases)
+    monkeypatch.setattr(env_budget.time, "perf_counter_ns", lambda: _Nested.now)
+    untouched = [_Nested.outer, _Nested.inner]
+
+    def step(_: Any) -> None:
+        _Nested.now += 1000
+        _Nested().outer()
+
+    rows = {row.phase: row for row in env_budget.measure_budget(step, [None] * 3)}
+    assert list(rows) == ["outer", "inner", env_budget.REST]
+    assert [row.median_us for row in rows.values()] == [2.0, 4.0, 1.0]
+    assert [row.mean_us for row in rows.values()] == [2.0, 4.0, 1.0]
+    assert sum(row.planned_us for row in rows.values()) == 500.0
+    assert [_Nested.outer, _Nested.inner] == untouched
+
+
+def test_all_phases_take_part_in_a_step() -> None:
+    """Over 25 ticks each phase of the plan is called, and afterwards nothing of the package is changed."""
+    before = [owner.__dict__[name] for phase in env_budget.PHASES for owner, name in phase.calls]
+    env = vslam_v0.parallel_env(world="fig5", num_robots=2, num_particles=10)
+    env.reset(seed=3)
+    actions = [{agent: np.array([0.3, 0.5]) for agent in env.agents}] * 25
+    rows = env_budget.measure_budget(env.step, actions)
+    assert all(row.mean_us > 0.0 for row in rows)
+    assert [owner.__dict__[name] for phase in env_budget.PHASES for owner, name in phase.calls] == before
+
+
+def test_recorded_actions_play_again() -> None:
+    """Actions that a policy took lead a fresh environment along the same way."""
+    env = vslam_v0.parallel_env(world="fig5", num_robots=2, num_particles=10)
+    actions = record_actions(env, 7, 12)
+    poses = env.true_poses
+    env.reset(seed=7)
+    for action in actions:
+        env.step(action)
+    np.testing.assert_array_equal(env.true_poses, poses)
+
+
+def test_times_are_summed_up() -> None:
+    """Median, 99th percentile, least and rate are those of the durations."""
+    times = StepTimes.of(np.array([1.0, 2.0, 3.0, 4.0, 100.0]) * 1e-6)
+    assert (times.median_us, times.min_us, times.calls) == (3.0, 1.0, 5)
+    assert times.per_second == pytest.approx(1e6 / 3.0)
+    assert 90.0 < times.p99_us <= 100.0
+
+
+def test_a_missing_peer_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the peer package is not installed, nothing is timed in its place."""
+    monkeypatch.setattr(env_timing, "PEER", "a_package_that_nobody_has")
+    assert time_peer(3, 2, 1, 0) is None
+
+
+def test_loads_differ_from_the_base_one_by_one() -> None:
+    """The first numbers make the base; every other row differs from it in one of them."""
+    loads = EnvBenchConfig(robots=(2, 1), particles=(10, 20), worlds=("fig5", "hall"), modes=("dict", "goal")).loads()
+    assert len(loads) == 5
+    base = loads[0]
+    for load in loads[1:]:
+        assert sum(getattr(load, name) != getattr(base, name) for name in ("robots", "particles", "world", "mode")) == 1
+
+
+def test_stopping_early_leaves_what_there_is() -> None:
+    """A bench that is stopped after two trials is incomplete and says no more than it measured."""
+    config = EnvBenchConfig(robots=(1,), particles=(5,), worlds=("fig5",), modes=("dict",), steps=3, peer=False)
+    asked: list[bool] = []
+
+    def should_stop() -> bool:
+        asked.append(True)
+        return len(asked) > 2
+
+    result = run_bench(config, should_stop=should_stop)
+    assert not result.complete
+    assert len(result.rows) == 1
+    assert result.budget
+    assert result.simulator is None
+    assert not result.snapshots
+
+
+def test_the_command_writes_its_figures(tmp_path: Path) -> None:
+    """The run folder and the JSON hold rows, budget, snapshots, resets and goals; the config repeats the run."""
+    out, file = tmp_path / "run", tmp_path / "figures.json"
+    arguments = ["bench", "env", "--robots", "1", "--particles", "5", "--worlds", "fig5", "--modes", "flat,goal",
+                 "--steps", "4", "--no-peer"]  # fmt: skip
+    result = runner.invoke(app, [*arguments, "--out", str(out), "--json", str(file)])
+    assert result.exit_code == 0, result.output
+    figures = json.loads(file.read_text())
+    assert figures == json.loads((out / "metrics.json").read_text())
+    assert [row["mode"] for row in figures["rows"]] == ["flat", "goal"]
+    assert all(row["calls"] == 4 and row["walls"] == 11 for row in figures["rows"])
+    assert figures["complete"]
+    assert figures["peer"] is None
+    assert {"get_state", "clone"} <= figures["snapshots"].keys()
+    assert {goal["name"] for goal in figures["goals"]} >= {"env.step, per second", "reset, ms"}
+    assert all(isinstance(goal["met"], bool) for goal in figures["goals"])
+    again = runner.invoke(app, ["bench", "env", "--config", str(out / "config.toml"), "--out", str(tmp_path / "again")])
+    assert again.exit_code == 0, again.output
+    rows = json.loads((tmp_path / "again" / "metrics.json").read_text())["rows"]
+    assert [row["mode"] for row in rows] == ["flat", "goal"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["--robots", "9"], "robots: expected ints from 1 to 8, got 9"),
+        (["--robots", "x"], "robots: expected numbers with commas between"),
+        (["--modes", "image"], "modes: expected some of dict, flat, goal"),
+        (["--worlds", "castle"], "world: expected one of 'office'"),
+        (["--particles", "0"], "num_particles: expected an int >= 1"),
+        (["--steps", "0"], "steps: expected an int >= 2"),
+    ],
+)
+def test_bad_input_is_refused(arguments: list[str], says: str, tmp_path: Path) -> None:
+    """Bad options are refused before a folder is made."""
+    result = runner.invoke(app, ["bench", "env", *arguments, "--out", str(tmp_path / "run")])
+    assert isinstance(result.exception, ValueError)
+    assert says in str(result.exception)
+    assert not (tmp_path / "run").exists()

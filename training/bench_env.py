@@ -1,0 +1,252 @@
+"""`EnvBenchConfig`: what `vslam bench env` times; `run_bench`: its trials, one after the other."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, fields
+from typing import Any, Self
+
+from slam_backend.errors import bad_argument, check_int
+from training.env_budget import BudgetRow, measure_budget
+from training.env_timing import (
+    StepTimes,
+    record_actions,
+    time_env,
+    time_peer,
+    time_resets,
+    time_simulator,
+    time_snapshots,
+)
+from training.machine_rates import describe_machine
+from vslam_env import vslam_v0
+from vslam_env.config import MAX_ROBOTS, EnvConfig
+
+WARM_UP = 60  # steps: the maps have landmarks then
+MODES: dict[str, dict[str, Any]] = {
+    "dict": {},
+    "flat": {"observation_type": "flat"},
+    "goal": {"action_type": "goal", "decision_ticks": 1},
+}
+GOALS = {"env.step": 2000.0, "simulator": 4000.0}  # per second
+GOAL_RESET_MS, GOAL_STATE_MS = 20.0, 2.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EnvBenchConfig:
+    """All that decides the benchmark. One number at a time differs from the base, the first of each list.
+
+    Attributes:
+        robots: K.
+        particles: M of each filter.
+        worlds: Families or paths.
+        modes: Of observations and actions; `goal` decides at every tick.
+        steps: Timed per row.
+        seed: Of the episodes.
+        peer: Also simple_spread of MPE2.
+    """
+
+    robots: tuple[int, ...] = (3, 1, 2, 4, 6, 8)
+    particles: tuple[int, ...] = (100, 30, 300, 1000)
+    worlds: tuple[str, ...] = ("office", "fig5", "maze", "hall", "loops")
+    modes: tuple[str, ...] = ("dict", "flat", "goal")
+    steps: int = 600
+    seed: int = 100
+    peer: bool = True
+
+    def __post_init__(self) -> None:
+        check_int("steps", self.steps, 2, "Time a few steps.")
+        check_int("seed", self.seed, 0, "Use 0 or a positive number.")
+        for name in ("robots", "particles", "worlds", "modes"):
+            if not getattr(self, name):
+                raise bad_argument(name, "at least one", "none", "Name what to time.")
+        for robots in self.robots:
+            if not 1 <= check_int("robots", robots, 1, "Use 1 to 8 robots.") <= MAX_ROBOTS:
+                raise bad_argument("robots", f"ints from 1 to {MAX_ROBOTS}", robots, "Use 1 to 8 robots.")
+        for mode in self.modes:
+            if mode not in MODES:
+                raise bad_argument("modes", "some of " + ", ".join(MODES), mode, "Check the spelling.")
+
+    @classmethod
+    def from_mapping(cls, values: Mapping[str, Any]) -> Self:
+        """Build a config from plain values, as `to_mapping` gives them; unknown names are refused."""
+        known = [field.name for field in fields(cls)]
+        for name in values:
+            if name not in known:
+                raise bad_argument("config", "one of " + ", ".join(known), name, "Correct the name in the file.")
+        chosen: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in values.items()}
+        return cls(**chosen)
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return the plain values that repeat this benchmark, the seed apart."""
+        return {name: value for name, value in asdict(self).items() if name != "seed"}
+
+    def loads(self) -> list["EnvLoad"]:
+        """Return what is timed, row by row, the base first."""
+        base = EnvLoad(self.robots[0], self.particles[0], self.worlds[0], self.modes[0])
+        rows = [base]
+        rows += [EnvLoad(robots, base.particles, base.world, base.mode) for robots in self.robots[1:]]
+        rows += [EnvLoad(base.robots, particles, base.world, base.mode) for particles in self.particles[1:]]
+        rows += [EnvLoad(base.robots, base.particles, world, base.mode) for world in self.worlds[1:]]
+        return rows + [EnvLoad(base.robots, base.particles, base.world, mode) for mode in self.modes[1:]]
+
+
+@dataclass(frozen=True, slots=True)
+class EnvLoad:
+    """An environment to time: robots, particles, world, and mode of observations and actions."""
+
+    robots: int
+    particles: int
+    world: str
+    mode: str
+
+    def config(self) -> EnvConfig:
+        """Return the environment's configuration."""
+        # Eight robots find no starts 5 m apart in every building.
+        apart = {"min_start_distance": 2.0, "shared_start_view": True} if self.robots > 4 else {}
+        return EnvConfig().replace(
+            world=self.world,
+            num_robots=self.robots,
+            belief={"filter": {"num_particles": self.particles}},
+            **MODES[self.mode],
+            **apart,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class EnvRow:
+    """One load, timed; `walls` of the episode's world."""
+
+    load: EnvLoad
+    walls: int
+    times: StepTimes
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return it as plain values."""
+        return asdict(self.load) | {"walls": self.walls} | asdict(self.times)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EnvBenchResult:
+    """What was measured; later parts are empty or None where the user stopped.
+
+    Attributes:
+        machine: As `describe_machine` tells.
+        rows: In the order of the loads.
+        simulator: Ticks of the simulator alone, under the base load.
+        budget: Of a step under the base load.
+        reset: Of the base environment.
+        snapshots: By name.
+        peer: simple_spread with as many agents, or None where it is not installed or not asked for.
+        complete: Whether nothing is missing.
+    """
+
+    machine: dict[str, Any]
+    rows: tuple[EnvRow, ...]
+    simulator: StepTimes | None
+    budget: tuple[BudgetRow, ...]
+    reset: StepTimes | None
+    snapshots: Mapping[str, StepTimes]
+    peer: StepTimes | None
+    complete: bool
+
+    def goals(self) -> list[dict[str, Any]]:
+        """Return goals with what was measured."""
+        found = []
+        if self.rows:
+            found.append(_goal("env.step, per second", self.rows[0].times.per_second, GOALS["env.step"], True))
+        if self.simulator is not None:
+            found.append(_goal("simulator only, per second", self.simulator.per_second, GOALS["simulator"], True))
+        if self.reset is not None:
+            found.append(_goal("reset, ms", self.reset.median_us / 1e3, GOAL_RESET_MS, False))
+        for name in ("get_state", "set_state, same episode"):
+            if name in self.snapshots:
+                found.append(_goal(f"{name}, ms", self.snapshots[name].median_us / 1e3, GOAL_STATE_MS, False))
+        return found
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return it as plain values."""
+        return {
+            "machine": self.machine,
+            "rows": [row.to_mapping() for row in self.rows],
+            "simulator": None if self.simulator is None else asdict(self.simulator),
+            "budget": [asdict(row) for row in self.budget],
+            "reset": None if self.reset is None else asdict(self.reset),
+            "snapshots": {name: asdict(times) for name, times in self.snapshots.items()},
+            "peer": None if self.peer is None else asdict(self.peer),
+            "goals": self.goals(),
+            "complete": self.complete,
+        }
+
+
+def run_bench(
+    config: EnvBenchConfig,
+    on_trial: Callable[[str], None] = lambda name: None,
+    should_stop: Callable[[], bool] = lambda: False,
+) -> EnvBenchResult:
+    """Time all loads, and the base load in parts.
+
+    Args:
+        config: What is timed.
+        on_trial: Called with the name of each trial before it begins.
+        should_stop: Asked between trials.
+    """
+    seed, steps = config.seed, config.steps
+    loads = config.loads()
+    base = loads[0].config()
+    rows: list[EnvRow] = []
+    results: dict[str, Any] = {"simulator": None, "budget": [], "reset": None, "snapshots": {}, "peer": None}
+
+    def row(load: EnvLoad) -> None:
+        env = vslam_v0.parallel_env(config=load.config())
+        times = time_env(env, seed, steps, WARM_UP)
+        rows.append(EnvRow(load, len(env.world.walls), times))
+
+    def budget() -> None:
+        env = vslam_v0.parallel_env(config=base)
+        actions = record_actions(env, seed, WARM_UP + steps)
+        env.reset(seed=seed)
+        for action in actions[:WARM_UP]:
+            env.step(action)
+        results["budget"] = measure_budget(env.step, actions[WARM_UP:])
+
+    def keep(name: str, call: Callable[[], Any]) -> Callable[[], None]:
+        return lambda: results.update({name: call()})
+
+    trials: list[tuple[str, Callable[[], None]]] = [(_title(load), lambda load=load: row(load)) for load in loads]  # type: ignore[misc]
+    trials.insert(1, ("budget", budget))
+    trials.insert(2, ("simulator", keep("simulator", lambda: time_simulator(base, seed, steps, WARM_UP))))
+    if config.peer:
+        trials.insert(3, ("peer", keep("peer", lambda: time_peer(loads[0].robots, steps, WARM_UP, seed))))
+    trials.insert(4, ("reset", keep("reset", lambda: time_resets(vslam_v0.parallel_env(config=base), seed, min(20, steps)))))
+    begun, often = min(300, steps), min(60, 4 + steps)
+    snapshots = keep("snapshots", lambda: time_snapshots(vslam_v0.parallel_env(config=base), seed, begun, often))
+    trials.insert(5, ("snapshots", snapshots))
+    done = 0
+    for name, trial in trials:
+        if should_stop():
+            break
+        on_trial(name)
+        trial()
+        done += 1
+    return EnvBenchResult(
+        machine=describe_machine(),
+        rows=tuple(rows),
+        simulator=results["simulator"],
+        budget=tuple(results["budget"]),
+        reset=results["reset"],
+        snapshots=results["snapshots"],
+        peer=results["peer"],
+        complete=done == len(trials),
+    )
+
+
+def count_trials(config: EnvBenchConfig) -> int:
+    """Return how often `run_bench` calls `on_trial`."""
+    return len(config.loads()) + 4 + config.peer
+
+
+def _title(load: EnvLoad) -> str:
+    return f"{load.robots} robots, {load.particles} particles, {load.world}, {load.mode}"
+
+
+def _goal(name: str, measured: float, goal: float, at_least: bool) -> dict[str, Any]:
+    met = measured >= goal if at_least else measured <= goal
+    return {"name": name, "measured": measured, "goal": goal, "at_least": at_least, "met": bool(met)}

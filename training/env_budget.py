@@ -1,0 +1,128 @@
+"""Where the time of `env.step` goes: each phase timed without what it calls of the others, beside the plan."""
+
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import wraps
+from typing import Any
+
+import numpy as np
+
+from slam_backend.filter import FastSlam
+from slam_backend.team import TeamSlam
+from vslam_env import observation
+from vslam_env.belief import TeamBelief
+from vslam_env.environment import ExplorationEnv
+from vslam_env.episode import Episode
+from vslam_env.navigation import CandidateSlots
+from vslam_env.sensors import LandmarkSensor, Scan
+from vslam_env.shared_grids import SharedGrids
+from vslam_env.world import Simulator
+
+REST = "all else"
+
+
+@dataclass(frozen=True, slots=True)
+class Phase:
+    """A part of a step.
+
+    Attributes:
+        name: Shown in the table.
+        planned_us: For three robots with 100 particles and 5 measurements each [us].
+        calls: What counts to it: owners and names of functions.
+    """
+
+    name: str
+    planned_us: float
+    calls: tuple[tuple[Any, str], ...]
+
+
+PHASES = (
+    Phase("physics", 25, ((Simulator, "step"),)),
+    Phase("landmark sensor", 40, ((LandmarkSensor, "measure"),)),
+    Phase("scans", 20, ((Scan, "measure"),)),
+    Phase("grid painting", 20, ((SharedGrids, "paint"), (SharedGrids, "follow"), (SharedGrids, "meet"))),
+    Phase("filters", 135, ((FastSlam, "step"),)),
+    Phase("team, alignment", 40, ((TeamSlam, "step"),)),
+    Phase("errors", 15, ((Episode, "map_scores"), (Episode, "pose_errors"), (Episode, "standing"))),
+    Phase("local grids", 20, ((observation, "local_grid"),)),
+    Phase("candidates", 40, ((CandidateSlots, "update"),)),
+    Phase(
+        "beliefs, dictionaries",
+        70,
+        ((TeamBelief, "step"), (ExplorationEnv, "_observations"), (ExplorationEnv, "_infos")),
+    ),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class BudgetRow:
+    """What a phase took per step.
+
+    Attributes:
+        phase: Its name.
+        planned_us: As `Phase`; 75 for what is in no phase, which makes the plan 500.
+        median_us: Over steps [us].
+        mean_us: Over steps; what happens now and then shows here alone [us].
+    """
+
+    phase: str
+    planned_us: float
+    median_us: float
+    mean_us: float
+
+
+def measure_budget(step: Callable[[Any], Any], arguments: list[Any]) -> list[BudgetRow]:
+    """Call `step` with each argument in turn and tell where the time went.
+
+    The clock itself costs about a microsecond for each timed call.
+    """
+    totals: list[dict[str, int]] = []
+    with _timed(PHASES) as spent:
+        for argument in arguments:
+            spent.clear()
+            begin = time.perf_counter_ns()
+            step(argument)
+            whole = time.perf_counter_ns() - begin
+            totals.append({**spent, REST: whole - sum(spent.values())})
+    plan = {phase.name: phase.planned_us for phase in PHASES}
+    plan[REST] = 500.0 - sum(plan.values())
+    rows = []
+    for name, planned in plan.items():
+        micros = np.array([total.get(name, 0) for total in totals]) / 1e3
+        rows.append(BudgetRow(name, planned, float(np.median(micros)), float(micros.mean())))
+    return rows
+
+
+@contextmanager
+def _timed(phases: tuple[Phase, ...]) -> Iterator[dict[str, int]]:
+    """Time the calls of phases while the block runs; yields nanoseconds by phase, nested phases taken off."""
+    spent: dict[str, int] = defaultdict(int)
+    stack: list[list[int]] = []  # of nested calls: nanoseconds that inner ones took
+
+    def timed(function: Callable[..., Any], name: str) -> Callable[..., Any]:
+        @wraps(function)
+        def call(*args: Any, **kwargs: Any) -> Any:
+            stack.append([0])
+            begin = time.perf_counter_ns()
+            try:
+                return function(*args, **kwargs)
+            finally:
+                whole = time.perf_counter_ns() - begin
+                spent[name] += whole - stack.pop()[0]
+                if stack:
+                    stack[-1][0] += whole
+
+        return call
+
+    originals = [(owner, name, owner.__dict__[name]) for phase in phases for owner, name in phase.calls]
+    try:
+        for phase in phases:
+            for owner, name in phase.calls:
+                setattr(owner, name, timed(owner.__dict__[name], phase.name))
+        yield spent
+    finally:
+        for owner, name, original in originals:
+            setattr(owner, name, original)

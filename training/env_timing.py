@@ -1,0 +1,138 @@
+"""Environments timed step by step on actions that were recorded beforehand, so that no policy is timed with them."""
+
+import gc
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+
+from agents.registry import make_policy
+from slam_backend.errors import FloatArray
+from training.step_timing import no_garbage_collection
+from vslam_env import vslam_v0
+from vslam_env.config import TICK, EnvConfig
+from vslam_env.environment import ExplorationEnv
+from vslam_env.setting import draw_setting
+from vslam_env.world import Simulator, read_odometry
+
+PEER = "mpe2"  # the package whose simple_spread is timed beside
+
+
+@dataclass(frozen=True, slots=True)
+class StepTimes:
+    """Of calls that were timed one by one [us].
+
+    Attributes:
+        median_us: Half of the calls took longer.
+        p99_us: 1 % took longer.
+        min_us: The shortest.
+        per_second: Calls in a second, by the median.
+        calls: How many.
+    """
+
+    median_us: float
+    p99_us: float
+    min_us: float
+    per_second: float
+    calls: int
+
+    @classmethod
+    def of(cls, seconds: FloatArray) -> "StepTimes":
+        """Summarise durations (n,) [s]."""
+        median, high = (float(q) for q in np.quantile(1e6 * seconds, (0.5, 0.99)))
+        return cls(median, high, float(1e6 * seconds.min()), 1e6 / median, len(seconds))
+
+
+def record_actions(env: ExplorationEnv, seed: int, steps: int) -> list[dict[str, Any]]:
+    """Let the nearest-frontier policy drive an episode; return its actions, which can be played again."""
+    env.max_cycles = max(env.max_cycles, steps + 1)
+    policies = {agent: make_policy("frontier", env.config.action_type) for agent in env.possible_agents}
+    rng = np.random.default_rng(seed)
+    observations, _ = env.reset(seed=seed)
+    actions = []
+    for _ in range(steps):
+        # A flat vector is no dict of arrays: the policy goes by the belief alone.
+        actions.append({a: policies[a].act(observations[a], env.belief(a), rng) for a in env.agents})
+        observations = env.step(actions[-1])[0]
+    return actions
+
+
+def time_steps(call: Callable[[Any], Any], arguments: Sequence[Any], warm_up: int) -> FloatArray:
+    """Return how long calls took (n - warm_up,) [s], nothing of their results kept."""
+    durations = np.empty(len(arguments), np.int64)
+    with no_garbage_collection():
+        for i, argument in enumerate(arguments):
+            begin = time.perf_counter_ns()
+            call(argument)
+            durations[i] = time.perf_counter_ns() - begin
+    seconds: FloatArray = durations[warm_up:] / 1e9
+    return seconds
+
+
+def time_env(env: ExplorationEnv, seed: int, steps: int, warm_up: int) -> StepTimes:
+    """Time `env.step` along an episode of the nearest-frontier policy."""
+    actions = record_actions(env, seed, warm_up + steps)
+    env.reset(seed=seed)
+    return StepTimes.of(time_steps(env.step, actions, warm_up))
+
+
+def time_simulator(config: EnvConfig, seed: int, steps: int, warm_up: int) -> StepTimes:
+    """Time ticks of the simulator alone: physics, odometry, landmark sensor and scans, no filter, no observation."""
+    setting = draw_setting(config, config.world, np.random.SeedSequence(seed).spawn(1)[0])
+    simulator = Simulator(setting.world, setting.true_starts, config.robot_radius, TICK)
+    odometry, sensor, scan = (np.random.default_rng(seed + i) for i in range(3))
+    rng = np.random.default_rng(seed)
+
+    def tick(commands: FloatArray) -> None:
+        before = simulator.poses
+        simulator.step(commands)
+        after = simulator.poses
+        read_odometry(before, after, setting.bias, config.odometry, odometry)
+        setting.sensor.measure(after, sensor)
+        setting.scan.measure(after, scan)
+
+    commands, turn = [], np.zeros(config.num_robots)
+    for _ in range(warm_up + steps):  # they wander, and meet walls now and then
+        turn = np.clip(0.9 * turn + 0.4 * rng.standard_normal(config.num_robots), -1.5, 1.5)
+        commands.append(np.column_stack([np.full(config.num_robots, 0.5), turn]))
+    return StepTimes.of(time_steps(tick, commands, warm_up))
+
+
+def time_resets(env: ExplorationEnv, first_seed: int, resets: int) -> StepTimes:
+    """Time resets, each of another seed; the first is not counted."""
+    return StepTimes.of(time_steps(lambda seed: env.reset(seed=seed), range(first_seed, first_seed + resets + 1), 1))
+
+
+def time_snapshots(env: ExplorationEnv, seed: int, steps: int, repeats: int) -> Mapping[str, StepTimes]:
+    """Time taking and restoring states after `steps` steps of the nearest-frontier policy, and clones."""
+    record_actions(env, seed, steps)
+    state = env.get_state()
+    other = vslam_v0.parallel_env(config=env.config)
+    other.reset(seed=seed + 1)
+    states = [other.get_state(), state]
+    some: list[int] = list(range(repeats))
+    return {
+        "get_state": StepTimes.of(time_steps(lambda _: env.get_state(), some, 1)),
+        "set_state, same episode": StepTimes.of(time_steps(lambda _: env.set_state(state), some, 1)),
+        "set_state, another seed": StepTimes.of(time_steps(lambda i: other.set_state(states[i % 2]), some, 2)),
+        "clone": StepTimes.of(time_steps(lambda _: env.clone(), some, 1)),
+    }
+
+
+def time_peer(agents: int, steps: int, warm_up: int, seed: int) -> StepTimes | None:
+    """Time simple_spread of MPE2 under random actions, or return None where it is not installed."""
+    if find_spec(PEER) is None:
+        return None
+    peer = import_module(f"{PEER}.simple_spread_v3").parallel_env(N=agents, max_cycles=warm_up + steps + 1)
+    peer.reset(seed=seed)
+    for agent in peer.agents:
+        peer.action_space(agent).seed(seed)
+    actions = [{a: peer.action_space(a).sample() for a in peer.agents} for _ in range(warm_up + steps)]
+    durations = time_steps(peer.step, actions, warm_up)
+    peer.close()
+    gc.collect()
+    return StepTimes.of(durations)
