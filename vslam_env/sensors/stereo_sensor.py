@@ -1,0 +1,131 @@
+"""`StereoSensor`: rendered eyes and the image front end stand in for the landmark sensor."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from slam_backend.camera import StereoCamera
+from slam_backend.errors import FloatArray, IntArray, bad_argument, check_float
+from slam_backend.frontend import CornerOptions, FrontEndOptions, StereoFrame, StereoFrontEnd
+from slam_backend.frontend.images import Image
+from vslam_env.sensors.landmark_sensor import Frame
+from vslam_env.sensors.stereo_camera import ImagingConfig, StereoEye
+from vslam_env.sensors.stereo_textures import TextureConfig, WallTextures, draw_textures
+from vslam_env.sensors.stereo_truth import TextureCorners
+from vslam_env.world.freespace import FreeSpace
+from vslam_env.world.spec import Landmarks, World
+
+
+def few_spread() -> FrontEndOptions:
+    """Return the default front end of a robot: at most 20 points a frame, spread over the image."""
+    return FrontEndOptions(max_measurements=20)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StereoSensorConfig:
+    """Rendered eyes: what the walls look like, how images are taken, and how they are measured.
+
+    Attributes:
+        camera: Optics and size of the images; its sigmas are not used, since images have the noise that they have.
+        textures: What the walls look like.
+        imaging: Noise and exposure of the images.
+        front_end: How images are measured.
+        working_distance: True landmarks are the corners of the textures as a camera sees them from so far [m].
+        tolerance: A measured point is the true landmark nearest to it on its wall within this distance [m].
+    """
+
+    camera: StereoCamera = field(default_factory=StereoCamera)
+    textures: TextureConfig = field(default_factory=TextureConfig)
+    imaging: ImagingConfig = field(default_factory=ImagingConfig)
+    front_end: FrontEndOptions = field(default_factory=few_spread)
+    working_distance: float = 3.0
+    tolerance: float = 0.08
+
+    def __post_init__(self) -> None:
+        parts = {"camera": StereoCamera, "textures": TextureConfig, "imaging": ImagingConfig}
+        for name, kind in (parts | {"front_end": FrontEndOptions}).items():
+            if not isinstance(getattr(self, name), kind):
+                cure = f"Build one: {kind.__name__}(...)."
+                raise bad_argument(f"stereo.{name}", f"a {kind.__name__}", getattr(self, name), cure)
+        for name in ("working_distance", "tolerance"):
+            check_float(f"stereo.{name}", getattr(self, name), "Give metres.", above=0.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EyeFrame(Frame):
+    """What one robot's eyes saw in one tick, and what was made of it.
+
+    Attributes:
+        left: (H, W) uint8.
+        right: (H, W) uint8.
+        seen: What the front end found in them.
+    """
+
+    left: Image
+    right: Image
+    seen: StereoFrame
+
+
+class StereoSensor:
+    """Measures the textured walls of one world with the eyes of all robots.
+
+    Args:
+        config: How.
+        world: Its walls; landmarks of its own are not used.
+        free_space: Of this world.
+        rng: Source of the textures.
+        robot_radius: Robots hide what stands behind them [m].
+
+    Attributes:
+        config: As given.
+        textures: Of the walls.
+        corners: The true landmarks.
+    """
+
+    def __init__(
+        self,
+        config: StereoSensorConfig,
+        world: World,
+        free_space: FreeSpace,
+        rng: np.random.Generator,
+        robot_radius: float = 0.2,
+    ) -> None:
+        self.config = config
+        self.textures: WallTextures = draw_textures(world.walls, rng, config.textures)
+        resolution = config.camera.focal_px / config.working_distance
+        options: CornerOptions = config.front_end.corners
+        self.corners = TextureCorners(world, self.textures, free_space, resolution, options, config.tolerance)
+        self._eye = StereoEye(config.camera, config.imaging, world.walls, self.textures, robot_radius)
+        self._front_end = StereoFrontEnd(config.camera, config.front_end)
+
+    @property
+    def landmarks(self) -> Landmarks:
+        """The true landmarks."""
+        return self.corners.landmarks
+
+    def measure(self, poses: FloatArray, rng: np.random.Generator) -> list[Frame]:
+        """Take and measure a pair of images with each robot's eyes.
+
+        Args:
+            poses: (K, 3) float64 [m, m, rad], world frame. True poses.
+            rng: Source of exposure and noise.
+
+        Returns:
+            One frame for each robot, with the true landmark behind each point, -1 where there is none: on edges that
+            are none of a texture, on robots, and where nothing stands.
+        """
+        frames: list[Frame] = []
+        for robot in range(len(poses)):
+            left, right = self._eye.take(poses, robot, rng)
+            seen = self._front_end.measure(left, right)
+            frames.append(EyeFrame(seen.measurements, self._claims(poses, robot, seen), left, right, seen))
+        return frames
+
+    def _claims(self, poses: FloatArray, robot: int, frame: StereoFrame) -> IntArray:
+        """Return the true landmark (n,) int64 behind each measured point: where its ray meets a wall, not its depth."""
+        camera = self.config.camera
+        traced = self._eye.trace(poses, robot, frame.pixels[:, 0])
+        with np.errstate(invalid="ignore"):
+            rise = (0.5 * (camera.height - 1) - frame.pixels[:, 1]) / camera.focal_px * traced.depths
+        heights = np.where(traced.walls >= 0, camera.mount[2] + rise, 0.0)
+        return self.corners.claims(traced, heights)
