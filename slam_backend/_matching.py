@@ -106,6 +106,50 @@ def _unlike(
     return passed
 
 
+@jit
+def _alike(
+    a: Float32Array, b_columns: Float32Array, limit: float, most: int
+) -> tuple[IntArray, IntArray, IntArray]:
+    """Return the b within a squared distance `limit` of each a (n, most), and how many each a (n,) and b (m,) has."""
+    n, m = len(a), b_columns.shape[1]
+    found = np.zeros((n, most), np.int64)
+    of_a, of_b = np.zeros(n, np.int64), np.zeros(m, np.int64)
+    lengths_b = _squared_lengths(b_columns)
+    squares = np.empty(BLOCK, np.float32)
+    for start in range(0, m, BLOCK):
+        stop = min(start + BLOCK, m)
+        for i in range(n):
+            _squared_distances(a[i], b_columns, lengths_b, start, stop, squares)
+            for j in range(stop - start):
+                if squares[j] <= limit:
+                    if of_a[i] < most:
+                        found[i, of_a[i]] = start + j
+                    of_a[i] += 1
+                    of_b[start + j] += 1
+    return found, of_a, of_b
+
+
+def look_alikes(a: Float32Array, b: Float32Array, gate: float, most: int) -> IntArray:
+    """Pair all descriptors within `gate`, but none that so pairs with more than `most`: those tell nothing.
+
+    Args:
+        a: (n, d) float32 [-].
+        b: (m, d) float32 [-].
+        gate: Largest L2 distance of a pair [-].
+        most: Most partners of one.
+
+    Returns:
+        (k, 2) int64 rows (index in a, index in b), by rising index in a, then in b; k <= n `most`.
+    """
+    if not len(a) or not len(b):
+        return np.empty((0, 2), np.int64)
+    found, of_a, of_b = _alike(_fresh(a), _fresh(b.T), gate * gate, most)
+    rows, places = np.nonzero((np.arange(most) < of_a[:, None]) & (of_a <= most)[:, None])
+    partners = found[rows, places]
+    pairs = np.column_stack([rows, partners])
+    return np.asarray(pairs[of_b[partners] <= most])
+
+
 def mutual_nearest(a: Float32Array, b: Float32Array, gate: float) -> IntArray:
     """Pair descriptors that are each other's nearest and no farther apart than `gate`.
 

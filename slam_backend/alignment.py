@@ -3,10 +3,12 @@
 import math
 
 import numpy as np
+from scipy.spatial import KDTree
+from scipy.special import pdtrc
 
 from slam_backend import _alignment_kernels as kernels
 from slam_backend import _proposals as proposals
-from slam_backend._matching import mutual_nearest, unlike_other_places
+from slam_backend._matching import look_alikes, mutual_nearest, unlike_other_places
 from slam_backend.alignment_types import REASONS, Alignment, AlignmentOptions, Reason
 from slam_backend.errors import BoolArray, FloatArray, IntArray, bad_argument, check_choice
 from slam_backend.geometry import transform_points, wrap_angle
@@ -22,6 +24,7 @@ METHODS = ("ransac", "svd", "icp", "impicp", "gnc", "clique")
 RIVAL_DISTANCE = 0.5  # [m]; beyond these two an alignment counts as another one, and as a false one
 RIVAL_ANGLE = np.deg2rad(5.0)
 RIVALS = 5  # most promising rivals that are refined
+FALSE_ALARMS = 1e-3  # expected number of sets of look-alikes that fit by chance as well
 MOST_PAIRS = 10_000  # candidates by geometry alone
 MIRRORED = 3, 0.1  # the mirror image is believed if it fits so many more matches, and this share of the inliers more
 
@@ -29,9 +32,10 @@ MIRRORED = 3, 0.1  # the mirror image is believed if it fits so many more matche
 def candidate_matches(map_a: LandmarkMap, map_b: LandmarkMap, options: AlignmentOptions) -> IntArray:
     """Match landmarks by appearance, without regard to where they lie in the plane.
 
-    Each is the other's nearest descriptor, within the gate, clearly nearer than any landmark of another place in
-    either map; and their heights agree, because planar robots with one camera height share z (Sec. 3.1). Without
-    appearance all pairs whose heights agree are candidates.
+    Those that stand out: each is the other's nearest descriptor, within the gate, clearly nearer than any landmark of
+    another place in either map. Beside them all pairs within the gate of landmarks that have few look-alikes: which of
+    them is meant, geometry has to tell, and that there are several is evidence, too. Heights agree, because planar
+    robots with one camera height share z (Sec. 3.1). Without appearance all pairs whose heights agree are candidates.
 
     Args:
         map_a: The one map.
@@ -39,12 +43,17 @@ def candidate_matches(map_a: LandmarkMap, map_b: LandmarkMap, options: Alignment
         options: Gates.
 
     Returns:
-        (k, 2) int64 rows (index in map_a, index in map_b), by rising index in map_a; one-to-one unless
-        `options.appearance` is off.
+        (k, 2) int64 rows (index in map_a, index in map_b), by rising index in map_a, then in map_b. One-to-one where
+        all landmarks look different.
 
     Raises:
         ValueError: If the maps' descriptors differ in size, or there are too many pairs to try without appearance.
     """
+    return _candidates(map_a, map_b, options)[0]
+
+
+def _candidates(map_a: LandmarkMap, map_b: LandmarkMap, options: AlignmentOptions) -> tuple[IntArray, BoolArray]:
+    """Return the candidates (k, 2), and which of them stand out (k,): these are one-to-one."""
     if map_a.descriptors.shape[1] != map_b.descriptors.shape[1]:
         raise bad_argument(
             "map_b",
@@ -53,23 +62,30 @@ def candidate_matches(map_a: LandmarkMap, map_b: LandmarkMap, options: Alignment
             "Describe the landmarks of both maps with the same front end.",
         )
     if options.appearance:
-        matches = mutual_nearest(map_a.descriptors, map_b.descriptors, options.descriptor_gate)
+        clear = mutual_nearest(map_a.descriptors, map_b.descriptors, options.descriptor_gate)
         for one, other, here, there in ((map_a, map_b, 0, 1), (map_b, map_a, 1, 0)):
-            descriptors, partners = one.descriptors[matches[:, here]], matches[:, there]
+            descriptors, partners = one.descriptors[clear[:, here]], clear[:, there]
             limits = (options.same_place, options.descriptor_ratio)
-            matches = matches[unlike_other_places(descriptors, partners, other.descriptors, other.means, *limits)]
+            clear = clear[unlike_other_places(descriptors, partners, other.descriptors, other.means, *limits)]
+        alike = clear[:0]
+        if options.look_alikes:
+            alike = look_alikes(map_a.descriptors, map_b.descriptors, options.descriptor_gate, options.look_alikes)
     else:
         if len(map_a) * len(map_b) > MOST_PAIRS:
             raise bad_argument(
                 "map_b", f"at most {MOST_PAIRS} pairs of landmarks without appearance", len(map_a) * len(map_b),
                 "Give smaller maps, or tell landmarks apart.",
             )  # fmt: skip
-        matches = np.argwhere(np.ones((len(map_a), len(map_b)), np.bool_))
+        clear, alike = np.empty((0, 2), np.int64), np.argwhere(np.ones((len(map_a), len(map_b)), np.bool_))
+    names = np.concatenate([clear, alike]) @ np.array([max(len(map_b), 1), 1])
+    unique, first = np.unique(names, return_index=True)
+    matches = np.column_stack([unique // max(len(map_b), 1), unique % max(len(map_b), 1)])
+    stands_out = first < len(clear)
     rows_a, rows_b = matches.T
     climb = map_a.means[rows_a, 2] - map_b.means[rows_b, 2]
     variance = map_a.covariances[rows_a, 2, 2] + map_b.covariances[rows_b, 2, 2] + options.position_floor**2
-    level: IntArray = matches[climb**2 <= options.position_gate * variance]
-    return level
+    level = climb**2 <= options.position_gate * variance
+    return matches[level], stands_out[level]
 
 
 def align_maps(
@@ -104,20 +120,20 @@ def align_maps(
     options, rng = _checked(map_a, map_b, method, rng, options)
     if not options.appearance and len(map_a) * len(map_b) > MOST_PAIRS:
         return Alignment.refused("too many candidates")
-    matches = candidate_matches(map_a, map_b, options)
+    matches, stands_out = _candidates(map_a, map_b, options)
     if len(matches) < options.min_inliers:
         return Alignment.refused("too few candidates")
     table = _match_table(map_a, map_b, matches)
     floor, gate = options.position_floor**2, options.position_gate
     hypotheses = _search(table, rng, options)
-    start = _propose(method, map_a, map_b, matches, table, hypotheses, options)
+    start = _propose(method, map_a, map_b, matches, stands_out, table, hypotheses, options)
     if start is None:
         return Alignment.refused("too few inliers")
     pose, members, variance = kernels.refine(table, start, floor, gate)
-    distances = kernels.squared_distances(table, pose, floor)
-    inside = _one_to_one(matches, distances) & (distances <= gate)
+    inside = _fitting(table, matches, pose, floor, gate)
+    members &= inside | _one_to_one(matches)  # of look-alikes that all fit, one shapes the motion
     inliers = matches[inside]
-    if len(inliers) < options.min_inliers:
+    if len(inliers) < options.min_inliers or _by_chance(table, map_a, matches, pose, inside, options):
         return Alignment.refused("too few inliers")
     points_b = map_b.means[inliers[:, 1], :2]
     ratio = _strongest_rival(table, matches, hypotheses, pose, variance, points_b.mean(axis=0), options)
@@ -156,12 +172,12 @@ def propose_motion(
         ValueError: As `align_maps`.
     """
     options, rng = _checked(map_a, map_b, method, rng, options)
-    matches = candidate_matches(map_a, map_b, options)
+    matches, stands_out = _candidates(map_a, map_b, options)
     if len(matches) < 2:
         return None
     table = _match_table(map_a, map_b, matches)
     hypotheses = _search(table, rng, options) if method == "ransac" else np.empty((0, 5))
-    return _propose(method, map_a, map_b, matches, table, hypotheses, options)
+    return _propose(method, map_a, map_b, matches, stands_out, table, hypotheses, options)
 
 
 def _checked(
@@ -190,12 +206,18 @@ def _propose(
     map_a: LandmarkMap,
     map_b: LandmarkMap,
     matches: IntArray,
+    stands_out: BoolArray,
     table: FloatArray,
     hypotheses: FloatArray,
     options: AlignmentOptions,
 ) -> FloatArray | None:
-    """Return the motion (3,) at which a method begins; None if it finds none."""
+    """Return the motion (3,) at which a method begins; None if it finds none.
+
+    Those that cannot choose among look-alikes begin with the candidates that stand out, where there are enough.
+    """
     floor, gate = options.position_floor**2, options.position_gate
+    if method not in ("ransac", "clique") and np.count_nonzero(stands_out) >= options.min_inliers:
+        matches, table = matches[stands_out], table[stands_out]
     if method == "ransac":
         return hypotheses[hypotheses[:, 4].argmax(), :3].copy() if len(hypotheses) else None
     if method == "gnc":
@@ -236,19 +258,53 @@ def _search(table: FloatArray, rng: np.random.Generator, options: AlignmentOptio
     )
 
 
-def _one_to_one(matches: IntArray, distances: FloatArray) -> BoolArray:
-    """Tell which matches (k, 2) remain if each landmark keeps that of the smallest distance (k,), greedily."""
-    kept = np.zeros(len(matches), np.bool_)
-    taken_a, taken_b = set[int](), set[int]()
-    if len(np.unique(matches[:, 0])) == len(np.unique(matches[:, 1])) == len(matches):
-        return ~kept
-    for i in np.argsort(distances, kind="stable"):
-        a, b = matches[i].tolist()
-        if a not in taken_a and b not in taken_b:
-            kept[i] = True
-            taken_a.add(a)
-            taken_b.add(b)
-    return kept
+def _one_to_one(matches: IntArray) -> bool:
+    """Tell whether no landmark appears twice in matches (k, 2)."""
+    return len(np.unique(matches[:, 0])) == len(np.unique(matches[:, 1])) == len(matches)
+
+
+def _fitting(table: FloatArray, matches: IntArray, pose: FloatArray, floor: float, gate: float) -> BoolArray:
+    """Tell which candidates (k,) lie within the gate under `pose`; of several of one landmark the closest, greedily."""
+    distances = kernels.squared_distances(table, pose, floor)
+    inside = distances <= gate
+    rows = np.flatnonzero(inside)
+    if not _one_to_one(matches[rows]):
+        taken_a, taken_b = set[int](), set[int]()
+        for i in rows[np.argsort(distances[rows], kind="stable")].tolist():
+            a, b = matches[i].tolist()
+            inside[i] = a not in taken_a and b not in taken_b
+            if inside[i]:
+                taken_a.add(a)
+                taken_b.add(b)
+    return inside
+
+
+def _by_chance(
+    table: FloatArray,
+    map_a: LandmarkMap,
+    matches: IntArray,
+    pose: FloatArray,
+    inside: BoolArray,
+    options: AlignmentOptions,
+) -> bool:
+    """Tell whether so many inliers would come together by chance somewhere among so many look-alikes.
+
+    Were all pairs wrong, a candidate's partner would be any landmark of map a, and fit if it lay near by chance. The
+    chance of as many as are `inside` (k,), two of which any motion can be made to fit, times the number of pairs that
+    a motion can be made from, is how often that is expected at all: a number of false alarms (Moisan and Stival 2004).
+    Where candidates are one-to-one by appearance, `min_inliers` alone decides.
+    """
+    if _one_to_one(matches):
+        return False
+    moved = transform_points(pose, table[:, 3:6])
+    spread = (table[:, 6] + table[:, 9] + table[:, 12] + table[:, 15]) / 2.0 + options.position_floor**2
+    tree = KDTree(map_a.means[:, :2])
+    near = tree.query_ball_point(moved[:, :2], np.sqrt(options.position_gate * spread), return_length=True)
+    fitted = np.isin(matches[:, 1], matches[inside, 1])  # one of those near is the partner found, not chance
+    share = (np.asarray(near, dtype=np.float64) - fitted).clip(min=0.0) / len(map_a)
+    expected = np.bincount(matches[:, 1], share).clip(max=1.0).sum()
+    tests = 0.5 * len(matches) * (len(matches) - 1.0)
+    return bool(tests * pdtrc(np.count_nonzero(inside) - 3.0, expected) > FALSE_ALARMS)
 
 
 def _strongest_rival(
@@ -263,18 +319,14 @@ def _strongest_rival(
     """Return how near the best hypothesis that differs even when refined comes to `pose`, as `Alignment.ratio` says."""
     floor, gate = options.position_floor**2, options.position_gate
 
-    def fits(motion: FloatArray) -> BoolArray:
-        distances = kernels.squared_distances(table, motion, variance)
-        return np.asarray(_one_to_one(matches, distances) & (distances <= gate))
-
-    ours = fits(pose)
+    ours = _fitting(table, matches, pose, variance, gate)
     others = np.ascontiguousarray(hypotheses[_differ(hypotheses[:, :3], pose, centre_b), :3])
     promise = kernels.own_support(table, others, ours, floor, gate)
     strongest = 0.0
     for i in np.argsort(-promise, kind="stable")[:RIVALS]:
         refined = kernels.refine(table, others[i].copy(), floor, gate)[0]
         if _differ(refined[None], pose, centre_b)[0]:
-            theirs = fits(refined)
+            theirs = _fitting(table, matches, refined, variance, gate)
             own = max(float(np.count_nonzero(ours & ~theirs)), 0.5 * float(np.count_nonzero(ours)), 1.0)
             strongest = max(strongest, float(np.count_nonzero(theirs & ~ours)) / own)
     return strongest
@@ -298,8 +350,7 @@ def _is_mirrored(
     full = np.empty((len(table), 3, 3))
     full[:, upper[0], upper[1]] = full[:, upper[1], upper[0]] = table[:, 12:]
     image[:, 12:] = (mirror @ full @ mirror)[:, upper[0], upper[1]]
-    distances = kernels.squared_distances(image, pose, options.position_floor**2)
-    fits = _one_to_one(matches, distances) & (distances <= options.position_gate)
+    fits = _fitting(image, matches, pose, options.position_floor**2, options.position_gate)
     more = np.count_nonzero(fits & ~inside) - np.count_nonzero(inside & ~fits)
     return bool(more >= max(MIRRORED[0], MIRRORED[1] * np.count_nonzero(inside)))
 

@@ -31,7 +31,9 @@ class AlignmentOptions:
         appearance: Whether only landmarks that look alike may be the same. False: any two of the same height may, where
             all look the same; two maps then have at most 10,000 such pairs.
         descriptor_gate: Largest L2 distance between matched descriptors [-].
-        descriptor_ratio: A match must be closer than this times the best landmark of another place [-].
+        descriptor_ratio: A match stands out if it is closer than this times the best landmark of another place [-].
+        look_alikes: Landmarks that have up to so many look-alikes within the gate in the other map may be any of them;
+            with more they must stand out. 0: all must.
         same_place: Landmarks of one map within this distance may be duplicates, and do not compete [m].
         position_gate: Largest squared Mahalanobis residual of an inlier [-]; 11.34 is 99 % of 3 degrees of freedom.
         position_floor: Standard deviation added to the residuals, because filters' maps are over-confident [m].
@@ -48,13 +50,14 @@ class AlignmentOptions:
     appearance: bool = True
     descriptor_gate: float = 0.45
     descriptor_ratio: float = 0.8
+    look_alikes: int = 6
     same_place: float = 1.0
     position_gate: float = 11.34
     position_floor: float = 0.1
     min_inliers: int = 8
     max_ratio: float = 0.6
     min_spread: float = 2.0
-    max_sigma_position: float = 0.18
+    max_sigma_position: float = 0.17
     max_sigma_heading: float = 0.025
     success_probability: float = 0.999
     max_samples: int = 20_000
@@ -71,6 +74,7 @@ class AlignmentOptions:
             check_float(f"options.{name}", getattr(self, name), "Give a distance in metres.", at_least=0.0)
         probability = self.success_probability
         check_float("options.success_probability", probability, "Use e.g. 0.999.", above=0.0, at_most=1.0 - 1e-12)
+        check_int("options.look_alikes", self.look_alikes, 0, "Use 0 to demand that all stand out.")
         check_int("options.min_inliers", self.min_inliers, FEWEST_INLIERS, "Two fit any motion: demand more.")
         check_int("options.max_samples", self.max_samples, 1, "Allow at least one sample.")
 

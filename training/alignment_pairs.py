@@ -20,10 +20,11 @@ DESCRIPTOR_NOISE = 0.17  # root mean square length
 FEWEST_TRUE = 12  # true pairs of an identifiable pair of maps
 LEAST_SPREAD = 2.0  # they extend over this at least [m]
 UNALIGNABLE = (
-    "no overlap", "no overlap, corridors", "mirrored corridor", "mirrored map", "shifted corridor", "twin rooms",
-    "half alike",
+    "no overlap", "no overlap, corridors", "no overlap, look-alikes", "no overlap, look-alikes in corridors",
+    "mirrored corridor", "mirrored map", "shifted corridor", "twin rooms", "half alike",
 )  # fmt: skip
-IDENTIFIABLE = ("area", "corridor", "area, rival", "corridor, rival")
+IDENTIFIABLE = ("area", "corridor", "area, rival", "corridor, rival", "area, look-alikes")
+CLASS = 3  # so many of all landmarks look the same where there are look-alikes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,7 +78,7 @@ def draw_identifiable(kind: str, rng: np.random.Generator) -> MapPair:
 
     Args:
         kind: "area" or "corridor": where the true pairs lie; "..., rival": up to half as many wrong ones agree on
-            another motion.
+            another motion; "..., look-alikes": three of all landmarks always look the same.
         rng: Source of the draws.
     """
     check_choice("kind", kind, IDENTIFIABLE)
@@ -95,6 +96,8 @@ def draw_identifiable(kind: str, rng: np.random.Generator) -> MapPair:
         count = min(right // 2, alike - right)
         rows = slice(right, right + count)
         points_b[rows] = transform_points(_other_motion(rng), points_a[rows])
+    if kind.endswith("look-alikes"):
+        return _look_alikes(points_a, points_b, right, rng)
     return _pair(points_a, points_b, right, alike, rng)
 
 
@@ -102,11 +105,12 @@ def draw_unalignable(kind: str, rng: np.random.Generator) -> MapPair:
     """Draw maps that must not be aligned: nothing tells where one lies in the other, or two places say so alike.
 
     Args:
-        kind: "no overlap": other places, where all landmarks look alike pairwise by chance. "no overlap, corridors":
-            likewise, but thin. "mirrored corridor": its two walls are swapped. "mirrored map": the mirror image of an
-            area. "shifted corridor": doors that repeat, so that two shifts or more are supported almost alike. "twin
-            rooms": two rooms that look the same, of which b has seen one or both. "half alike": half of all
-            landmarks look like wrong ones that agree on another place, about as many as are right.
+        kind: "no overlap": other places, where all landmarks look alike pairwise by chance. "..., corridors": likewise,
+            but thin. "..., look-alikes": three of all landmarks always look the same. "mirrored corridor": its two
+            walls are swapped. "mirrored map": the mirror image of an area. "shifted corridor": doors that repeat, so
+            that two shifts are supported almost alike. "twin rooms": two rooms that look the same, of which b has seen
+            one. "half alike": half of all landmarks look like wrong ones that agree on another place, about as many as
+            agree on a first.
         rng: Source of the draws.
     """
     check_choice("kind", kind, UNALIGNABLE)
@@ -115,6 +119,8 @@ def draw_unalignable(kind: str, rng: np.random.Generator) -> MapPair:
     area = (SQUARE, SQUARE)
     if kind.startswith("no overlap"):
         size = corridor if kind.endswith("corridors") else area
+        if "look-alikes" in kind:
+            return _look_alikes(_spread(count, size, rng), _spread(count, size, rng), 0, rng)
         return _pair(_spread(count, size, rng), _spread(count, size, rng), 0, count, rng)
     if kind.startswith("mirrored"):
         points = _spread(count, corridor if kind.endswith("corridor") else area, rng)
@@ -141,6 +147,15 @@ def _twin_rooms(count: int, rng: np.random.Generator) -> MapPair:
     a = np.concatenate([room, transform_points([14.0, *rng.uniform(-3.0, 3.0, 2)], room)])
     looks = _unit(half, rng)
     return _pair_of(a, np.concatenate([looks, looks]), room, looks, 0, rng)
+
+
+def _look_alikes(points_a: FloatArray, points_b: FloatArray, right: int, rng: np.random.Generator) -> MapPair:
+    """Return maps with the first `right` rows in common, in which three of all landmarks always look the same."""
+    count = len(points_a) + len(points_b) - right
+    classes = rng.permutation(count) // CLASS
+    looks = _unit(-(-count // CLASS), rng)[classes]
+    looks_b = np.concatenate([looks[:right], looks[len(points_a) :]])
+    return _pair_of(points_a, looks[: len(points_a)], points_b, looks_b, right, rng)
 
 
 def _spread(count: int, size: tuple[float, float], rng: np.random.Generator) -> FloatArray:

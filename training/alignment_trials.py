@@ -52,8 +52,8 @@ def cases(kind: Kind) -> tuple[str, ...]:
 @lru_cache(maxsize=1)
 def maps_of(kind: Kind, case: str, overlap: float, outliers: float, seed: int) -> MapPair:
     """Return the maps of a trial; all methods are tried on the same."""
-    stream = np.random.SeedSequence([seed, KINDS.index(kind), cases(kind).index(case)])
-    rng = np.random.default_rng(stream)
+    cell = KINDS.index(kind), cases(kind).index(case), round(1000 * overlap), round(1000 * outliers)
+    rng = np.random.default_rng([seed, *cell])  # cells share no draws, so that their errors are independent
     if kind == "grid":
         return draw_pair(overlap, outliers, rng)
     return draw_unalignable(case, rng) if kind == "U" else draw_identifiable(case, rng)

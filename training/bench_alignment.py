@@ -15,7 +15,7 @@ GRID = (
     (1.0, 0.0), (0.5, 0.0), (0.5, 0.5), (0.25, 0.0), (0.25, 0.5), (0.25, 0.75), (0.1, 0.0), (0.1, 0.5), (0.1, 0.8),
     (0.1, 0.9),
 )  # fmt: skip
-QUICK = {"seeds": 10, "hard": 28}
+QUICK = {"seeds": 10, "hard": 45}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -30,7 +30,7 @@ class AlignmentBenchConfig:
     """
 
     methods: tuple[str, ...] = METHODS
-    seeds: int = 200
+    seeds: int = 500
     hard: int = 1000
     seed: int = 0
 

@@ -19,10 +19,10 @@ def bench_alignment(
     methods: Annotated[
         str | None, typer.Option(help="Of ransac, svd, icp, impicp, gnc, clique.", show_default="all")
     ] = None,
-    seeds: Annotated[int | None, typer.Option(help="Trials of each cell of the grid.", show_default="200")] = None,
+    seeds: Annotated[int | None, typer.Option(help="Trials of each cell of the grid.", show_default="500")] = None,
     hard: Annotated[int | None, typer.Option(help="Trials of each hard set.", show_default="1000")] = None,
     first_seed: Annotated[int | None, typer.Option(help="The first seed.", show_default="0")] = None,
-    quick: Annotated[bool, typer.Option("--quick", help="10 trials of each cell, 28 of each hard set.")] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="10 trials of each cell, 45 of each hard set.")] = False,
     check: Annotated[bool, typer.Option("--check", help="Exit with status 1 unless ransac meets all goals.")] = False,
     out: Annotated[
         Path | None,

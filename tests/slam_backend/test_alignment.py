@@ -326,7 +326,7 @@ def test_duplicates_do_not_kill_a_match_but_look_alikes_elsewhere_do() -> None:
             np.vstack([RICH.descriptors, copied]),
         )
 
-    options = AlignmentOptions(descriptor_ratio=0.5)
+    options = AlignmentOptions(descriptor_ratio=0.5, look_alikes=0)
     blurry = replace(RICH, descriptors=RICH.descriptors + np.float32(0.004))
     near, far = with_copy([0.3, 0.3, 0.0]), with_copy([5.0, 0.0, 0.0])
     assert 0 in candidate_matches(blurry, near, options)[:, 0]
@@ -377,6 +377,7 @@ def test_bad_input_gives_one_clear_error() -> None:
         ("same_place", -1.0, "options.same_place: expected a finite number >= 0"),
         ("min_spread", float("nan"), "options.min_spread: expected"),
         ("min_inliers", 2, "options.min_inliers: expected an int >= 3, got 2"),
+        ("look_alikes", -1, "options.look_alikes: expected an int >= 0, got -1"),
         ("max_samples", 0, "options.max_samples: expected an int >= 1"),
         ("success_probability", 1.0, "options.success_probability: expected"),
         ("position_floor", "wide", "options.position_floor: expected"),

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from slam_backend import _alignment_kernels as kernels
 from slam_backend import _clique_kernels as cliques
 from slam_backend import _proposals as proposals
+from slam_backend._matching import look_alikes
 from slam_backend.alignment import METHODS, AlignmentOptions, align_maps, candidate_matches, propose_motion
 from slam_backend.geometry import between, inverse, transform_points
 from slam_backend.landmark_map import LandmarkMap
@@ -223,6 +224,51 @@ def test_a_shared_cluster_makes_no_rival() -> None:
             rng.uniform(0.0, [3.0, 3.0, 1.5], (20, 3)), rng.uniform(-15.0, [15.0, 15.0, 1.5], (120, 3)),
         ]))  # fmt: skip
         assert align_maps(a, seen_from(a, TURNED, 120, rng)).reason != "ambiguous"
+
+
+def threefold(rng: np.random.Generator, n: int, shared: int) -> tuple[LandmarkMap, LandmarkMap]:
+    """Draw two maps of n landmarks, of which `shared` are common and of all of which three always look the same."""
+    points = rng.uniform(0.0, [20.0, 15.0, 1.5], (2 * n - shared, 3))
+    classes = rng.standard_normal((len(points) // 3 + 1, D))
+    looks = (classes / np.linalg.norm(classes, axis=1, keepdims=True))[rng.permutation(len(points)) // 3]
+    a, b = (
+        landmark_map(rng, points[rows], looks[rows] + 0.15 * rng.standard_normal((n, D)) / np.sqrt(D))
+        for rows in (slice(n), slice(n - shared, None))
+    )
+    return a, seen_from(b, TURNED, 0, rng)
+
+
+def test_pairs_of_look_alikes_are_those_within_the_gate() -> None:
+    """All pairs within the gate, but none of a landmark with more of them than are allowed: as a plain search says."""
+    rng = np.random.default_rng(16)
+    a, b = threefold(rng, 90, 45)
+    distances = np.linalg.norm(a.descriptors[:, None].astype(float) - b.descriptors[None].astype(float), axis=2)
+    within = distances <= 0.45
+    for most in (2, 3):
+        kept = within & (within.sum(axis=1) <= most)[:, None] & (within.sum(axis=0) <= most)
+        assert look_alikes(a.descriptors, b.descriptors, 0.45, most).tolist() == np.argwhere(kept).tolist()
+        assert kept.sum() > 10
+    assert look_alikes(a.descriptors[:0], b.descriptors, 0.45, 3).shape == (0, 2)
+
+
+@pytest.mark.parametrize("method", ["ransac", "clique", "gnc"])
+def test_geometry_tells_look_alikes_apart(method: str) -> None:
+    """Where three of all landmarks look the same hardly any stands out, and yet nearly all common ones are found."""
+    a, b = threefold(np.random.default_rng(17), 120, 50)
+    assert align_maps(a, b, method, options=AlignmentOptions(look_alikes=0)).reason == "too few candidates"
+    found = align_maps(a, b, method)
+    assert found.success, found.reason
+    assert off(found.transform, TURNED) < 0.05
+    assert 48 <= len(found.inliers) <= 51
+    assert len(np.unique(found.inliers[:, 0])) == len(np.unique(found.inliers[:, 1])) == len(found.inliers)
+
+
+def test_look_alikes_elsewhere_are_not_taken_for_the_place() -> None:
+    """Without a common landmark look-alikes come together only by chance, and that is known for what it is."""
+    for seed in range(20):
+        a, b = threefold(np.random.default_rng([18, seed]), 150, 0)
+        assert len(candidate_matches(a, b, AlignmentOptions())) > 40
+        assert align_maps(a, b).reason == "too few inliers"
 
 
 @pytest.mark.parametrize("method", ["ransac", "clique"])

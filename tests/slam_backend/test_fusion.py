@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from slam_backend import fusion
-from slam_backend.alignment import Alignment
-from slam_backend.geometry import compose, rotation, transform_points
+from slam_backend.alignment import Alignment, align_maps
+from slam_backend.geometry import compose, inverse, rotation, transform_points
 from slam_backend.landmark_map import FIELDS, LandmarkMap
 from slam_backend.metrics import anees, nees
 
@@ -180,6 +180,29 @@ def test_fused_maps_keep_a_and_append_what_is_new_in_b() -> None:
     expected = fusion.fuse_landmarks(map_a.means[1], map_a.covariances[1], moved.means[3], moved.covariances[3])
     np.testing.assert_allclose(fused.means[1], expected[0], atol=1e-12)
     np.testing.assert_allclose(fused.covariances[1], expected[1], atol=1e-12)
+
+
+def test_maps_that_were_aligned_and_fused_are_as_certain_as_they_claim() -> None:
+    """With the motion's own covariance, a's landmarks, the fused ones and b's moved ones all have an ANEES of 1."""
+    squares = []
+    for seed in range(40):
+        rng = np.random.default_rng([9, seed])
+        truth = rng.uniform(0.0, [30.0, 30.0, 1.5], (120, 3))
+        looks = rng.standard_normal((120, 32))
+        looks /= np.linalg.norm(looks, axis=1, keepdims=True)
+        pose = np.array([*rng.uniform(-9.0, 9.0, 2), rng.uniform(-3.0, 3.0)])
+        sigma = np.tile(0.05**2 * np.eye(3), (70, 1, 1))
+        a, b = (
+            LandmarkMap(points + 0.05 * rng.standard_normal(points.shape), sigma, looks[rows])
+            for rows, points in ((slice(70), truth[:70]), (slice(50, 120), transform_points(inverse(pose), truth[50:])))
+        )
+        fused = fusion.fuse_maps(a, b, align_maps(a, b))
+        assert len(fused) == 120
+        squares.append(nees(fused.means - truth, fused.covariances) / 3.0)
+    parts = np.array(squares)
+    # Sampling: 4 sigma; what b's landmarks share, the error of one motion in each run, makes theirs spread more.
+    for rows, width in ((slice(50), 0.08), (slice(50, 70), 0.12), (slice(70, 120), 0.25)):
+        assert parts[:, rows].mean() == pytest.approx(1.0, abs=width)
 
 
 def test_fusing_with_an_empty_map_changes_nothing() -> None:

@@ -149,9 +149,9 @@ def test_a_trial_repeats() -> None:
 
 def test_every_method_meets_the_same_trials() -> None:
     """Trials come cell by cell and seed by seed, each once for each method; U and I never share a seed's maps."""
-    config = AlignmentBenchConfig(methods=("ransac", "gnc"), seeds=3, hard=8, seed=100)
+    config = AlignmentBenchConfig(methods=("ransac", "gnc"), seeds=3, hard=10, seed=100)
     trials = config.trials()
-    assert len(trials) == len(set(trials)) == 2 * (3 * len(GRID) + 16)
+    assert len(trials) == len(set(trials)) == 2 * (3 * len(GRID) + 20)
     assert {trial.case for trial in trials if trial.kind == "I"} == set(IDENTIFIABLE)
     assert AlignmentBenchConfig.from_mapping(config.to_mapping() | {"seed": 100}) == config
 
@@ -177,7 +177,7 @@ def test_the_command_leaves_tables_a_figure_and_every_trial(
 ) -> None:
     """A small bench ends with its goals; begun again in the same folder, nothing is run twice."""
     out, copy = tmp_path / "bench", tmp_path / "copy.json"
-    options = ("--methods", "ransac,gnc", "--seeds", "1", "--hard", "7", "--first-seed", "100", "--out", str(out))
+    options = ("--methods", "ransac,gnc", "--seeds", "1", "--hard", "9", "--first-seed", "100", "--out", str(out))
     assert run(monkeypatch, *options, "--json", str(copy)) == 0
     assert "I: share accepted" in capsys.readouterr().out
     metrics = json.loads((out / "metrics.json").read_text())
@@ -186,7 +186,7 @@ def test_the_command_leaves_tables_a_figure_and_every_trial(
     assert (out / "alignment.png").stat().st_size > 10_000
     assert "| 10 % | 90 % | ransac | 100.0 |" in (out / "tables.md").read_text()
     trials = (out / "trials.jsonl").read_text()
-    assert len(trials.splitlines()) == 2 * (len(GRID) + 14)
+    assert len(trials.splitlines()) == 2 * (len(GRID) + 18)
     assert run(monkeypatch, *options) == 0
     assert (out / "trials.jsonl").read_text() == trials
     poor = ("--methods", "svd", "--seeds", "1", "--hard", "0", "--check", "--out", str(tmp_path / "b"))
