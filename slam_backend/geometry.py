@@ -1,11 +1,14 @@
 """Rigid motions of the plane: poses (x, y, theta) as arrays, theta in [-pi, pi), `p_a = R(theta) p_b + t`."""
 
+import math
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from slam_backend.errors import FloatArray
+
+ONE = (3,)  # shape of a single pose
 
 
 def wrap_angle(angle: ArrayLike) -> Any:
@@ -38,6 +41,8 @@ def compose(a_from_b: ArrayLike, b_from_c: ArrayLike) -> FloatArray:
     [1.0, 2.0, 1.570796]
     """
     a, b = np.asarray(a_from_b, dtype=np.float64), np.asarray(b_from_c, dtype=np.float64)
+    if a.shape == b.shape == ONE:
+        return _compose_one(a.tolist(), b.tolist())
     c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
     x, y = b[..., 0], b[..., 1]
     result = np.empty(a.shape if a.shape == b.shape else np.broadcast_shapes(a.shape, b.shape))
@@ -50,6 +55,8 @@ def compose(a_from_b: ArrayLike, b_from_c: ArrayLike) -> FloatArray:
 def inverse(a_from_b: ArrayLike) -> FloatArray:
     """Turn a motion around: the pose (..., 3) of a in b from the pose (..., 3) of b in a."""
     a = np.asarray(a_from_b, dtype=np.float64)
+    if a.shape == ONE:
+        return _inverse_one(a.tolist())
     c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
     x, y = a[..., 0], a[..., 1]
     result = np.empty(a.shape)
@@ -57,6 +64,20 @@ def inverse(a_from_b: ArrayLike) -> FloatArray:
     result[..., 1] = s * x - c * y
     result[..., 2] = wrap_angle(-a[..., 2])
     return result
+
+
+# One pose at a time is the rule in an environment's step: plain floats take a third of the time, and give the same bits.
+
+
+def _compose_one(a: list[float], b: list[float]) -> FloatArray:
+    c, s = float(np.cos(a[2])), float(np.sin(a[2]))
+    x, y = a[0] + c * b[0] - s * b[1], a[1] + s * b[0] + c * b[1]
+    return np.array([x, y, (a[2] + b[2] + math.pi) % (2.0 * math.pi) - math.pi])
+
+
+def _inverse_one(a: list[float]) -> FloatArray:
+    c, s = float(np.cos(a[2])), float(np.sin(a[2]))
+    return np.array([-c * a[0] - s * a[1], s * a[0] - c * a[1], (math.pi - a[2]) % (2.0 * math.pi) - math.pi])
 
 
 def between(w_from_a: ArrayLike, w_from_b: ArrayLike) -> FloatArray:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields
+from functools import partial
 from typing import Any, Self
 
 from slam_backend.errors import bad_argument, check_int
@@ -210,7 +211,7 @@ def run_bench(
     def keep(name: str, call: Callable[[], Any]) -> Callable[[], None]:
         return lambda: results.update({name: call()})
 
-    trials: list[tuple[str, Callable[[], None]]] = [(_title(load), lambda load=load: row(load)) for load in loads]  # type: ignore[misc]
+    trials: list[tuple[str, Callable[[], None]]] = [(_title(load), partial(row, load)) for load in loads]
     trials.insert(1, ("budget", budget))
     trials.insert(2, ("simulator", keep("simulator", lambda: time_simulator(base, seed, steps, WARM_UP))))
     if config.peer:
