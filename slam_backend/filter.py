@@ -240,7 +240,7 @@ class FastSlam:
         """Return (M, c) of padded rows (c, P). A copy."""
         return rows[:, : self.num_particles].T.copy()
 
-    def map(self, estimate: Literal["best", "mixture"] = "best") -> LandmarkMap:
+    def map(self, estimate: Literal["best", "mixture"] = "best", min_count: int = 1) -> LandmarkMap:
         """Return the map in the map frame, landmarks by ascending id.
 
         Args:
@@ -248,16 +248,18 @@ class FastSlam:
                 mean and covariance over all particles that hold the landmark, path uncertainty included,
                 sum w_m (Sigma_m + (mu_m - mu)(mu_m - mu)^T) (Sec. 3.2, see ERRATA); the landmarks are those of the most
                 probable particle.
+            min_count: Landmarks measured fewer times are left out.
         """
         check_choice("estimate", estimate, ("best", "mixture"))
         slots = self._maps.used_slots()
         values, counts = self._maps.of_particle(self.best_particle, slots)
-        slots, values, counts = slots[counts > 0], values[counts > 0], counts[counts > 0]
+        held = counts >= max(min_count, 1)
+        slots, values, counts = slots[held], values[held], counts[held]
         if estimate == "best":
-            means, covariances = values[:, :3], values[:, 3:][:, UNPACK]
+            means, covariances = np.ascontiguousarray(values[:, :3]), values[:, 3:][:, UNPACK]
         else:
-            dense, held = self._maps.dense(slots)
-            weights = np.exp(self._log_weights) * (held > 0)
+            dense, times = self._maps.dense(slots)
+            weights = np.exp(self._log_weights) * (times > 0)
             weights /= np.maximum(weights.sum(axis=1, keepdims=True), 1e-300)
             mixed = np.einsum("ncm,nm->nc", dense, weights)
             means = mixed[:, :3]

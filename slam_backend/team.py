@@ -199,9 +199,11 @@ class TeamSlam:
         branch, index = self._find(robot)
         return branch.filter.particles_from_start(index)
 
-    def map(self, robot: int, estimate: Literal["best", "mixture"] = "best") -> LandmarkMap:
+    def map(
+        self, robot: int, estimate: Literal["best", "mixture"] = "best", min_count: int = 1
+    ) -> LandmarkMap:
         """Return the map that the robot goes by in its map frame; see `FastSlam.map`."""
-        return self._find(robot)[0].filter.map(estimate)
+        return self._find(robot)[0].filter.map(estimate, min_count)
 
     def start_from_group(self, robot: int) -> FloatArray:
         """Return (3,) the motion from the map frame of the robot's filter to the robot's own start frame.

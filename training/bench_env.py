@@ -216,7 +216,8 @@ def run_bench(
     trials.insert(2, ("simulator", keep("simulator", lambda: time_simulator(base, seed, steps, WARM_UP))))
     if config.peer:
         trials.insert(3, ("peer", keep("peer", lambda: time_peer(loads[0].robots, steps, WARM_UP, seed))))
-    trials.insert(4, ("reset", keep("reset", lambda: time_resets(vslam_v0.parallel_env(config=base), seed, min(20, steps)))))
+    resets = keep("reset", lambda: time_resets(vslam_v0.parallel_env(config=base), seed, min(20, steps)))
+    trials.insert(4, ("reset", resets))
     begun, often = min(300, steps), min(60, 4 + steps)
     snapshots = keep("snapshots", lambda: time_snapshots(vslam_v0.parallel_env(config=base), seed, begun, often))
     trials.insert(5, ("snapshots", snapshots))

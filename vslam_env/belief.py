@@ -114,8 +114,10 @@ class TeamBelief:
         self._grids.follow(self._tick, report.entries, report.renamings)
         self._grids.meet(self._mates, self._starts)
         for robot, mates in enumerate(self._mates):
-            poses = compose(self._starts[robot], self._means[list(mates)])
-            poses[mates.index(robot)] = self._poses[robot]
+            poses = self._poses[robot : robot + 1]
+            if len(mates) > 1:
+                poses = compose(self._starts[robot], self._means[list(mates)])
+                poses[mates.index(robot)] = self._poses[robot]
             self._grids.paint(self._tick, robot, mates, poses, readings)
         for robot in range(self.num_robots):
             if self._candidates_are_due(robot):
@@ -146,8 +148,7 @@ class TeamBelief:
         """Return the confirmed landmarks of a robot's group, in the group's map frame."""
         number = self._numbers[robot]
         if number not in self._maps:
-            whole = self._team.map(robot)
-            self._maps[number] = whole.subset(whole.counts >= self._confirm_after)
+            self._maps[number] = self._team.map(robot, min_count=self._confirm_after)
         return self._maps[number]
 
     def start_from_group(self, robot: int) -> FloatArray:

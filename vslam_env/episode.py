@@ -7,11 +7,12 @@ from typing import Any
 import numpy as np
 
 from slam_backend.errors import FloatArray, IntArray
-from slam_backend.geometry import between, compose, wrap_angle
+from slam_backend.geometry import between, compose
 from vslam_env.belief import Body, TeamBelief
 from vslam_env.config import TICK, EnvConfig
 from vslam_env.errors_of_maps import MapScores, world_from_group
 from vslam_env.oracle import true_alignment
+from vslam_env.pose_errors import pose_errors
 from vslam_env.readings import Readings
 from vslam_env.reward import Standing
 from vslam_env.sensors import Frame
@@ -116,8 +117,7 @@ class Episode:
 
     def pose_errors(self) -> FloatArray:
         """Return (K, 2): how far each robot is from where it believes to be [m], and its heading likewise [rad]."""
-        difference = self.believed_poses() - self._simulator.poses
-        return np.column_stack([np.hypot(*difference[:, :2].T), np.abs(wrap_angle(difference[:, 2]))])
+        return pose_errors(self.true_starts, self.estimated_path[-1], self._simulator.poses)
 
     def standing(self, scores: Sequence[MapScores], pose_errors: FloatArray) -> Standing:
         """Return how the team stands, from what `map_scores` and `pose_errors` returned."""

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from small_env import MEETING, room, small_env, turning, wander
 
-from slam_backend.geometry import between, compose
+from slam_backend.geometry import between, compose, wrap_angle
 from vslam_env import World
 from vslam_env.actions import DISCRETE_COMMANDS, command_of
+from vslam_env.pose_errors import pose_errors
 
 INFO_KEYS = [
     "map_error",
@@ -372,3 +373,13 @@ def test_worlds_of_all_kinds() -> None:
     env.reset(seed=1)
     assert np.allclose(env.true_start_poses, own.start_poses)
     assert small_env(world="fig5").reset(seed=0)
+
+
+def test_pose_errors_are_differences_of_placed_poses() -> None:
+    """An estimated pose, laid at the true start, is compared with the true pose: position and heading."""
+    rng = np.random.default_rng(4)
+    starts, estimated, true = rng.uniform(-4.0, 4.0, (3, 20, 3))
+    placed = compose(starts, estimated)
+    errors = pose_errors(starts, estimated, true)
+    np.testing.assert_allclose(errors[:, 0], np.linalg.norm(placed[:, :2] - true[:, :2], axis=1))
+    np.testing.assert_allclose(errors[:, 1], np.abs(wrap_angle(placed[:, 2] - true[:, 2])))
