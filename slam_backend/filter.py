@@ -7,6 +7,7 @@ particles are resampled.
 
 import copy
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
@@ -16,6 +17,7 @@ from slam_backend import _kernels
 from slam_backend._existence_step import ExistenceStep
 from slam_backend._frame_buffers import UPPER, FrameBuffers, Turn
 from slam_backend._particle_maps import ParticleMaps, aligned
+from slam_backend._rejuvenation_step import RejuvenationStep, write_maps
 from slam_backend._step_input import check_step
 from slam_backend.adaptation import AdaptiveParticles, next_num_particles
 from slam_backend.camera import StereoCamera
@@ -26,9 +28,10 @@ from slam_backend.geometry import between, compose, rotate_covariances, rotation
 from slam_backend.landmark_map import LandmarkMap
 from slam_backend.measurements import Measurements
 from slam_backend.motion import OdometryModel
-from slam_backend.reports import PoseEstimate, StepReport
+from slam_backend.reports import PoseEstimate, RejuvenationReport, StepReport
 from slam_backend.resampling import RESAMPLING
 from slam_backend.run_log import RobotLog
+from slam_backend.smoothing.options import SmoothingOptions
 
 UNPACK = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 NOTHING = np.zeros(3)
@@ -44,7 +47,7 @@ class FastSlam:
         initial_poses: (K, 3) [m, m, rad], map frame. None: all at the origin.
         num_particles, camera, motion, proposal, resampling, resample_threshold, position_gate, descriptor_gate,
         dead_zone, dead_radius, recovery_position, recovery_heading, descriptor_sigma, ambiguity,
-        new_landmark_density, one_to_one, adaptive, existence: See `FilterOptions`.
+        new_landmark_density, one_to_one, adaptive, existence, rejuvenate_every, smoothing: See `FilterOptions`.
 
     Raises:
         ValueError: If an argument is out of its range; the text names it.
@@ -79,6 +82,8 @@ class FastSlam:
         one_to_one: bool = True,
         adaptive: AdaptiveParticles | None = None,
         existence: ExistenceModel | None = None,
+        rejuvenate_every: int | None = None,
+        smoothing: SmoothingOptions | None = None,
         seed: int | np.random.SeedSequence | np.random.Generator = 0,
         initial_poses: ArrayLike | None = None,
     ) -> None:
@@ -101,6 +106,8 @@ class FastSlam:
             one_to_one=one_to_one,
             adaptive=adaptive,
             existence=existence,
+            rejuvenate_every=rejuvenate_every,
+            smoothing=SmoothingOptions() if smoothing is None else smoothing,
         )
         self._set_up(num_robots, options, seed)
         if initial_poses is not None:
@@ -127,6 +134,7 @@ class FastSlam:
         existence = options.existence
         self._existence = None if existence is None else ExistenceStep(existence, options.camera)
         self._maps = ParticleMaps(m, None if existence is None else existence.log_odds_prior)
+        self._rejuvenation = None if options.rejuvenate_every is None else RejuvenationStep(options, k)
         padded = self._maps.padded  # particles come in blocks of lanes; the last block's surplus lanes mean nothing
         self._poses = aligned((k, 3, padded), np.float64)  # x_t^[m] of each robot, map frame
         self._starts = aligned((k, 3, padded), np.float64)  # where each robot started, map frame; spreads at a merge
@@ -335,11 +343,30 @@ class FastSlam:
                     self._steps - 1, moves[robot], exact[robot], turn.points,
                     ids if len(turn.keep) == turn.size else ids[turn.keep], turn.noises if turn.given else None,
                 )  # fmt: skip
+                if self._rejuvenation is not None:
+                    self._rejuvenation.note(robot, self._steps - 1, self._estimates[robot])
         for slots in deserted:
             self._maps.release(slots)
         if report.resampled:
             self._resample()
+        if self._rejuvenation is not None and self._rejuvenation.due(report.associations):
+            return replace(report, rejuvenation=self._rejuvenate(self._rejuvenation))
         return report
+
+    def _rejuvenate(self, smoother: RejuvenationStep) -> RejuvenationReport:
+        """Draw the particles anew from the posterior of whole paths, if it can be found."""
+        m = self.num_particles
+        result = smoother.run(self._logs, self._starts[:, :, :m], self._maps, self._camera, self._rng)
+        if (new := result.particles) is not None:
+            write_maps(self._maps, new)
+            self._poses[:, :, :m], self._starts[:, :, :m] = new.poses, new.starts
+            self._means[:] = self._poses
+            self._covariances.fill(0.0)
+            self._blind.fill(False)
+            self._log_weights[:], self._path_log_weights[:] = new.log_weights, new.log_densities
+            self._weights[:] = np.exp(new.log_weights)
+            self._estimates = [PoseEstimate(*of_robot) for of_robot in zip(new.means, new.covariances, strict=True)]
+        return RejuvenationReport(result.reason, result.ess, result.iterations, result.graph.num_keys)
 
     def _take_turn(
         self,
@@ -464,6 +491,8 @@ class FastSlam:
         self._blind = self._blind[order]
         self._logs = [self._logs[robot] for robot in order]
         self._estimates = [self._estimates[robot] for robot in order]
+        if self._rejuvenation is not None:
+            self._rejuvenation.reorder(order)
 
     # ------------------------------------------------------------------ snapshots
 
@@ -474,6 +503,8 @@ class FastSlam:
         state: dict[str, Any] = {name: getattr(self, name).copy() for name in self._STATE}
         state |= {"steps": self._steps, "estimates": _copies(self._estimates), "maps": self._maps.get_state()}
         state["logs"] = tuple(log.get_state() for log in self._logs)
+        if self._rejuvenation is not None:
+            state["rejuvenation"] = self._rejuvenation.get_state()
         return state | {"options": self.options, "rng": copy.deepcopy(self._rng.bit_generator.state)}
 
     def set_state(self, state: Mapping[str, Any]) -> None:
@@ -495,6 +526,8 @@ class FastSlam:
         self._maps.set_state(state["maps"])
         for log, logged in zip(self._logs, state["logs"], strict=True):
             log.set_state(logged)
+        if self._rejuvenation is not None:
+            self._rejuvenation.set_state(state["rejuvenation"])
         self._steps, self._estimates = state["steps"], list(_copies(state["estimates"]))
         # A stream of its own: the old one may be the caller's, or of another kind.
         self._rng = np.random.Generator(getattr(np.random, state["rng"]["bit_generator"])(0))

@@ -9,6 +9,7 @@ from slam_backend.errors import bad_argument, check_choice, check_float, check_i
 from slam_backend.existence import ExistenceModel
 from slam_backend.motion import OdometryModel
 from slam_backend.resampling import RESAMPLING
+from slam_backend.smoothing.options import SmoothingOptions
 
 PROPOSALS = ("fastslam2", "fastslam1")
 
@@ -43,6 +44,9 @@ class FilterOptions:
         adaptive: How the number of particles follows the spread of the poses at each resampling; None: it stays.
         existence: How the probability that a landmark exists follows from being seen and missed; particles delete
             landmarks that are too improbable. None: what is once in a map stays there.
+        rejuvenate_every: Steps after which particles are drawn anew from the posterior of whole paths, as a smoother
+            finds it; also at the first step after a merge, and sooner when a loop is closed. None: never.
+        smoothing: How that is done.
     """
 
     num_particles: int = 100
@@ -63,6 +67,8 @@ class FilterOptions:
     one_to_one: bool = True
     adaptive: AdaptiveParticles | None = None
     existence: ExistenceModel | None = None
+    rejuvenate_every: int | None = None
+    smoothing: SmoothingOptions = field(default_factory=SmoothingOptions)
 
     def __post_init__(self) -> None:
         check_int("num_particles", self.num_particles, 1, "Use at least one particle; 100 is a good start.")
@@ -84,5 +90,9 @@ class FilterOptions:
                 raise bad_argument(name, f"{model.__name__} or None", value, f"Build one: {model.__name__}().")
         if self.existence is not None:
             self.existence.view(self.camera)  # raises if nothing is left of the view
+        if self.rejuvenate_every is not None:
+            check_int("rejuvenate_every", self.rejuvenate_every, 1, "Give a number of steps, or None for never.")
+        if not isinstance(self.smoothing, SmoothingOptions):
+            raise bad_argument("smoothing", "SmoothingOptions", self.smoothing, "Build them: SmoothingOptions().")
         if not isinstance(self.one_to_one, bool):
             raise bad_argument("one_to_one", "a bool", self.one_to_one, "Say True or False.")

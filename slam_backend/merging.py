@@ -151,6 +151,8 @@ def finish(joint: FastSlam, a: FastSlam, b: FastSlam, renamed: IntArray) -> None
     joint._steps = max(a._steps, b._steps)
     joint._estimates = [joint._mixture(robot) for robot in range(joint.num_robots)]
     joint._logs = [log.copy() for log in a._logs] + [log.renamed(renamed[:, 0], renamed[:, 1]) for log in b._logs]
+    if joint._rejuvenation is not None:
+        joint._rejuvenation.hasten()
 
 
 class _Dense(NamedTuple):

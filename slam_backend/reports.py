@@ -38,6 +38,7 @@ class StepReport:
         nis: Mean of the squared Mahalanobis innovations (3 degrees of freedom, ideal 3) over the measurements that
             the most probable particle matched, without those it had predicted behind the camera; NaN if there is none.
         resampled: Whether the particles were resampled.
+        rejuvenation: What came of drawing particles anew from smoothed paths; None: it was not tried in this step.
     """
 
     associations: tuple[IntArray, ...]
@@ -48,6 +49,24 @@ class StepReport:
     ess: float
     nis: float
     resampled: bool
+    rejuvenation: "RejuvenationReport | None" = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RejuvenationReport:
+    """What came of an attempt to rejuvenate a filter.
+
+    Attributes:
+        reason: Why the old particles stay; "" if there are new ones.
+        ess: Effective sample size of the importance weights of whole paths, in [1, M]; NaN if it did not come to that.
+        iterations: Of the smoother.
+        num_keys: Key poses that it keeps.
+    """
+
+    reason: str
+    ess: float
+    iterations: int
+    num_keys: int
 
 
 @dataclass(frozen=True, slots=True, eq=False)

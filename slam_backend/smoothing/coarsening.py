@@ -13,42 +13,51 @@ import numpy as np
 from slam_backend.errors import BoolArray, FloatArray, IntArray
 from slam_backend.geometry import between, compose, rotation
 from slam_backend.smoothing.graph import NONE, PathGraph, chained
+from slam_backend.smoothing.options import SmoothingOptions
+from slam_backend.smoothing.sightings import Sightings
 from slam_backend.smoothing.solving import Mode
 
+CONTRADICTION = 2.0  # times the kernel's squared distance: measurements farther off are dropped for good
+OF_POINTS = ("points", "point_noises", "given", "point_frames", "point_landmarks")
 
-def coarsened(graph: PathGraph, mode: Mode, spreads: FloatArray, max_keys: int, fresh_keys: int) -> PathGraph:
+
+def coarsened(
+    graph: PathGraph, mode: Mode, spreads: FloatArray, camera: FloatArray, options: SmoothingOptions
+) -> PathGraph:
     """Return the graph at its mode, with old keys condensed and at most `max_keys` of them, if the fresh ones allow.
 
     Args:
         graph: As it was solved.
         mode: Of it.
         spreads: (k,) [m^2] how far the motion from the key before scatters.
-        max_keys: Of all robots together.
-        fresh_keys: Newest ones to be left as they are, of all robots together.
+        camera: As in `find_mode`.
+        options: How many keys, and how many of them fresh, of all robots together.
     """
-    share = max(1, fresh_keys // len(graph.tips))
+    share = max(1, options.fresh_keys // len(graph.tips))
     fresh = np.zeros(graph.num_keys, dtype=np.bool_)
     for robot in range(len(graph.tips)):
         fresh[np.flatnonzero(graph.robots == robot)[-share:]] = True
     at_mode = replace(graph, poses=mode.poses, landmarks=mode.landmarks)
-    condensed = _condensed(at_mode, mode, fresh)
+    condensed = _condensed(at_mode, mode, fresh, camera, options)
     condensed = _without_blind(condensed, fresh)
-    representatives, slack = _representatives(condensed, spreads, fresh, max_keys)
+    representatives, slack = _representatives(condensed, spreads, fresh, options.max_keys)
     return compacted(_joined(replace(condensed, slack=slack), representatives))
 
 
-def _condensed(graph: PathGraph, mode: Mode, fresh: BoolArray) -> PathGraph:
-    """Freeze what was measured from keys that are no longer fresh."""
-    seen = mode.sightings
+def _condensed(
+    graph: PathGraph, mode: Mode, fresh: BoolArray, camera: FloatArray, options: SmoothingOptions
+) -> PathGraph:
+    """Freeze what was measured from keys that are no longer fresh, but for what the smoothed path contradicts."""
+    old = ~fresh[graph.frame_keys[graph.point_frames]]
+    if options.kernel and (lost := old & (mode.sightings.squares > CONTRADICTION * options.kernel)).any():
+        graph = replace(graph, **{name: getattr(graph, name)[~lost] for name in OF_POINTS})
+    seen = Sightings.of(graph)
+    seen.linearise(graph, mode.poses, mode.landmarks, camera, options.noise_scale, options.kernel)
     frozen = seen.frozen | ~fresh[seen.keys]
     keep = fresh[graph.frame_keys[graph.point_frames]]
     return replace(
         graph,
-        points=graph.points[keep],
-        point_noises=graph.point_noises[keep],
-        given=graph.given[keep],
-        point_frames=graph.point_frames[keep],
-        point_landmarks=graph.point_landmarks[keep],
+        **{name: getattr(graph, name)[keep] for name in OF_POINTS},
         frozen_keys=seen.keys[frozen],
         frozen_landmarks=seen.landmarks[frozen],
         centres=seen.centres[frozen],
@@ -63,11 +72,11 @@ def _without_blind(graph: PathGraph, fresh: BoolArray) -> PathGraph:
     sighted = np.zeros(graph.num_keys, dtype=np.bool_)
     sighted[graph.frozen_keys] = True
     sighted[graph.frame_keys[graph.point_frames]] = True
-    blind = ~sighted & ~fresh & (graph.previous >= 0)
+    blind = ~sighted & ~fresh & graph.linked
     if not blind.any():
         return graph
     previous, motions, noises = graph.previous.copy(), graph.motions.copy(), graph.noises.copy()
-    for key in np.flatnonzero(previous >= 0):  # in the order of time
+    for key in np.flatnonzero(graph.linked):  # in the order of time
         before = previous[key]
         while blind[before]:
             motions[key], noises[key] = chained(motions[before], noises[before], motions[key], noises[key])
@@ -83,10 +92,10 @@ def _representatives(
     k = graph.num_keys
     representative = np.arange(k)
     following = np.full(k, NONE)
-    linked = np.flatnonzero(graph.previous >= 0)
+    linked = np.flatnonzero(graph.linked)
     following[graph.previous[linked]] = linked  # a blind key was replaced by its successor, if it has one
-    needed = following[np.maximum(graph.previous, 0)] == np.arange(k)
-    needed |= graph.previous < 0
+    needed = np.ones(k, dtype=np.bool_)
+    needed[linked] = following[graph.previous[linked]] == linked
     representative[~needed] = NONE
     surplus = int(needed.sum()) - max_keys
     slack, previous = graph.slack.copy(), graph.previous.copy()
@@ -139,6 +148,7 @@ def _joined(graph: PathGraph, representative: IntArray) -> PathGraph:
         infos=sightings[3],
         slopes=sightings[4],
         counts=sightings[5],
+        heads=number[graph.heads],
         tips=number[graph.tips],
     )
 

@@ -7,11 +7,13 @@ from typing import NamedTuple
 import numpy as np
 
 from slam_backend.errors import BoolArray, FloatArray, IntArray, bad_argument
-from slam_backend.geometry import compose, rotation
+from slam_backend.geometry import between, compose, rotation, wrap_angle
 from slam_backend.log_arrays import EXACT, ODOMETRY, REJECTED, LogArrays
 from slam_backend.motion import OdometryModel
 
 NONE = -1
+VAGUE = (1e4, 1e4, 10.0)  # variances [m^2, m^2, rad^2] of a start of which nothing is known
+RIGID = 1e-4  # [m, rad]; starts that scatter less against each other do not move
 
 
 def _empty(*shape: int) -> FloatArray:
@@ -30,9 +32,10 @@ class PathGraph:
     measurements of the newest keys are kept; those of older keys are condensed into frozen sightings.
 
     Attributes:
-        robots: (k,) int64. Whose pose each key is; keys of a robot are in the order of time.
+        robots: (k,) int64. Whose pose each key is, `NONE` for the origin; keys of a robot are in the order of time.
         poses: (k, 3) float64 [m, m, rad], map frame. The last mode.
-        previous: (k,) int64. The key before, `NONE` for the start of a robot, which is given.
+        previous: (k,) int64. The key before, `NONE` where the pose is given: the origin, or a robot's start. A start
+            that is not known hangs on the origin, or on another robot's start.
         motions: (k, 3) float64 [m, m, rad]. Odometry from the previous key, in its frame.
         noises: (k, 3, 3) float64. Its covariance, likewise.
         slack: (k,) float64 [m^2]. How much those poses may move against each other that stand rigidly to the key.
@@ -45,6 +48,8 @@ class PathGraph:
         counts: (s,) int64. Measurements in each.
         landmark_ids: (l,) int64. Names of the landmarks.
         landmarks: (l, 3) float64 [m], map frame. The last mode.
+        aliases: (a, 2) int64. Rows (name, name it goes by): landmarks found to be one.
+        heads: (K,) int64. Key at the start of each robot.
         tips: (K,) int64. Newest key of each robot.
         latest: (K,) int64. Newest step of each robot's log that is taken in, -1 before the first.
     """
@@ -70,23 +75,72 @@ class PathGraph:
     counts: IntArray = field(default_factory=_no_index)
     landmark_ids: IntArray = field(default_factory=_no_index)
     landmarks: FloatArray = field(default_factory=lambda: _empty(0, 3))
+    aliases: IntArray = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
+    heads: IntArray
     tips: IntArray
     latest: IntArray
+
+    def __post_init__(self) -> None:
+        for name in self.__dataclass_fields__:
+            getattr(self, name).setflags(write=False)
 
     @classmethod
     def at_starts(cls, starts: FloatArray) -> "PathGraph":
         """Return the graph of K robots that stand at `starts` (K, 3), map frame, and have seen nothing."""
+        return cls.at_uncertain_starts(np.asarray(starts, dtype=np.float64)[:, :, None])
+
+    @classmethod
+    def at_uncertain_starts(cls, starts: FloatArray) -> "PathGraph":
+        """Return the graph of K robots whose starts (K, 3, M) particles may hold to be different, as after a merge.
+
+        A start on which all particles agree is given. Another is sought: nothing but measurements shall say where it
+        is, for what particles think of it stems from these. Where two robots' starts do not change against each other,
+        the second hangs on the first.
+        """
         k = len(starts)
+        loose = [i for i in range(k) if (starts[i] != starts[i, :, :1]).any()]
+        poses, previous, motions, noises = list(starts[:, :, 0]), [NONE] * k, [np.zeros(3)] * k, [np.zeros((3, 3))] * k
+        for place, i in enumerate(loose):
+            poses[i] = np.array([starts[i, 0].mean(), starts[i, 1].mean(), circular_mean(starts[i, 2])])
+            previous[i], motions[i], noises[i] = k, poses[i], np.diag(VAGUE)
+            for other in loose[:place]:
+                apart = between(starts[other].T, starts[i].T)
+                if np.abs(_turned(apart - apart[0])).max() < RIGID:
+                    previous[i], motions[i], noises[i] = other, apart[0], RIGID**2 * np.eye(3)
+                    break
+        extra = 1 if loose else 0
+        robots = np.concatenate([np.arange(k), np.full(extra, NONE)])
         return cls(
-            robots=np.arange(k),
-            poses=np.array(starts, dtype=np.float64),
-            previous=np.full(k, NONE),
-            motions=np.zeros((k, 3)),
-            noises=np.zeros((k, 3, 3)),
-            slack=np.zeros(k),
+            robots=robots,
+            poses=np.array([*poses, *np.zeros((extra, 3))]),
+            previous=np.array([*previous, *[NONE] * extra], dtype=np.int64),
+            motions=np.array([*motions, *np.zeros((extra, 3))]),
+            noises=np.array([*noises, *np.zeros((extra, 3, 3))]),
+            slack=np.zeros(k + extra),
+            heads=np.arange(k),
             tips=np.arange(k),
             latest=np.full(k, -1),
         )
+
+    def reordered(self, order: IntArray) -> "PathGraph":
+        """Return the graph in which robot i is the one that was `order[i]`; (K,) a permutation."""
+        robots = self.robots.copy()
+        robots[self.robots >= 0] = np.argsort(order)[self.robots[self.robots >= 0]]
+        return replace(
+            self, robots=robots, heads=self.heads[order], tips=self.tips[order], latest=self.latest[order]
+        )
+
+    def known_as(self, ids: IntArray) -> IntArray:
+        """Return the names by which landmarks go."""
+        result = ids.copy()
+        for old, new in self.aliases:  # in the order in which they were found
+            result[result == old] = new
+        return result
+
+    @property
+    def linked(self) -> BoolArray:
+        """(k,) whether a key comes after another of the same robot."""
+        return np.asarray((self.previous >= 0) & (self.robots[self.previous] == self.robots))
 
     @property
     def num_keys(self) -> int:
@@ -145,7 +199,7 @@ def extended(
     new_frames = np.concatenate([part.frames + frames[i] for i, part in enumerate(parts)])
     frame_keys_now = np.concatenate(frame_keys)
     points = np.concatenate([log.points[part.rows] for log, part in zip(logs, parts, strict=True)])
-    ids = np.concatenate([log.ids[part.rows] for log, part in zip(logs, parts, strict=True)])
+    ids = graph.known_as(np.concatenate([log.ids[part.rows] for log, part in zip(logs, parts, strict=True)]))
     at = poses[frame_keys_now[new_frames]]  # a new frame is a key itself
     first_seen = np.column_stack([points[:, :2] + mount[:2], points[:, 2] + mount[2]])
     first_seen[:, :2] = at[:, :2] + np.einsum("nij,nj->ni", rotation(at[:, 2]), first_seen[:, :2])
@@ -238,3 +292,24 @@ def chained(
     by_first[:2, 2] = by_second[:2, :2] @ [-move[1], move[0]]
     joint = by_first @ noise @ by_first.T + by_second @ move_noise @ by_second.T
     return compose(chain, move), joint
+
+
+def circular_mean(angles: FloatArray) -> float:
+    """Return the mean direction of angles (n,) [rad] in (-pi, pi]."""
+    return float(np.arctan2(np.sin(angles).mean(), np.cos(angles).mean()))
+
+
+def _turned(poses: FloatArray) -> FloatArray:
+    """Return differences of poses (n, 3) with headings in [-pi, pi)."""
+    return np.column_stack([poses[:, :2], wrap_angle(poses[:, 2])])
+
+
+def first_rows(log: LogArrays, count: int) -> LogArrays:
+    """Return the first steps of a log; the arrays are views."""
+    end = int(log.starts[min(count, len(log))])
+    return LogArrays(
+        steps=log.steps[:count], kinds=log.kinds[:count], motions=log.motions[:count], given=log.given[:count],
+        starts=log.starts[: count + 1], points=log.points[:end], ids=log.ids[:end],
+        covariances=None if log.covariances is None else log.covariances[:end],
+        descriptor_rows=None if log.descriptor_rows is None else log.descriptor_rows[:end],
+    )  # fmt: skip

@@ -16,6 +16,9 @@ class SmoothingOptions:
         kernel: Squared Mahalanobis distance of a measurement (3 degrees of freedom) above which it loses weight; 0:
             none does.
         noise_scale: Factor on the covariance of all measurements.
+        closure_after: A loop is closed where three landmarks are matched at a time that were not seen for more steps
+            than this; the filter is then rejuvenated a fifth of `rejuvenate_every` after the last time. 0: never for
+            that.
         least_ess: Share of M that the effective sample size of the importance weights must reach.
         max_iterations: Of Gauss and Newton.
         tolerance: The descent ends when the cost is expected to fall by less than this (half a squared distance).
@@ -25,6 +28,7 @@ class SmoothingOptions:
     fresh_keys: int = 60
     kernel: float = 16.0
     noise_scale: float = 1.0
+    closure_after: int = 100
     least_ess: float = 0.3
     max_iterations: int = 15
     tolerance: float = 1e-3
@@ -33,6 +37,7 @@ class SmoothingOptions:
         check_int("max_keys", self.max_keys, 2, "Two poses are the least that can be smoothed.")
         check_int("fresh_keys", self.fresh_keys, 1, "The newest pose is always fresh.")
         check_int("max_iterations", self.max_iterations, 1, "Ten are enough as a rule.")
+        check_int("closure_after", self.closure_after, 0, "Use 0 to look for no closures.")
         check_float("kernel", self.kernel, "Use 0 for plain squares.", at_least=0.0)
         check_float("noise_scale", self.noise_scale, "Use 1 for the noise as it is.", above=0.0)
         check_float("tolerance", self.tolerance, "Use 1e-3.", above=0.0)

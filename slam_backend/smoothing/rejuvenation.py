@@ -4,18 +4,63 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import lapack
 
 from slam_backend.errors import FloatArray, IntArray
 from slam_backend.geometry import wrap_angle
-from slam_backend.log_arrays import LogArrays
+from slam_backend.log_arrays import EXACT, LogArrays
 from slam_backend.motion import OdometryModel
 from slam_backend.resampling import effective_sample_size
-from slam_backend.smoothing.coarsening import coarsened
-from slam_backend.smoothing.graph import PathGraph, extended
+from slam_backend.smoothing.coarsening import coarsened, compacted
+from slam_backend.smoothing.duplicates import find_duplicates, without_duplicates
+from slam_backend.smoothing.graph import PathGraph, extended, first_rows
 from slam_backend.smoothing.options import SmoothingOptions
-from slam_backend.smoothing.sampling import draw_paths
-from slam_backend.smoothing.solving import find_mode
+from slam_backend.smoothing.sampling import Draws, draw_paths
+from slam_backend.smoothing.solving import Mode, find_mode
+
+SCOUTS = 32  # paths drawn to see what is rigid, while a long log is taken in
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Looks:
+    """Appearance of landmarks that no caller has named.
+
+    Attributes:
+        ids: (n,) int64, ascending.
+        descriptors: (n, d) float32.
+        gate: L2 distance beyond which two do not look alike.
+    """
+
+    ids: IntArray
+    descriptors: NDArray[np.float32]
+    gate: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Particles:
+    """M particles from the posterior of whole paths.
+
+    Attributes:
+        poses, starts: (K, 3, M) float64 [m, m, rad], map frame. Newest pose and start of each robot.
+        log_weights: (M,) float64, normalised.
+        log_densities: (M,) float64. Of the newest poses under the Gaussian about the mode, up to a constant: 0 for the
+            first particle, whose path is the mode.
+        ids: (l,) int64. Landmarks that have a sighting.
+        landmarks: (l, 9, M) float64. Their means (3) and covariances (6), map frame.
+        counts: (l,) int64. Measurements of each.
+        means, covariances: (K, 3), (K, 3, 3) float64. The newest poses under the Gaussian about the mode.
+    """
+
+    poses: FloatArray
+    starts: FloatArray
+    log_weights: FloatArray
+    log_densities: FloatArray
+    ids: IntArray
+    landmarks: FloatArray
+    counts: IntArray
+    means: FloatArray
+    covariances: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -26,26 +71,15 @@ class Rejuvenation:
         graph: To go on with next time.
         reason: Why there are no new particles; "" if there are.
         ess: Effective sample size of the importance weights, in [1, M]; NaN if it did not come to that.
-        iterations: Of the descent.
-        poses: (K, 3, M) float64 [m, m, rad], map frame. Newest pose of each robot.
-        log_weights: (M,) float64, normalised.
-        ids: (l,) int64. Landmarks that have a sighting.
-        landmarks: (l, 9, M) float64. Their means (3) and covariances (6).
-        counts: (l,) int64. Measurements of each.
-        means, covariances: (K, 3), (K, 3, 3) float64. The newest poses under the Gaussian about the mode.
+        iterations: Of the last descent.
+        particles: The new ones, or None.
     """
 
     graph: PathGraph
     reason: str
     ess: float
     iterations: int
-    poses: FloatArray
-    log_weights: FloatArray
-    ids: IntArray
-    landmarks: FloatArray
-    counts: IntArray
-    means: FloatArray
-    covariances: FloatArray
+    particles: Particles | None
 
 
 def rejuvenate(
@@ -57,44 +91,84 @@ def rejuvenate(
     rng: np.random.Generator,
     options: SmoothingOptions,
     guesses: Sequence[Mapping[int, FloatArray]] | None = None,
+    looks: Looks | None = None,
 ) -> Rejuvenation:
-    """Take in what the robots did since, smooth, and draw M particles."""
-    grown = extended(graph, logs, motion, camera[4:], guesses)
-    mode = find_mode(grown, camera, options)
-    k = len(graph.tips)
-    if mode.reason:
-        none = np.zeros((0, 9, num_particles))
-        return Rejuvenation(
-            grown, mode.reason, float("nan"), mode.iterations, np.zeros((k, 3, num_particles)),
-            np.zeros(num_particles), np.zeros(0, dtype=np.int64), none, np.zeros(0, dtype=np.int64), np.zeros((k, 3)),
-            np.zeros((k, 3, 3)),
-        )  # fmt: skip
-    draws = draw_paths(grown, mode, num_particles, rng)
+    """Take in what the robots did since, smooth, and draw particles.
+
+    A long log is taken in part by part, so that the effort stays that of `max_keys` poses each time. Nothing is raised
+    for what may happen in a run: the reason says why there are no new particles.
+
+    Args:
+        graph: As the last attempt left it, or `PathGraph.at_starts`.
+        logs: Per robot, of the steps after `graph.latest`.
+        motion: Noise of the odometry.
+        camera: (7,) focal length, baseline, sigma_px, sigma_disparity, mount.
+        num_particles: M.
+        rng: Source of the draws.
+        options: What decides the rest.
+        guesses: Per robot where it may be after some of the new steps (3,), map frame.
+        looks: For landmarks that turn out to be one. None: all are what they are called.
+    """
+    if any((log.kinds == EXACT).any() for log in logs):
+        return Rejuvenation(graph, "poses that were given as exact", float("nan"), 0, None)
+    share = max(1, options.fresh_keys // len(logs))
+    rest = list(logs)
+    while True:
+        last = all(len(log) <= share for log in rest)
+        grown = extended(graph, [first_rows(log, share) for log in rest], motion, camera[4:], guesses)
+        mode = find_mode(grown, camera, options)
+        if mode.reason:
+            return Rejuvenation(graph, mode.reason, float("nan"), mode.iterations, None)
+        draws = draw_paths(grown, mode, num_particles if last else SCOUTS, rng)
+        graph = coarsened(grown, mode, draws.spreads, camera, options)
+        if last:
+            break
+        rest = [log.since(int(graph.latest[i]) + 1) for i, log in enumerate(rest)]
     weights = np.exp(draws.log_weights - draws.log_weights.max())
     weights /= weights.sum()
     ess = effective_sample_size(weights)
-    reason = "" if ess >= options.least_ess * num_particles else f"an effective sample size of {ess:.1f}"
-    counts = np.bincount(mode.sightings.landmarks, weights=mode.sightings.counts, minlength=len(grown.landmark_ids))
+    if not ess >= options.least_ess * num_particles:
+        return Rejuvenation(graph, f"an effective sample size of {ess:.1f}", ess, mode.iterations, None)
+    if looks is not None and len(looks.ids):
+        duplicates = find_duplicates(grown, mode, draws, _descriptors(grown, looks), looks.gate)
+        graph = compacted(without_duplicates(graph, duplicates))
+    return Rejuvenation(graph, "", ess, mode.iterations, _particles(grown, mode, draws, weights))
+
+
+def _descriptors(graph: PathGraph, looks: Looks) -> NDArray[np.float32]:
+    """Return descriptors (l, d) by row of the graph's landmarks, NaN where there is none."""
+    at = np.minimum(np.searchsorted(looks.ids, graph.landmark_ids), len(looks.ids) - 1)
+    result = looks.descriptors[at]
+    result[looks.ids[at] != graph.landmark_ids] = np.nan
+    return result
+
+
+def _particles(graph: PathGraph, mode: Mode, draws: Draws, weights: FloatArray) -> Particles:
+    """Gather what particles hold."""
+    counts = np.bincount(mode.sightings.landmarks, weights=mode.sightings.counts, minlength=len(graph.landmark_ids))
     seen = counts > 0
-    poses = draws.poses[grown.tips]
-    poses[:, 2] = wrap_angle(poses[:, 2])
-    means = mode.poses[grown.tips].copy()
+    poses, starts = draws.poses[graph.tips], draws.poses[graph.heads]
+    means = mode.poses[graph.tips]
+    joint = _covariance(mode.factor, mode.columns[graph.tips])
+    off = (poses - means[:, :, None])[mode.columns[graph.tips] >= 0].reshape(-1, poses.shape[2])
+    covariances = np.zeros((len(means), 3, 3))
+    sought = np.flatnonzero(mode.columns[graph.tips] >= 0)
+    for place, robot in enumerate(sought):
+        covariances[robot] = joint[3 * place : 3 * place + 3, 3 * place : 3 * place + 3]
+    densities = -0.5 * np.einsum("im,im->m", off, np.linalg.solve(joint, off)) if len(off) else np.zeros(len(weights))
+    for array in (poses, starts):
+        array[:, 2] = wrap_angle(array[:, 2])
     means[:, 2] = wrap_angle(means[:, 2])
-    fewer = coarsened(grown, mode, draws.spreads, options.max_keys, options.fresh_keys)
-    return Rejuvenation(
-        fewer, reason, ess, mode.iterations, poses, np.log(weights), grown.landmark_ids[seen], draws.landmarks[seen],
-        counts[seen].astype(np.int64), means,
-        _covariances(mode.factor, mode.columns[grown.tips]),
+    return Particles(
+        poses, starts, np.log(np.maximum(weights, 1e-300)), densities, graph.landmark_ids[seen], draws.landmarks[seen],
+        counts[seen].astype(np.int64), means, covariances,
     )  # fmt: skip
 
 
-def _covariances(factor: FloatArray, columns: IntArray) -> FloatArray:
-    """Return the marginal covariances (K, 3, 3) of poses, from the factor U of the information U^T U."""
-    result = np.zeros((len(columns), 3, 3))
-    for robot, first in enumerate(columns):
-        if first >= 0:
-            unit = np.zeros((len(factor), 3), order="F")
-            unit[first + np.arange(3), np.arange(3)] = 1.0
-            half = lapack.dtrtrs(factor, unit, lower=0, trans=1)[0]
-            result[robot] = half.T @ half
-    return result
+def _covariance(factor: FloatArray, columns: IntArray) -> FloatArray:
+    """Return the joint marginal covariance (3 r, 3 r) of the poses that are sought, from the factor of U^T U."""
+    rows = (columns[columns >= 0][:, None] + np.arange(3)).ravel()
+    unit = np.zeros((len(factor), len(rows)), order="F")
+    unit[rows, np.arange(len(rows))] = 1.0
+    half = lapack.dtrtrs(factor, unit, lower=0, trans=1)[0]
+    return np.asarray(half.T @ half)

@@ -1,0 +1,166 @@
+"""`FastSlam(rejuvenate_every=...)`: what the smoother gives the filter, and that nothing is lost on the way."""
+
+import numpy as np
+import pytest
+from same_bits import assert_same
+from small_problems import small_run
+
+from slam_backend.filter import FastSlam
+from slam_backend.motion import OdometryModel
+from slam_backend.smoothing.options import SmoothingOptions
+from training.accuracy_trials import follow, score
+from training.stereo_runs import RunSpec, simulate_run
+
+EVERY = 8
+
+
+def rejuvenated(run, seed=1, every=EVERY, **options):
+    """Return a filter for a run, rejuvenated every few steps."""
+    return run.build_filter(30, "fastslam2", seed, rejuvenate_every=every, **options)
+
+
+def test_particles_are_drawn_anew_when_it_is_due():
+    """In every eighth step, and no other, the report tells of new particles, with a sound sample size."""
+    run = small_run(2)
+    slam = rejuvenated(run)
+    for step, reading in enumerate(run.readings(), start=1):
+        report = slam.step(**reading).rejuvenation
+        assert (report is not None) == (step % EVERY == 0)
+        if report is not None:
+            assert report.reason == ""
+            assert 0.8 * 30 < report.ess <= 30.0
+            assert np.ptp(slam.particles(0)[0], axis=0).min() > 0.0
+
+
+def test_all_particles_then_hold_the_same_landmarks_and_names_stay():
+    """After a rejuvenation each particle holds each landmark, under the caller's own name, as often as it was seen."""
+    run = small_run()
+    slam = rejuvenated(run, every=21)
+    for reading in run.readings():
+        slam.step(**reading)
+    ids, _, covariances, counts = slam._dense()
+    seen = np.bincount(np.concatenate([names[0] for names in run.names]))
+    slots = slam._maps.used_slots()
+    np.testing.assert_array_equal(slam._maps.ids[slots], ids)
+    np.testing.assert_array_equal(counts, np.repeat(seen[slam._maps.identities[slots]][:, None], 30, axis=1))
+    full = covariances.transpose(0, 2, 1)[..., [[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
+    assert np.linalg.eigvalsh(full).min() > 0.0
+
+
+def test_a_snapshot_goes_on_bit_for_bit():
+    """Taken between two rejuvenations, a snapshot goes on as the filter does, through the next two."""
+    run = small_run(2)
+    readings = list(run.readings())
+    slam = rejuvenated(run)
+    for reading in readings[:11]:
+        slam.step(**reading)
+    state = slam.get_state()
+    other = FastSlam(2, num_particles=3, seed=9)
+    other.set_state(state)
+    for reading in readings[11:]:
+        slam.step(**reading)
+    for reading in readings[11:]:
+        other.step(**reading)
+    assert_same(slam.get_state(), other.get_state())
+    again = FastSlam(2, num_particles=3, seed=9)
+    again.set_state(state)  # what the others did since has not changed it
+    for reading in readings[11:]:
+        again.step(**reading)
+    assert_same(slam.get_state(), again.get_state())
+
+
+def test_robots_can_be_renumbered():
+    """A filter whose robots are exchanged goes on like the one whose readings are exchanged."""
+    run = small_run(2)
+    slam = rejuvenated(run)
+    for step, reading in enumerate(run.readings()):
+        if step == 10:
+            slam.reorder(np.array([1, 0]))
+        if step >= 10:
+            reading = {name: value[::-1] for name, value in reading.items()}
+        report = slam.step(**reading).rejuvenation
+        assert report is None or report.reason == ""
+    for robot, other in ((0, 1), (1, 0)):
+        error = slam.pose(robot).mean - run.true_paths[other, -1]
+        assert np.hypot(error[0], error[1]) < 0.2
+
+
+def test_where_there_is_nothing_to_smooth_the_filter_goes_on():
+    """A robot that stands, exact odometry or poses, or a descent that fails: the old particles stay, with a reason."""
+    run = small_run()
+    still = OdometryModel(
+        sigma_along=0.0, sigma_across=0.0, sigma_heading=0.0, sigma_turn=0.0, floor_position=0.0, floor_heading=0.0
+    )
+    hasty = SmoothingOptions(max_iterations=1)
+    cases = (
+        (rejuvenated(run, every=1), list(run.readings())[:1], None, "no pose to seek"),
+        (rejuvenated(run, motion=still), list(run.readings()), None, "odometry without noise"),
+        (rejuvenated(run), list(run.readings()), run.true_paths[0], "poses that were given as exact"),
+        (rejuvenated(run, smoothing=hasty), list(run.readings()), None, "no convergence in 1 iterations"),
+    )
+    for slam, readings, path, reason in cases:
+        reasons = set()
+        for step, reading in enumerate(readings):
+            exact = None if path is None else [path[step] - run.true_paths[0, 0] * [1.0, 1.0, 0.0]]
+            report = slam.step(**reading, poses=exact)
+            if report.rejuvenation is not None:
+                reasons.add(report.rejuvenation.reason)
+                assert np.isnan(report.rejuvenation.ess)
+        assert reasons == {reason}
+        assert np.isfinite(slam.pose(0).mean).all()
+
+
+def test_too_small_a_sample_size_is_refused():
+    """Below the share of M that is asked for, the old particles stay, and the reason says the size."""
+    run = small_run()
+    slam = rejuvenated(run, smoothing=SmoothingOptions(least_ess=1.0))
+    reports = [slam.step(**reading).rejuvenation for reading in run.readings()]
+    reasons = [report.reason for report in reports if report is not None]
+    assert len(reasons) == 2
+    assert all(reason.startswith("an effective sample size of ") for reason in reasons)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"rejuvenate_every": 0}, r"rejuvenate_every: expected an int >= 1, got 0"),
+        ({"rejuvenate_every": 2.5}, r"rejuvenate_every: expected an int >= 1, got 2.5"),
+        ({"smoothing": {"max_keys": 9}}, r"smoothing: expected SmoothingOptions"),
+    ],
+)
+def test_bad_options_are_refused(options, message):
+    """What cannot be is refused when the filter is built."""
+    with pytest.raises(ValueError, match=message):
+        FastSlam(**options)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"max_keys": 1}, "max_keys: expected an int >= 2"),
+        ({"fresh_keys": 0}, "fresh_keys: expected an int >= 1"),
+        ({"max_iterations": 0}, "max_iterations: expected an int >= 1"),
+        ({"closure_after": -1}, "closure_after: expected an int >= 0"),
+        ({"kernel": -1.0}, "kernel: expected a finite number >= 0"),
+        ({"noise_scale": 0.0}, "noise_scale: expected a finite number > 0"),
+        ({"tolerance": 0.0}, "tolerance: expected a finite number > 0"),
+        ({"least_ess": 1.5}, "least_ess: expected a finite number >= 0 and <= 1"),
+    ],
+)
+def test_bad_smoothing_options_are_refused(options, message):
+    """Each number of the smoother has its range."""
+    with pytest.raises(ValueError, match=message):
+        SmoothingOptions(**options)
+
+
+@pytest.mark.slow
+def test_a_rejuvenated_filter_maps_better_and_says_so():
+    """After 80 m with 30 particles, map errors are below two thirds of the plain filter's, and NEES below a fifth."""
+    maps, nees = np.zeros((2, 3)), np.zeros((2, 3))
+    for i, seed in enumerate(range(121, 124)):
+        run = simulate_run(RunSpec(length=80.0, measurements=8), seed)
+        for method, every in enumerate((None, 25)):
+            row = score(run, follow(run, run.build_filter(30, "fastslam2", seed, rejuvenate_every=every)))
+            maps[method, i], nees[method, i] = row["map_rmse_m"], row["nees_median"]
+    assert np.sqrt((maps[1] ** 2).mean()) < 0.67 * np.sqrt((maps[0] ** 2).mean())
+    assert nees[1].mean() < 0.2 * nees[0].mean()
