@@ -16,6 +16,7 @@ if TYPE_CHECKING:  # what computes is imported when the command runs, so that --
 
 COMMAND = "run"
 VIDEO_SIZE = (960, 720)
+EYE_WIDTH = 640  # of what one robot sees, beside the map [px]
 
 
 def run(
@@ -33,6 +34,9 @@ def run(
     max_cycles: Annotated[int | None, typer.Option(help="Steps of the episode.", show_default="180 s worth")] = None,
     particles: Particles = None,
     preset: Annotated[str | None, typer.Option(help="easy, standard or hard noise.", show_default="standard")] = None,
+    sensor: Annotated[
+        str | None, typer.Option(help="landmark, or stereo: rendered eyes.", show_default="landmark")
+    ] = None,
     out: Out = None,
     json: Json = None,
     video: Annotated[bool, typer.Option(help="Whether to film the run.")] = True,
@@ -54,6 +58,7 @@ def run(
         "max_cycles": max_cycles,
         "particles": particles,
         "preset": preset,
+        "sensor": sensor,
     }
     chosen = RunConfig.from_mapping(gather(COMMAND, given, config, json, out))
     env = chosen.make_env()
@@ -85,21 +90,25 @@ def _run_live(console: Console, env: Any, policies: Any, config: "RunConfig", vi
     from contextlib import ExitStack
 
     from training.episode import Progress, run_episode
+    from training.eye_pictures import beside_the_map
     from training.interrupt import interrupt_flag
     from training.live import LiveProgress
     from training.video import VideoWriter, choose_pace, with_slow_flashes
     from vslam_env.rendering import draw_frame
 
     pace = choose_pace(config.num_steps, config.step_s)
+    eyes = config.sensor == "stereo"
+    size = (VIDEO_SIZE[0] + (EYE_WIDTH if eyes else 0), VIDEO_SIZE[1])
     with ExitStack() as stack:
         interrupted = stack.enter_context(interrupt_flag())
         live = stack.enter_context(LiveProgress(console, config.num_steps, env.possible_agents))
-        writer = None if video is None else stack.enter_context(VideoWriter(video, VIDEO_SIZE, pace.fps))
+        writer = None if video is None else stack.enter_context(VideoWriter(video, size, pace.fps))
 
         def on_step(progress: Progress) -> None:
             live.show(progress)
             if writer is not None and progress.step % pace.stride == 0:
-                writer.add(draw_frame(with_slow_flashes(env.scene(), env.events, pace.speedup), VIDEO_SIZE))
+                picture = draw_frame(with_slow_flashes(env.scene(), env.events, pace.speedup), VIDEO_SIZE)
+                writer.add(beside_the_map(picture, env.episode.frames[0], EYE_WIDTH) if eyes else picture)
 
         record = run_episode(env, policies, config.seed, on_step, interrupted)
     if not record.complete:

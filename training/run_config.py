@@ -9,7 +9,7 @@ from agents.policy import Policy
 from agents.registry import make_policy
 from slam_backend.errors import bad_argument, check_choice, check_int
 from vslam_env import vslam_v0
-from vslam_env.config import ACTION_TYPES, GOAL_DECISION_TICKS, PRESETS, TICK
+from vslam_env.config import ACTION_TYPES, GOAL_DECISION_TICKS, PRESETS, SENSORS, TICK
 from vslam_env.environment import ExplorationEnv
 from vslam_env.world import WORLD_FAMILIES
 
@@ -29,6 +29,7 @@ class RunConfig:
         max_cycles: Steps of the episode; None: as many as `EPISODE_S` takes.
         particles: Per filter.
         preset: Of the environment's noise.
+        sensor: `"landmark"` or `"stereo"`.
         seed: Of all random draws.
     """
 
@@ -39,12 +40,14 @@ class RunConfig:
     max_cycles: int | None = None
     particles: int = 100
     preset: str = "standard"
+    sensor: str = "landmark"
     seed: int = 0
 
     def __post_init__(self) -> None:
         check_int("robots", self.robots, 1, "Use 1 to 8 robots.")
         check_choice("action_type", self.action_type, ACTION_TYPES)
         check_choice("preset", self.preset, PRESETS)
+        check_choice("sensor", self.sensor, SENSORS)
         check_int("particles", self.particles, 1, "Use at least one particle; 100 is a good start.")
         check_int("seed", self.seed, 0, "Use 0 or a positive number.")
         if self.max_cycles is not None:
@@ -84,6 +87,7 @@ class RunConfig:
             num_particles=self.particles,
             max_cycles=self.num_steps,
             preset=self.preset,
+            sensor=self.sensor,
         )
 
     def make_policies(self, env: ExplorationEnv) -> dict[str, Policy]:

@@ -13,16 +13,18 @@ import tomli_w
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from slam_backend.errors import bad_argument, check_choice, check_float, check_int
+from slam_backend.existence import ExistenceModel
+from slam_backend.frontend import KINDS
 from slam_backend.motion import OdometryModel
 from vslam_env.robot_belief import BeliefConfig
-from vslam_env.sensors import LandmarkSensorConfig, ScanConfig
+from vslam_env.sensors import LandmarkSensorConfig, ScanConfig, StereoSensorConfig
 from vslam_env.world import SPLITS, LandmarkConfig, OdometryNoise
 
 T = TypeVar("T")
 
 ACTION_TYPES = ("continuous", "discrete", "goal")
 OBSERVATION_TYPES = ("dict", "flat")
-SENSORS = ("landmark",)
+SENSORS = ("landmark", "stereo")
 PRESETS = ("easy", "standard", "hard")
 MAX_ROBOTS = 8
 TICK = 0.1  # [s]
@@ -31,6 +33,7 @@ PARTS = {
     "landmarks": LandmarkConfig,
     "odometry": OdometryNoise,
     "landmark_sensor": LandmarkSensorConfig,
+    "stereo": StereoSensorConfig,
     "scan": ScanConfig,
     "belief": BeliefConfig,
 }
@@ -64,6 +67,7 @@ class EnvConfig:
         landmarks: Where the landmarks of worlds without their own are, and how alike they look.
         odometry: True noise of the odometry.
         landmark_sensor: True noise of the landmark sensor.
+        stereo: Rendered eyes: what walls look like, how images are taken and measured; with `sensor="stereo"`.
         scan: The range finder and its true noise.
         belief: What the robots assume, and how they align their maps.
     """
@@ -73,7 +77,7 @@ class EnvConfig:
     world: str = "office"
     world_split: Literal["train", "validation", "test"] | None = None
     num_robots: int = 3
-    sensor: Literal["landmark"] = "landmark"
+    sensor: Literal["landmark", "stereo"] = "landmark"
     action_type: Literal["continuous", "discrete", "goal"] = "continuous"
     decision_ticks: int | None = None
     max_cycles: int = 1000
@@ -91,6 +95,7 @@ class EnvConfig:
     landmarks: LandmarkConfig = field(default_factory=LandmarkConfig)
     odometry: OdometryNoise = field(default_factory=OdometryNoise)
     landmark_sensor: LandmarkSensorConfig = field(default_factory=LandmarkSensorConfig)
+    stereo: StereoSensorConfig = field(default_factory=StereoSensorConfig)
     scan: ScanConfig = field(default_factory=ScanConfig)
     belief: BeliefConfig = field(default_factory=BeliefConfig)
 
@@ -168,7 +173,7 @@ class EnvConfig:
         return tomli_w.dumps(_without_none(_plain(self)))
 
 
-def preset_config(name: str) -> EnvConfig:
+def preset_config(name: str, sensor: str = "landmark") -> EnvConfig:
     """Return a preset.
 
     `standard`: odometry with sigma 5 % of the distance and 2 degrees per metre, and a bias per episode of 2 % and 0.5
@@ -178,11 +183,17 @@ def preset_config(name: str) -> EnvConfig:
     `hard`: odometry noise and bias doubled, 3 landmarks a tick detected with probability 0.8, 0.1 false points,
     descriptor noise 0.2.
     The filters assume the odometry noise of their preset.
+    With `sensor="stereo"` only the odometry differs between presets, and filters assume what `stereo_belief` says.
 
     Raises:
-        ValueError: If there is no such preset.
+        ValueError: If there is no such preset or sensor.
     """
     check_choice("preset", name, PRESETS)
+    check_choice("sensor", sensor, SENSORS)
+    if sensor == "stereo":
+        plain = preset_config(name)
+        eyes = dataclasses.replace(plain, sensor="stereo")
+        return dataclasses.replace(eyes, belief=stereo_belief(eyes.stereo, plain.belief))
     if name == "standard":
         return EnvConfig()
     scale = 0.5 if name == "easy" else 2.0
@@ -197,6 +208,24 @@ def preset_config(name: str) -> EnvConfig:
         belief={"filter": {"motion": assumed}},
         landmark_sensor=sensors[name],
     )
+
+
+def stereo_belief(eyes: StereoSensorConfig, belief: BeliefConfig) -> BeliefConfig:
+    """Return a belief fit for rendered eyes: their optics, twice their noise, and landmarks that come and go.
+
+    Rendered eyes measure disparities to 0.05 px and corners to 0.1 to 0.2 px, but corners wander with the viewpoint,
+    and some points slide along edges: these landmarks die because they are not seen again where they should be.
+
+    Args:
+        eyes: The sensor.
+        belief: All that has nothing to do with the sensor is taken from here.
+    """
+    optics = {name: getattr(eyes.camera, name) for name in ("focal_px", "baseline", "width", "height", "max_range")}
+    doubled = dataclasses.replace(belief.filter.camera, mount=eyes.camera.mount, **optics)
+    existence = ExistenceModel(detection=0.7, frame_limit=eyes.front_end.max_measurements)
+    gate = KINDS[eyes.front_end.descriptor].gate
+    assumed = dataclasses.replace(belief.filter, camera=doubled, existence=existence, descriptor_gate=gate)
+    return dataclasses.replace(belief, filter=assumed)
 
 
 def _validated(cls: type[T], values: Mapping[str, Any]) -> T:

@@ -5,11 +5,12 @@ from typing import Any
 
 import numpy as np
 
+from slam_backend.camera import StereoCamera
 from slam_backend.errors import FloatArray, bad_argument
 from vslam_env.config import EnvConfig
 from vslam_env.coverage import CoverageMeter
 from vslam_env.errors_of_maps import ClaimLedger
-from vslam_env.sensors import LandmarkSensor, Scan
+from vslam_env.sensors import LandmarkSensor, Scan, StereoSensor
 from vslam_env.world import (
     FreeSpace,
     World,
@@ -42,7 +43,7 @@ class Setting:
     bias: FloatArray
     belief_seed: np.random.SeedSequence
     stream_states: dict[str, Any]
-    sensor: LandmarkSensor
+    sensor: LandmarkSensor | StereoSensor
     scan: Scan
     coverage: CoverageMeter
     countable: np.ndarray
@@ -80,32 +81,43 @@ def draw_setting(
         layout, textures = np.random.SeedSequence(world_seed).spawn(2)
     bare = make_world(source, np.random.default_rng(layout), config.world_split)
     free_space = FreeSpace(bare, config.robot_radius)
-    landmarks = bare.landmarks
-    if landmarks is None:
-        landmarks = place_landmarks(bare, np.random.default_rng(textures), config.landmarks, free_space)
+    paint = np.random.default_rng(textures)
+    eyes: LandmarkSensor | StereoSensor
+    if config.sensor == "stereo":
+        eyes = StereoSensor(config.stereo, bare, free_space, paint, config.robot_radius)
+        landmarks, camera = eyes.landmarks, config.stereo.camera
+    else:
+        given = bare.landmarks
+        landmarks = place_landmarks(bare, paint, config.landmarks, free_space) if given is None else given
+        eyes = LandmarkSensor(config.landmark_sensor, bare.walls, landmarks, config.robot_radius)
+        camera = config.landmark_sensor.camera
     world = World(bare.name, bare.walls, landmarks, bare.start_poses)
-    true_starts = _starts(config, world, free_space, start_poses, np.random.default_rng(starts))
+    true_starts = _starts(config, world, free_space, camera, start_poses, np.random.default_rng(starts))
     true_starts.setflags(write=False)
     streams = {
         name: np.random.default_rng(stream)
         for name, stream in (("odometry", odometry), ("sensor", sensor), ("scan", scan))
     }
-    sight = config.landmark_sensor
     return Setting(
         world=world,
         true_starts=true_starts,
         bias=draw_bias(config.odometry, config.num_robots, streams["odometry"]),
         belief_seed=belief_seed,
         stream_states={name: stream.bit_generator.state for name, stream in streams.items()},
-        sensor=LandmarkSensor(sight, world.walls, landmarks, config.robot_radius),
+        sensor=eyes,
         scan=Scan(config.scan, world.walls, config.robot_radius),
         coverage=CoverageMeter(free_space.free_area_cells, true_starts),
-        countable=free_space.visible_landmarks(landmarks, sight.camera, sight.max_incidence),
+        countable=free_space.visible_landmarks(landmarks, camera, config.landmark_sensor.max_incidence),
     )
 
 
 def _starts(
-    config: EnvConfig, world: World, free_space: FreeSpace, start_poses: Any, rng: np.random.Generator
+    config: EnvConfig,
+    world: World,
+    free_space: FreeSpace,
+    camera: StereoCamera,
+    start_poses: Any,
+    rng: np.random.Generator,
 ) -> FloatArray:
     given = world.start_poses
     if start_poses is not None:
@@ -123,7 +135,7 @@ def _starts(
         config.num_robots,
         rng,
         config.min_start_distance,
-        no_shared_view=None if config.shared_start_view else config.landmark_sensor.camera,
+        no_shared_view=None if config.shared_start_view else camera,
         landmarks=world.landmarks,
         max_incidence=config.landmark_sensor.max_incidence,
     )

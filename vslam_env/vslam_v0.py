@@ -42,7 +42,8 @@ def parallel_env(
             .pgm), of a ROS map (.yaml), of a .json file of walls or of a folder of these; a `World`; or a function of
             a generator that returns one.
         num_robots: 1 to 8; default 3.
-        sensor: `"landmark"`.
+        sensor: `"landmark"` (default): simulated measurements. `"stereo"`: rendered eyes see textured walls; with the
+            stereo front end their images become measurements.
         action_type: `"continuous"` (default): (speed, turn) in [-1, 1], zeros stand still. `"discrete"`: stay, ahead,
             left, right. `"goal"`: 0 stays, 1 to 16 drive to a candidate of the last observation.
         decision_ticks: Ticks of 0.1 s per step; default 1, with `goal` 10.
@@ -69,7 +70,7 @@ def parallel_env(
     if isinstance(config, (str, Path)):
         config = EnvConfig.from_toml(config)
     elif config is None:
-        config = preset_config("standard" if preset is None else preset)
+        config = preset_config("standard" if preset is None else preset, "landmark" if sensor is None else sensor)
     elif not isinstance(config, EnvConfig):
         raise bad_argument("config", "an EnvConfig, a path or None", config, "Build one with EnvConfig(...).")
     changes: dict[str, Any] = {

@@ -2,5 +2,15 @@
 
 from vslam_env.sensors.landmark_sensor import Frame, LandmarkSensor, LandmarkSensorConfig
 from vslam_env.sensors.scan import Scan, ScanConfig
+from vslam_env.sensors.stereo_sensor import EyeFrame, StereoSensor, StereoSensorConfig
 
-__all__ = ["Frame", "LandmarkSensor", "LandmarkSensorConfig", "Scan", "ScanConfig"]
+__all__ = [
+    "EyeFrame",
+    "Frame",
+    "LandmarkSensor",
+    "LandmarkSensorConfig",
+    "Scan",
+    "ScanConfig",
+    "StereoSensor",
+    "StereoSensorConfig",
+]
