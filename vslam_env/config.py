@@ -227,7 +227,7 @@ def stereo_belief(eyes: StereoSensorConfig, belief: BeliefConfig) -> BeliefConfi
     doubled = dataclasses.replace(belief.filter.camera, mount=eyes.camera.mount, **optics)
     existence = ExistenceModel(detection=0.7, frame_limit=eyes.front_end.max_measurements)
     gate = KINDS[eyes.front_end.descriptor].gate
-    changes = {"existence": existence, "descriptor_gate": gate, "recovery_position": 0.0}
+    changes: dict[str, Any] = {"existence": existence, "descriptor_gate": gate, "recovery_position": 0.0}
     assumed = dataclasses.replace(belief.filter, camera=doubled, **changes)
     return dataclasses.replace(belief, filter=assumed)
 
