@@ -16,7 +16,8 @@ GROUP = (*CONDITION, "method", "particles")
 FIGURES = (
     "pose_rms_m", "pose_aligned_rms_m", "heading_rms_deg", "map_rmse_m", "map_aligned_rmse_m", "map_recall",
     "map_precision", "confirmed_recall", "confirmed_precision", "nees_median", "nees_mean", "anees", "ess_share",
-    "nis", "wrong_match_share", "held_back_share", "step_ms",
+    "nis", "wrong_match_share", "held_back_share", "step_ms", "rejuvenation_ms",
+    "refused_share",
 )  # fmt: skip
 
 
@@ -42,10 +43,14 @@ class Goal:
 
 
 def _at(preset: str, association: str, method: str = "fastslam2") -> dict[str, Any]:
-    """Return the fields of single-robot trials of 100 m with 100 particles."""
+    """Return the fields of single-robot trials of 100 m, filters with 100 particles."""
     return {
-        "preset": preset, "association": association, "robots": 1, "length": 100.0, "method": method, "particles": 100,
+        "preset": preset, "association": association, "robots": 1, "length": 100.0, "method": method,
+        "particles": 100 if method.startswith("fastslam") else 0,
     }  # fmt: skip
+
+
+REJUVENATED = _at("good", "known", "fastslam2+rejuvenation")
 
 
 GOALS = (
@@ -66,6 +71,12 @@ GOALS = (
          statistic=np.median, limit=0.15),
     Goal(name="good stereo, unknown: pose, worst seed [m]", condition=_at("good", "unknown"), figure="pose_rms_m",
          statistic=np.max, limit=1.0),
+    Goal(name="good stereo, known, rejuvenated: map over batch ML's", condition=REJUVENATED, figure="map_rmse_m",
+         statistic=np.mean, limit=1.3, over=_at("good", "known", "batch_ml")),
+    Goal(name="good stereo, known, rejuvenated: pose over the ideal online estimate's", condition=REJUVENATED,
+         figure="pose_rms_m", statistic=np.mean, limit=1.5, over=_at("good", "known", "ideal_online")),
+    Goal(name="good stereo, known, rejuvenated: NEES, median", condition=REJUVENATED, figure="nees_median",
+         statistic=np.median, limit=6.0),
     Goal(name="good stereo: pose, unknown over known, a goal beyond", condition=_at("good", "unknown"),
          figure="pose_rms_m", statistic=np.mean, limit=1.0, over=_at("good", "known")),
 )  # fmt: skip

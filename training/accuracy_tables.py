@@ -13,6 +13,7 @@ from training.accuracy_summary import CONDITION
 NAMES = {
     "dead_reckoning": "dead reckoning", "batch_ml": "batch ML", "ideal_online": "ideal online",
     "fastslam1": "fastslam1", "fastslam2": "fastslam2", "fastslam2+existence": "with existence",
+    "fastslam2+rejuvenation": "with rejuvenation",
 }  # fmt: skip
 # Per table its columns: heading, figure, statistic over seeds, factor, digits, whether with its interval.
 PARTS: dict[str, tuple[tuple[str, str, str, float, int, bool], ...]] = {
@@ -41,6 +42,8 @@ PARTS: dict[str, tuple[tuple[str, str, str, float, int, bool], ...]] = {
         ("wrong matches [%]", "wrong_match_share", "mean", 100.0, 2, False),
         ("neither matched nor new [%]", "held_back_share", "mean", 100.0, 2, False),
         ("step [ms]", "step_ms", "median", 1.0, 2, False),
+        ("rejuvenation [ms]", "rejuvenation_ms", "median", 1.0, 1, False),
+        ("refused [%]", "refused_share", "mean", 100.0, 1, False),
     ),
 }
 

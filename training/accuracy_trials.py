@@ -18,8 +18,9 @@ from training.ideal_online import ideal_online
 from training.stereo_runs import FALSE_POINT, RunSpec, StereoRun, simulate_run
 
 PEERS = ("dead_reckoning", "batch_ml", "ideal_online")
-FILTERS = ("fastslam1", "fastslam2", "fastslam2+existence")
+FILTERS = ("fastslam1", "fastslam2", "fastslam2+existence", "fastslam2+rejuvenation")
 METHODS = (*PEERS, *FILTERS)
+REJUVENATE_EVERY = 25  # steps
 CONFIRMED = 2  # sightings that confirm a landmark
 LEAST_SIGMA = 1e-5  # [m, rad]; a collapsed set of particles claims no error at all, which has no NEES
 
@@ -91,7 +92,8 @@ def play(trial: Trial) -> dict[str, Any]:
         the landmarks that were measured), `map_precision`, `confirmed_recall`, `confirmed_precision` (of landmarks seen
         twice and more); `nees_median`, `nees_mean` (3-D, ideal 3), `anees` (the mean over the dimension, ideal 1); of
         filters `ess_share` (mean of ESS / M), `nis` (mean, ideal 3), `wrong_match_share` (of all matches of the most
-        probable particle), `held_back_share` (of all measurements, neither matched nor new), `step_ms` (median); and
+        probable particle), `held_back_share` (of all measurements, neither matched nor new), `step_ms` (median),
+        `rejuvenation_ms` (median of the steps in which it was tried), `refused_share` (of these attempts); and
         `seconds`. NaN stands for what is not known.
     """
     begin = time.perf_counter()
@@ -107,10 +109,16 @@ def play(trial: Trial) -> dict[str, Any]:
 
 
 def _build_filter(run: StereoRun, trial: Trial) -> FastSlam:
-    """Return the filter that a trial's method names, fresh; "+existence": with the default model of existence."""
-    proposal, _, existence = trial.method.partition("+")
-    frame_limit = run.spec.measurements // run.spec.robots
-    options = {"existence": ExistenceModel(frame_limit=frame_limit)} if existence else {}
+    """Return the filter that a trial's method names, fresh.
+
+    "+existence": with the default model of existence; "+rejuvenation": every `REJUVENATE_EVERY` steps.
+    """
+    proposal, _, extra = trial.method.partition("+")
+    options: dict[str, Any] = {}
+    if extra == "existence":
+        options["existence"] = ExistenceModel(frame_limit=run.spec.measurements // run.spec.robots)
+    elif extra == "rejuvenation":
+        options["rejuvenate_every"] = REJUVENATE_EVERY
     return run.build_filter(trial.particles, proposal, trial.seed, **options)  # type: ignore[arg-type]
 
 
@@ -126,7 +134,8 @@ def score(run: StereoRun, answer: Answer) -> dict[str, float]:
     }
     row |= dict.fromkeys(
         ("map_rmse_m", "map_aligned_rmse_m", "map_recall", "map_precision", "confirmed_recall", "confirmed_precision",
-         "nees_median", "nees_mean", "anees", "ess_share", "nis", "wrong_match_share", "held_back_share", "step_ms"),
+         "nees_median", "nees_mean", "anees", "ess_share", "nis", "wrong_match_share", "held_back_share", "step_ms",
+         "rejuvenation_ms", "refused_share"),
         float("nan"),
     )  # fmt: skip
     if answer.covariances is not None:
@@ -169,11 +178,14 @@ def follow(run: StereoRun, slam: FastSlam) -> Answer:
     robots = range(slam.num_robots)
     claims: dict[int, int] = {}  # id of a landmark -> true landmark behind the measurement that created it
     paths, covariances, ess, nis, times = [], [], [], [], []
+    attempts: list[tuple[float, bool]] = []
     matched = wrong = held_back = total = 0
     for reading, names in zip(run.readings(), run.names, strict=True):
         begin = time.perf_counter()
         report = slam.step(**reading)
         times.append(time.perf_counter() - begin)
+        if report.rejuvenation is not None:
+            attempts.append((times[-1], report.rejuvenation.reason != ""))
         ess.append(report.ess / slam.num_particles)
         nis.append(report.nis)
         for robot in robots:
@@ -202,6 +214,8 @@ def follow(run: StereoRun, slam: FastSlam) -> Answer:
             "wrong_match_share": wrong / max(matched, 1),
             "held_back_share": held_back / max(total, 1),
             "step_ms": 1e3 * float(np.median(times)),
+            "rejuvenation_ms": 1e3 * float(np.median([t for t, _ in attempts])) if attempts else float("nan"),
+            "refused_share": float(np.mean([refused for _, refused in attempts])) if attempts else float("nan"),
         },
     )
 

@@ -27,8 +27,9 @@ def bench_accuracy(
     methods: Annotated[
         str | None,
         typer.Option(
-            help="dead_reckoning, batch_ml, ideal_online, fastslam1, fastslam2, fastslam2+existence.",
-            show_default="all but the last",
+            help="dead_reckoning, batch_ml, ideal_online, fastslam1, fastslam2, fastslam2+existence, "
+            "fastslam2+rejuvenation.",
+            show_default="all but the last two",
         ),
     ] = None,
     particles: Annotated[str | None, typer.Option(help="Per filter.", show_default="10,30,100,300,1000")] = None,

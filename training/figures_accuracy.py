@@ -20,6 +20,7 @@ PANELS = (
 COLOURS = {
     "fastslam1": "#D55E00", "fastslam2": "#0072B2", "batch_ml": "#009E73", "ideal_online": "#CC79A7",
     "dead_reckoning": "#7f7f7f", "fastslam2+existence": "#56B4E9",
+    "fastslam2+rejuvenation": "#E69F00",
 }  # fmt: skip  # told apart by colour-blind eyes too
 
 

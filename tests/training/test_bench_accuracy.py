@@ -90,7 +90,8 @@ def test_methods_come_in_their_order(rows: list[dict[str, Any]]) -> None:
     }
     assert mean["batch_ml"] <= mean["ideal_online"] < mean["fastslam2"] < mean["dead_reckoning"]
     for row in rows:
-        assert row["particles"] == 0 or all(row[figure] is not None for figure in FIGURES), row
+        of_all = [figure for figure in FIGURES if figure not in ("rejuvenation_ms", "refused_share")]
+        assert row["particles"] == 0 or all(row[figure] is not None for figure in of_all), row
         if row["method"] in ("batch_ml", "ideal_online"):
             assert row["map_recall"] == row["map_precision"] == 1.0
             assert 0.0 < row["anees"] < 10.0
@@ -118,6 +119,20 @@ def test_unknown_association_is_scored_with_its_errors() -> None:
     assert 0.0 <= row["wrong_match_share"] < 0.2
     assert row["held_back_share"] > 0.0
     assert play(replace(trial, method="fastslam2+existence"))["map_precision"] > row["map_precision"]
+
+
+def test_rejuvenation_is_a_method_of_its_own() -> None:
+    """It is tried every 25 steps, its time and refusals are told, and the rest of the row is as of any filter."""
+    trial = Trial(
+        preset="good", association="known", robots=1, length=12.0, method="fastslam2+rejuvenation", particles=20,
+        seed=30,
+    )  # fmt: skip
+    row, plain_row = play(trial), play(replace(trial, method="fastslam2"))
+    assert row["refused_share"] == 0.0
+    assert row["rejuvenation_ms"] > row["step_ms"]
+    assert np.isnan(plain_row["rejuvenation_ms"])
+    assert row["map_recall"] == plain_row["map_recall"] == 1.0
+    assert row["pose_rms_m"] != plain_row["pose_rms_m"]
 
 
 def test_summary_and_intervals(rows: list[dict[str, Any]]) -> None:
