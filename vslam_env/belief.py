@@ -129,6 +129,7 @@ class TeamBelief:
         """Merge the groups of two robots with a given alignment of their filter maps; see `TeamSlam.merge`."""
         renaming = self._team.merge(robot_a, robot_b, alignment)
         self._look_up_poses()
+        self._grids.keep(self._tick + 1, renaming)
         self._grids.meet(self._mates, self._starts)
         return renaming
 

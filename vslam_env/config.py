@@ -59,7 +59,11 @@ class EnvConfig:
         shared_reward: Each robot gets the mean of all robots' rewards, term by term.
         oracle_pose: The robots know their poses, each in its own start frame.
         oracle_association: The robots know which landmark is which.
-        oracle_merge: Groups that share three true landmarks merge with the true transform; none tries by itself.
+        oracle_merge: Groups in contact that share three true landmarks merge with the true transform; none tries by
+            itself.
+        comm_range: Robots hear each other no farther than this [m]; None: at any distance.
+        comm_line_of_sight: Whether walls keep robots from hearing each other.
+        comm_loss: Probability that two robots that could hear each other do not, in each tick.
         robot_radius: [m].
         min_start_distance: Between any two robots [m].
         shared_start_view: Whether two robots may see a common landmark at their starts.
@@ -88,6 +92,9 @@ class EnvConfig:
     oracle_pose: bool = False
     oracle_association: bool = False
     oracle_merge: bool = False
+    comm_range: float | None = None
+    comm_line_of_sight: bool = False
+    comm_loss: float = 0.0
     robot_radius: float = 0.2
     min_start_distance: float = 5.0
     shared_start_view: bool = False
@@ -115,13 +122,17 @@ class EnvConfig:
         check_int("max_cycles", self.max_cycles, 1, "Give a number of steps.")
         if self.stop_at_recall is not None:
             check_float("stop_at_recall", self.stop_at_recall, "Give a share or None.", above=0.0, at_most=1.0)
-        for name in ("oracle_pose", "oracle_association", "oracle_merge", "shared_start_view", "shared_reward"):
+        switches = ("oracle_pose", "oracle_association", "oracle_merge", "shared_start_view", "shared_reward")
+        for name in (*switches, "comm_line_of_sight"):
             if not isinstance(getattr(self, name), bool):
                 raise bad_argument(name, "True or False", getattr(self, name), "Give a bool.")
         if not isinstance(self.reward, Mapping):
             raise bad_argument("reward", "weights by name", self.reward, "E.g. {'map_error': 1.0}.")
         for name, weight in self.reward.items():
             check_float(f"reward[{name!r}]", weight, "Give the weight of the term.")
+        if self.comm_range is not None:
+            check_float("comm_range", self.comm_range, "Give metres, or None for any distance.", at_least=0.0)
+        check_float("comm_loss", self.comm_loss, "Give a probability.", at_least=0.0, at_most=1.0)
         check_float("robot_radius", self.robot_radius, "Give metres.", above=0.0)
         check_float("min_start_distance", self.min_start_distance, "Give metres.", at_least=0.0)
         check_float("map_error_cutoff", self.map_error_cutoff, "Give metres.", above=0.0)
@@ -129,6 +140,11 @@ class EnvConfig:
             if not isinstance(getattr(self, name), kind):
                 raise bad_argument(name, f"a {kind.__name__}", getattr(self, name), f"Build one: {kind.__name__}(...).")
         check_float("scan.half_fov", self.scan.half_fov, "A scan spans less than a half circle.", at_most=1.57)
+
+    @property
+    def always_in_contact(self) -> bool:
+        """Whether nothing can keep the robots from hearing each other."""
+        return self.comm_range is None and not self.comm_line_of_sight and self.comm_loss == 0.0
 
     @property
     def ticks_per_step(self) -> int:

@@ -6,9 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend.errors import FloatArray, IntArray
+from slam_backend.contacts import reach
+from slam_backend.errors import BoolArray, FloatArray, IntArray
 from slam_backend.geometry import between, compose
 from vslam_env.belief import Body, TeamBelief
+from vslam_env.communication import contacts
 from vslam_env.config import TICK, EnvConfig
 from vslam_env.errors_of_maps import MapScores, world_from_group
 from vslam_env.oracle import true_alignment
@@ -176,6 +178,7 @@ class Episode:
         config, poses, bumped = self._config, self._simulator.poses, self._simulator.bumped
         self.frames = self.setting.sensor.measure(poses, self._streams["sensor"])
         scans = self.setting.scan.measure(poses, self._streams["scan"])
+        heard = self._contacts(poses)
         self.readings = tuple(
             Readings(
                 odometry=None if odometry is None else odometry[robot],
@@ -184,6 +187,7 @@ class Episode:
                 bump=bool(bumped[robot]),
                 pose=between(self.true_starts[robot], poses[robot]) if config.oracle_pose else None,
                 identities=frame.true_ids if config.oracle_association else None,
+                heard=None if heard is None else heard[robot],
             )
             for robot, frame in enumerate(self.frames)
         )
@@ -193,21 +197,32 @@ class Episode:
         self.ledger.record(report, [frame.true_ids for frame in self.frames])
         self.merge_ticks += [(self.tick, made.robots_a, made.robots_b) for made in report.renamings]
         if config.oracle_merge:
-            self._merge_by_oracle()
+            self._merge_by_oracle(reach(heard, config.num_robots))
         self.true_path.append(poses)
         self.estimated_path.append(self.belief.poses)
 
-    def _merge_by_oracle(self) -> None:
-        """Merge groups that share true landmarks until none do."""
+    def _contacts(self, poses: FloatArray) -> BoolArray | None:
+        """Return who hears whom (K, K), None if all hear all."""
+        config = self._config
+        if config.always_in_contact:
+            return None
+        limits = config.comm_range, config.comm_line_of_sight, config.comm_loss
+        return contacts(poses, self.world.walls, *limits, self._streams["radio"])
+
+    def _merge_by_oracle(self, networks: IntArray) -> None:
+        """Merge groups that share true landmarks until none do; robots of one network (K,) are in contact."""
         merged = True
         while merged:
             merged = False
             for a, b in combinations(self.belief.groups, 2):
+                speakers = self.belief.speaker(a), self.belief.speaker(b)
+                if networks[speakers[0]] != networks[speakers[1]]:
+                    continue
                 alignment = true_alignment(
                     self._claims(a), self._claims(b), self.true_starts[a[0]], self.true_starts[b[0]]
                 )
                 if alignment is not None:
-                    self.ledger.rename(self.belief.merge(self.belief.speaker(a), self.belief.speaker(b), alignment))
+                    self.ledger.rename(self.belief.merge(*speakers, alignment))
                     self.merge_ticks.append((self.tick, a, b))
                     merged = True
                     break

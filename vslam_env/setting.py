@@ -31,7 +31,7 @@ class Setting:
         true_starts: (K, 3) float64 [m, m, rad], world frame. Read-only.
         bias: (K, 2) float64. What each robot's odometry misreads throughout the episode, see `draw_bias`.
         belief_seed: From which the team's beliefs draw.
-        stream_states: Where the random streams of odometry, sensor and scan stand before the first frame, by name.
+        stream_states: Where the random streams (odometry, sensor, scan, radio) stand before the first frame, by name.
         sensor: The cameras.
         scan: The range finders.
         coverage: What measures how much of the floor has been seen.
@@ -74,7 +74,7 @@ def draw_setting(
     Raises:
         ValueError: If there is no such world, or robots cannot start there.
     """
-    layout, textures, starts, odometry, sensor, scan, belief_seed = seed.spawn(7)
+    layout, textures, starts, odometry, sensor, scan, belief_seed, radio = seed.spawn(8)
     if world_seed is None and config.world_split is not None:
         world_seed = draw_world_seed(config.world_split, np.random.default_rng(layout))
     if world_seed is not None:
@@ -96,7 +96,7 @@ def draw_setting(
     true_starts.setflags(write=False)
     streams = {
         name: np.random.default_rng(stream)
-        for name, stream in (("odometry", odometry), ("sensor", sensor), ("scan", scan))
+        for name, stream in (("odometry", odometry), ("sensor", sensor), ("scan", scan), ("radio", radio))
     }
     return Setting(
         world=world,

@@ -69,6 +69,17 @@ class SharedGrids:
     def __getitem__(self, robot: int) -> SeenGrid:
         return self._grids[robot]
 
+    def keep(self, tick: int, renaming: Renaming) -> None:
+        """Keep the grids of both sides of a merge, before they absorb each other's.
+
+        Args:
+            tick: Whose readings are painted next.
+            renaming: Of the merge.
+        """
+        sides = renaming.robots_a, renaming.robots_b
+        grids = {robot: self._grids[robot].get_state() for robot in sides[0] + sides[1]}
+        self._kept.append(Kept(tick, sides, renaming.maps, grids))
+
     def follow(self, tick: int, entries: Sequence[MapEntry], merged: Sequence[Renaming]) -> None:
         """Keep grids for an undo, undo, and forget what can no longer be undone.
 
@@ -79,9 +90,7 @@ class SharedGrids:
         """
         for entry in entries:
             if isinstance(entry, Renaming) and entry in merged:
-                sides = entry.robots_a, entry.robots_b
-                grids = {robot: self._grids[robot].get_state() for robot in sides[0] + sides[1]}
-                self._kept.append(Kept(tick, sides, entry.maps, grids))
+                self.keep(tick, entry)
             elif isinstance(entry, MergeUndone):
                 self._undo(entry)
             elif isinstance(entry, MapDropped):

@@ -29,6 +29,9 @@ def parallel_env(
     oracle_pose: bool | None = None,
     oracle_association: bool | None = None,
     oracle_merge: bool | None = None,
+    comm_range: float | None = None,
+    comm_line_of_sight: bool | None = None,
+    comm_loss: float | None = None,
     stop_at_recall: float | None = None,
     render_mode: str | None = None,
     config: EnvConfig | str | Path | None = None,
@@ -54,7 +57,10 @@ def parallel_env(
         observation_type: `"dict"` (default) or `"flat"`.
         oracle_pose: The robots know their poses in their own start frames.
         oracle_association: They know which landmark is which.
-        oracle_merge: Groups that share three landmarks merge with the true transform.
+        oracle_merge: Groups in contact that share three landmarks merge with the true transform.
+        comm_range: Robots hear each other no farther than this [m]; default any distance.
+        comm_line_of_sight: Walls keep robots from hearing each other; default no.
+        comm_loss: Probability that two robots do not hear each other in a tick; default 0.
         stop_at_recall: Terminate when each map holds this share of the landmarks; default never.
         render_mode: `"human"`, `"rgb_array"` or None.
         config: An `EnvConfig` or the path of its TOML file, instead of a preset.
@@ -86,6 +92,9 @@ def parallel_env(
         "oracle_pose": oracle_pose,
         "oracle_association": oracle_association,
         "oracle_merge": oracle_merge,
+        "comm_range": comm_range,
+        "comm_line_of_sight": comm_line_of_sight,
+        "comm_loss": comm_loss,
         "stop_at_recall": stop_at_recall,
         "belief": None if num_particles is None else {"filter": {"num_particles": num_particles}},
     }

@@ -1,0 +1,60 @@
+"""Which robots hear each other: range, sight and loss of their radios."""
+
+import numpy as np
+
+from slam_backend.errors import BoolArray, FloatArray
+
+
+def contacts(
+    poses: FloatArray,
+    walls: FloatArray,
+    comm_range: float | None,
+    line_of_sight: bool,
+    loss: float,
+    rng: np.random.Generator,
+) -> BoolArray:
+    """Return who hears whom in a tick; links work both ways or not at all.
+
+    Args:
+        poses: (K, 3) float64 [m, m, rad], world frame. True ones.
+        walls: (S, 4) float64 [m], world frame, rows (x1, y1, x2, y2).
+        comm_range: No link is longer than this [m]; None: any length.
+        line_of_sight: Whether walls cut links. Robots do not.
+        loss: Probability that a link that is there fails in this tick, each by itself.
+        rng: Drawn from only where links can fail, and then as often whatever the poses.
+
+    Returns:
+        (K, K) bool, symmetric; each robot hears itself.
+    """
+    count = len(poses)
+    one, other = np.triu_indices(count, 1)
+    heard = np.ones(len(one), dtype=np.bool_)
+    if comm_range is not None:
+        heard &= np.hypot(*(poses[one, :2] - poses[other, :2]).T) <= comm_range
+    if line_of_sight and heard.any():
+        heard[heard] = ~crosses_wall(poses[one[heard], :2], poses[other[heard], :2], walls)
+    if loss > 0.0:
+        heard &= rng.random(len(one)) >= loss
+    matrix = np.eye(count, dtype=np.bool_)
+    matrix[one, other] = matrix[other, one] = heard
+    return matrix
+
+
+def crosses_wall(starts: FloatArray, ends: FloatArray, walls: FloatArray) -> BoolArray:
+    """Tell which straight lines (n, 2) to (n, 2) [m] cross or touch any of the walls (S, 4) [m].
+
+    >>> wall = np.array([[1.0, -1.0, 1.0, 1.0]])
+    >>> crosses_wall(np.zeros((3, 2)), np.array([[2.0, 0.0], [0.5, 0.0], [2.0, 5.0]]), wall).tolist()
+    [True, False, False]
+    """
+    along = (ends - starts)[:, None]  # p + t r = q + u s
+    corner, edge = walls[None, :, :2], walls[None, :, 2:] - walls[None, :, :2]
+    across = _cross(along, edge)
+    gap = corner - starts[:, None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        t, u = _cross(gap, edge) / across, _cross(gap, along) / across  # parallel: NaN or infinite, so no crossing
+    return np.asarray(((t >= 0.0) & (t <= 1.0) & (u >= 0.0) & (u <= 1.0)).any(axis=1))
+
+
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
