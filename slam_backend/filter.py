@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from slam_backend import _kernels
+from slam_backend._best_map import best_map
 from slam_backend._existence_step import ExistenceStep
 from slam_backend._frame_buffers import UPPER, FrameBuffers, Turn
 from slam_backend._particle_maps import ParticleMaps, aligned
@@ -259,20 +260,18 @@ class FastSlam:
             min_count: Landmarks measured fewer times are left out.
         """
         check_choice("estimate", estimate, ("best", "mixture"))
-        slots = self._maps.used_slots()
-        values, counts = self._maps.of_particle(self.best_particle, slots)
-        held = counts >= max(min_count, 1)
-        slots, values, counts = slots[held], values[held], counts[held]
         if estimate == "best":
-            means, covariances = np.ascontiguousarray(values[:, :3]), values[:, 3:][:, UNPACK]
-        else:
-            dense, times = self._maps.dense(slots)
-            weights = np.exp(self._log_weights) * (times > 0)
-            weights /= np.maximum(weights.sum(axis=1, keepdims=True), 1e-300)
-            mixed = np.einsum("ncm,nm->nc", dense, weights)
-            means = mixed[:, :3]
-            offsets = dense[:, :3] - means[:, :, None]
-            covariances = mixed[:, 3:][:, UNPACK] + np.einsum("nim,njm,nm->nij", offsets, offsets, weights)
+            return LandmarkMap._trusted(*best_map(self._maps, self.best_particle, max(min_count, 1)))
+        slots = self._maps.used_slots()
+        counts = self._maps.of_particle(self.best_particle, slots)[1]
+        slots, counts = slots[counts >= max(min_count, 1)], counts[counts >= max(min_count, 1)]
+        dense, times = self._maps.dense(slots)
+        weights = np.exp(self._log_weights) * (times > 0)
+        weights /= np.maximum(weights.sum(axis=1, keepdims=True), 1e-300)
+        mixed = np.einsum("ncm,nm->nc", dense, weights)
+        means = mixed[:, :3]
+        offsets = dense[:, :3] - means[:, :, None]
+        covariances = mixed[:, 3:][:, UNPACK] + np.einsum("nim,njm,nm->nij", offsets, offsets, weights)
         return LandmarkMap._trusted(
             means, covariances, self._maps.descriptors[slots], counts.astype(np.int64), self._maps.ids[slots]
         )

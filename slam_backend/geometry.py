@@ -66,7 +66,7 @@ def inverse(a_from_b: ArrayLike) -> FloatArray:
     return result
 
 
-# One pose at a time is the rule in an environment's step: plain floats take a third of the time, and give the same bits.
+# One pose at a time is the rule in a step of an environment: plain floats take a third of the time, with the same bits.
 
 
 def _compose_one(a: list[float], b: list[float]) -> FloatArray:

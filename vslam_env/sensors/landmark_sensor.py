@@ -111,9 +111,16 @@ class LandmarkSensor:
         visible = self.visible(poses)
         num_false = np.minimum(rng.poisson(config.false_points, robots), most)
         keys = rng.random(visible.shape)
-        ids, counts = _choose(visible, keys, config.detection_probability, most - num_false)
-        points = _seen_from(self._landmarks.positions, ids, counts, poses, self._mount)
-        descriptors = self._descriptors[ids]
+        ids, counts, points, descriptors = _choose_and_see(
+            visible,
+            keys,
+            config.detection_probability,
+            most - num_false,
+            self._landmarks.positions,
+            self._descriptors,
+            poses,
+            self._mount,
+        )
         if num_false.any():
             at = np.repeat(np.cumsum(counts), num_false)
             ids = np.insert(ids, at, -1)
@@ -128,7 +135,8 @@ class LandmarkSensor:
             counts = np.bincount(np.repeat(np.arange(robots), counts)[sharp], minlength=robots)
             ids, points, descriptors = ids[sharp], points[sharp], descriptors[sharp]
         frames, begin = [], 0
-        for end in np.cumsum(counts).tolist():
+        for count in counts.tolist():
+            end = begin + count
             rows = slice(begin, end)
             frames.append(Frame(Measurements._trusted(points[rows], descriptors[rows]), ids[rows].copy()))
             begin = end
@@ -248,3 +256,22 @@ def _choose(
                 at -= 1
             chosen[at] = n
     return chosen[:total], counts
+
+
+@jit
+def _choose_and_see(
+    visible: BoolArray,
+    keys: FloatArray,
+    detection_probability: float,
+    places: IntArray,
+    positions: FloatArray,
+    descriptors: FloatArray,
+    poses: FloatArray,
+    mount: FloatArray,
+) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
+    """Return the landmarks that `_choose` chooses, how many for each robot, their points and true descriptors."""
+    ids, counts = _choose(visible, keys, detection_probability, places)
+    looks = np.empty((len(ids), descriptors.shape[1]))
+    for i in range(len(ids)):
+        looks[i] = descriptors[ids[i]]
+    return ids, counts, _seen_from(positions, ids, counts, poses, mount), looks

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from slam_backend._jit import jit
 from slam_backend.camera import StereoCamera
 from slam_backend.errors import FloatArray, check_array, check_float, check_int
 from vslam_env.world.visibility import cast_scans
@@ -64,5 +65,15 @@ class Scan:
         config = self.config
         poses = np.ascontiguousarray(poses, dtype=np.float64)
         true = cast_scans(poses, self.ray_angles, self._walls, self._robot_radius, config.max_range)
-        noisy = true * (1.0 + config.sigma * rng.standard_normal(true.shape))
-        return np.where(true < config.max_range, noisy, config.max_range).clip(0.0, config.max_range)
+        return _with_noise(true, rng.standard_normal(true.shape), config.sigma, config.max_range)
+
+
+@jit
+def _with_noise(true: FloatArray, noise: FloatArray, sigma: float, max_range: float) -> FloatArray:
+    """Return what is read of true ranges (K, R) [m] under standard normal draws (K, R)."""
+    read = np.empty_like(true)
+    for k in range(true.shape[0]):
+        for r in range(true.shape[1]):
+            noisy = true[k, r] * (1.0 + sigma * noise[k, r])
+            read[k, r] = min(max(noisy, 0.0), max_range) if true[k, r] < max_range else max_range
+    return read

@@ -1,0 +1,68 @@
+"""The compiled gather of one particle's map: an environment asks for it at every step."""
+
+from typing import Any
+
+import numpy as np
+
+from slam_backend._jit import jit
+from slam_backend._particle_maps import LANES, ParticleMaps
+from slam_backend.errors import FloatArray, IntArray
+
+
+@jit
+def _held(
+    ids: Any, row_of: Any, map_of: Any, maps: Any, counts: Any, m: int, min_count: int
+) -> tuple[IntArray, bool]:
+    """Return the slots that particle m holds with at least so many measurements, and whether their ids ascend."""
+    slots = np.empty(len(ids), np.int64)
+    n, last, ascending = 0, -1, True
+    for slot in range(len(ids)):
+        if ids[slot] >= 0:
+            place = maps[map_of[slot], m] if map_of[slot] > 0 else m
+            if counts[row_of[slot], place] >= min_count:
+                ascending &= ids[slot] > last
+                last = ids[slot]
+                slots[n] = slot
+                n += 1
+    return slots[:n], ascending
+
+
+@jit
+def _gather(
+    slots: Any, ids: Any, row_of: Any, map_of: Any, maps: Any, values: Any, counts: Any, m: int, lanes: int
+) -> tuple[FloatArray, FloatArray, IntArray, IntArray]:
+    """Return means (n, 3), covariances (n, 3, 3), counts (n,) and ids (n,) of slots of particle m.
+
+    The number of lanes is an argument, for a compiled kernel would not notice that it changed in another file.
+    """
+    n, padded = len(slots), counts.shape[1]
+    means, covariances = np.empty((n, 3)), np.empty((n, 3, 3))
+    times, names = np.empty(n, np.int64), np.empty(n, np.int64)
+    for i in range(n):
+        slot = slots[i]
+        row, place = row_of[slot], maps[map_of[slot], m] if map_of[slot] > 0 else m
+        at = row * 9 * padded + place // lanes * 9 * lanes + place % lanes
+        for axis in range(3):
+            means[i, axis] = values[at + axis * lanes]
+        entry = 3
+        for j in range(3):
+            for k in range(j, 3):
+                covariances[i, j, k] = covariances[i, k, j] = values[at + entry * lanes]
+                entry += 1
+        times[i], names[i] = counts[row, place], ids[slot]
+    return means, covariances, times, names
+
+
+def best_map(maps: ParticleMaps, m: int, min_count: int) -> tuple[FloatArray, FloatArray, Any, IntArray, IntArray]:
+    """Return what particle m holds with at least so many measurements, by ascending id.
+
+    Returns:
+        Means (n, 3), covariances (n, 3, 3), descriptors (n, d) float32, counts (n,) and ids (n,): all fresh.
+    """
+    slots, ascending = _held(maps.ids, maps.row_of, maps.map_of, maps.maps, maps.counts, m, min_count)
+    if not ascending:
+        slots = slots[np.argsort(maps.ids[slots])]
+    means, covariances, times, names = _gather(
+        slots, maps.ids, maps.row_of, maps.map_of, maps.maps, maps.values, maps.counts, m, LANES
+    )
+    return means, covariances, maps.descriptors[slots], times, names

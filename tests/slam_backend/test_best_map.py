@@ -1,0 +1,54 @@
+"""The compiled gather of the most probable particle's map agrees with the plain one."""
+
+import numpy as np
+
+from slam_backend import FastSlam, Measurements
+from slam_backend._best_map import best_map
+
+UNPACK = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
+
+
+def _filter_after_some_steps() -> FastSlam:
+    """Return a filter that has resampled, and in which landmarks came and went."""
+    rng = np.random.default_rng(3)
+    slam = FastSlam(num_particles=70, seed=4, resample_threshold=1.0)
+    points = np.column_stack([rng.uniform(-2.0, 2.0, 14), rng.uniform(-1.0, 1.0, 14), rng.uniform(2.0, 6.0, 14)])
+    looks = np.linalg.qr(rng.standard_normal((14, 14)))[0].astype(np.float32)
+    for step in range(12):
+        seen = rng.choice(14 if step > 4 else 8, 5, replace=False)
+        noisy = points[seen] + rng.normal(0.0, 0.02, (5, 3))
+        slam.step([np.array([0.0, 0.0, 0.001])], [Measurements(noisy, looks[seen])])
+    slam._maps.release(slam._maps.used_slots()[[2, 5]])
+    extra = Measurements(points[:2] + [0.0, 0.0, 3.0], -looks[:2])
+    slam.step([None], [extra])
+    return slam
+
+
+def test_the_gather_agrees_with_fancy_indexing() -> None:
+    """For each of 70 particles and any least count: the same landmarks, by ascending id, with the same bits."""
+    slam = _filter_after_some_steps()
+    maps = slam._maps
+    slots = maps.used_slots()
+    assert not (np.diff(slots) > 0).all()  # slots were used again: ids do not ascend with them
+    for m in range(70):
+        values, counts = maps.of_particle(m, slots)
+        for least in (1, 2, 5):
+            means, covariances, looks, times, ids = best_map(maps, m, least)
+            held = counts >= least
+            np.testing.assert_array_equal(means, values[held, :3])
+            np.testing.assert_array_equal(covariances, values[held][:, 3:][:, UNPACK])
+            np.testing.assert_array_equal(looks, maps.descriptors[slots[held]])
+            np.testing.assert_array_equal(times, counts[held])
+            np.testing.assert_array_equal(ids, maps.ids[slots[held]])
+
+
+def test_a_least_count_leaves_out_what_was_seen_less() -> None:
+    """`map(min_count=n)` is the subset of `map()` that was measured n times; an empty filter has an empty map."""
+    slam = _filter_after_some_steps()
+    whole, some = slam.map(), slam.map(min_count=3)
+    assert 0 < len(some) < len(whole)
+    np.testing.assert_array_equal(some.ids, whole.ids[whole.counts >= 3])
+    np.testing.assert_array_equal(some.means, whole.means[whole.counts >= 3])
+    mixed = slam.map("mixture", min_count=3)
+    np.testing.assert_array_equal(mixed.ids, some.ids)
+    assert len(FastSlam(num_particles=3).map()) == 0
