@@ -1,0 +1,280 @@
+"""`ExplorationVecEnv`: what Stable-Baselines3 gets is what each environment gives by itself."""
+
+from collections.abc import Iterator
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+from numpy.typing import NDArray
+from pettingzoo import ParallelEnv
+
+pytest.importorskip("stable_baselines3", reason="stable-baselines3 is not installed: pip install .[train]")
+
+from stable_baselines3 import PPO
+
+from training.vec_env import ExplorationVecEnv, env_seeds, make_vec_env
+from vslam_env import vslam_v0
+from vslam_env.config import EnvConfig
+
+GOALS = EnvConfig().replace(
+    world="fig5", num_robots=2, action_type="goal", max_cycles=4, belief={"filter": {"num_particles": 10}}
+)
+
+
+def _goals(masks: Any, rng: np.random.Generator) -> NDArray[np.int64]:
+    return np.array([rng.choice(np.flatnonzero(mask)) for mask in masks])
+
+
+def _assert_equal(ours: Any, theirs: Any) -> None:
+    if isinstance(theirs, dict):
+        assert set(ours) == set(theirs)
+        for name in theirs:
+            _assert_equal(ours[name], theirs[name])
+    else:
+        assert np.asarray(ours).dtype == np.asarray(theirs).dtype
+        np.testing.assert_array_equal(ours, theirs)
+
+
+def _toy(fails_at: int) -> Any:
+    """Return a maker of a tiny environment of one agent that fails in some step; cloudpickle takes it whole."""
+
+    class Toy(ParallelEnv):  # type: ignore[misc]
+        possible_agents, render_mode = ("only",), None
+
+        def observation_space(self, agent: str) -> spaces.Space[Any]:
+            return spaces.Box(0.0, 9.0, (1,), np.float32)
+
+        def action_space(self, agent: str) -> spaces.Space[Any]:
+            return spaces.Discrete(2)
+
+        def reset(self, seed: int | None = None, options: Any = None) -> tuple[Any, Any]:
+            self.agents, self.steps = ["only"], 0
+            return {"only": np.zeros(1, np.float32)}, {"only": {}}
+
+        def step(self, actions: Any) -> tuple[Any, ...]:
+            self.steps += 1
+            if self.steps == fails_at:
+                raise ArithmeticError("no reward today")
+            return {"only": np.zeros(1, np.float32)}, {"only": 0.0}, {"only": False}, {"only": False}, {"only": {}}
+
+    return Toy
+
+
+@pytest.fixture(scope="module")
+def workers() -> Iterator[ExplorationVecEnv]:
+    """Three environments of two robots in two processes."""
+    env = make_vec_env(GOALS, 3, workers=2)
+    yield env
+    env.close()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("where", ["here", "workers"])
+def test_slots_hold_what_each_environment_gives_alone(where: str, request: pytest.FixtureRequest) -> None:
+    """Observations, rewards, ends and infos of two episodes are those of a plain loop, in this process or others."""
+    env = make_vec_env(GOALS, 3) if where == "here" else request.getfixturevalue("workers")
+    env.seed(5)
+    observations = env.reset()
+    alone = [vslam_v0.parallel_env(config=GOALS) for _ in range(3)]
+    first = [one.reset(seed=seed) for one, seed in zip(alone, env_seeds(5, 3), strict=True)]
+    rng = np.random.default_rng(0)
+    slots = [(e, agent) for e in range(3) for agent in GOALS.agents]
+    for slot, (e, agent) in enumerate(slots):
+        _assert_equal({name: rows[slot] for name, rows in observations.items()}, first[e][0][agent])
+        _assert_equal(env.reset_infos[slot], first[e][1][agent])
+    for step in range(6):
+        actions = _goals(env.env_method("action_masks"), rng)
+        observations, rewards, dones, infos = env.step(actions)
+        told = [
+            one.step(dict(zip(GOALS.agents, actions[2 * e : 2 * e + 2], strict=True))) for e, one in enumerate(alone)
+        ]
+        ended = step == GOALS.max_cycles - 1
+        seen = [one.reset()[0] if ended else told[e][0] for e, one in enumerate(alone)]
+        for slot, (e, agent) in enumerate(slots):
+            _assert_equal({name: rows[slot] for name, rows in observations.items()}, seen[e][agent])
+            assert rewards[slot] == np.float32(told[e][1][agent])
+            assert dones[slot] == ended
+            info = dict(infos[slot])
+            assert info.pop("TimeLimit.truncated") is ended
+            if ended:
+                _assert_equal(info.pop("terminal_observation"), told[e][0][agent])
+            _assert_equal(info, told[e][4][agent])
+
+
+def test_rollouts_equal_a_loop() -> None:
+    """PPO's buffer holds the observations and rewards of a loop; at the time limit the value of the end is added."""
+    config = GOALS.replace(action_type="continuous", observation_type="flat", max_cycles=5)
+    model = PPO("MlpPolicy", make_vec_env(config, 2), n_steps=8, batch_size=8, n_epochs=1, seed=3, device="cpu")
+    _, callback = model._setup_learn(32, None)
+    assert model.collect_rollouts(model.env, callback, model.rollout_buffer, 8)
+    kept = model.rollout_buffer
+    for e, seed in enumerate(env_seeds(3, 2)):
+        env = vslam_v0.parallel_env(config=config)
+        observations, _ = env.reset(seed=seed)
+        for step in range(8):
+            slots = list(enumerate(config.agents, 2 * e))
+            for slot, agent in slots:
+                np.testing.assert_array_equal(kept.observations[step, slot], observations[agent])
+                assert kept.episode_starts[step, slot] == (step in (0, 5))
+            clipped = {agent: np.clip(kept.actions[step, slot], -1.0, 1.0) for slot, agent in slots}
+            observations, rewards, _, truncations, _ = env.step(clipped)
+            for slot, agent in slots:
+                reward = np.float32(rewards[agent])
+                if truncations[agent]:
+                    end = model.policy.obs_to_tensor(observations[agent])[0]
+                    value = model.policy.predict_values(end)[0].item()
+                    reward += model.gamma * value
+                    assert abs(value) > 1e-6
+                assert kept.rewards[step, slot] == pytest.approx(reward, rel=1e-6, abs=1e-9)
+            if not env.agents:
+                observations, _ = env.reset()
+
+
+def test_a_goal_reached_is_no_time_limit() -> None:
+    """Where episodes terminate, the slots are done and `TimeLimit.truncated` is false."""
+    env = make_vec_env(GOALS.replace(stop_at_recall=1e-9, max_cycles=50), 1, seed=1)
+    env.reset()
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        _, _, dones, infos = env.step(_goals(env.env_method("action_masks"), rng))
+        if dones.any():
+            break
+    assert dones.all()
+    assert [info["TimeLimit.truncated"] for info in infos] == [False, False]
+    assert all("terminal_observation" in info for info in infos)
+
+
+@pytest.mark.parametrize("where", ["here", "workers"])
+def test_results_are_copies(where: str, request: pytest.FixtureRequest) -> None:
+    """What one step returned changes by no later step, and changing it changes no later mask."""
+    env = make_vec_env(GOALS, 1) if where == "here" else request.getfixturevalue("workers")
+    env.seed(2)
+    first = env.reset()
+    kept = {name: rows.copy() for name, rows in first.items()}
+    masks = env.env_method("action_masks")
+    actions = _goals(masks, np.random.default_rng(1))
+    masks[0][:] = False
+    second = env.step(actions)[0]
+    _assert_equal(first, kept)
+    assert not any(np.shares_memory(first[name], second[name]) for name in first)
+    second["action_mask"][:] = 0
+    assert all(mask[0] for mask in env.env_method("action_masks"))
+
+
+def test_seeds_repeat_and_differ() -> None:
+    """A seed gives the same episodes again; neighbours share no environment's seed; None comes from anywhere."""
+    env = make_vec_env(GOALS, 2)
+    states = []
+    for seed in (7, 7, 8, None):
+        given = env.seed(seed)
+        assert given[0] == given[1] != given[2]
+        env.reset()
+        states.append(np.concatenate(env.env_method("state", indices=env.first_slots)))
+    np.testing.assert_array_equal(states[0], states[1])
+    assert not np.array_equal(states[1], states[2])
+    assert not np.array_equal(states[2], states[3])
+    assert not set(env_seeds(7, 100)) & set(env_seeds(8, 100))
+    assert env_seeds(7, 3) == env_seeds(7, 100)[:3]
+
+
+def test_options_reach_the_next_reset_only() -> None:
+    """A list of options goes slot by slot; the first slot of an environment speaks for it."""
+    env = make_vec_env(GOALS.replace(world="office", min_start_distance=2.0), 2, seed=0)
+    env.set_options([{"world_seed": 3}, {}, {"world_seed": 4}, {}])
+    env.reset()
+    layouts = [world.walls for world in env.get_attr("world", indices=env.first_slots)]
+    alone = vslam_v0.parallel_env(config=GOALS.replace(world="office", min_start_distance=2.0))
+    for layout, seed in zip(layouts, (3, 4), strict=True):
+        alone.reset(seed=99, options={"world_seed": seed})
+        np.testing.assert_array_equal(layout, alone.world.walls)
+    env.reset()
+    assert not np.array_equal(env.get_attr("world", 0)[0].walls, layouts[0])
+
+
+@pytest.mark.parametrize("where", ["here", "workers"])
+def test_attributes_and_methods(where: str, request: pytest.FixtureRequest) -> None:
+    """Attributes and methods are those of each slot's environment, in the order of the indices."""
+    env = make_vec_env(GOALS, 3) if where == "here" else request.getfixturevalue("workers")
+    env.seed(4)
+    env.reset()
+    assert env.num_envs == 6
+    assert env.first_slots == [0, 2, 4]
+    assert env.get_attr("agent") == ["robot_0", "robot_1"] * 3
+    env.set_attr("max_cycles", 9, indices=[4])
+    assert env.get_attr("max_cycles", indices=[5, 0]) == [9, GOALS.max_cycles]
+    env.set_attr("max_cycles", GOALS.max_cycles)
+    states = env.env_method("state")
+    np.testing.assert_array_equal(states[0], states[1])
+    np.testing.assert_array_equal(env.env_method("state", indices=[4, 0])[1], states[0])
+    assert env.has_attr("action_masks")
+    assert env.has_attr("events")
+    assert not env.has_attr("nothing_of_that_name")
+    assert env.env_is_wrapped(object, indices=[0, 1]) == [False, False]
+
+
+def test_masks_are_there_with_goal_actions_only() -> None:
+    """MaskablePPO asks `has_attr("action_masks")`; flat observations carry the mask too."""
+    assert make_vec_env(GOALS.replace(observation_type="flat"), 1).has_attr("action_masks")
+    assert not make_vec_env(GOALS.replace(action_type="discrete"), 1).has_attr("action_masks")
+
+
+def test_pictures() -> None:
+    """`render` tiles one picture per environment, as SB3's recorders want it."""
+    env = make_vec_env(GOALS, 2, seed=0, render_mode="rgb_array")
+    env.reset()
+    assert env.render_mode == "rgb_array"
+    assert [image.shape for image in env.get_images()] == [(720, 960, 3)] * 2
+    tiled = env.render()
+    assert tiled.dtype == np.uint8
+    assert tiled.size >= 2 * 720 * 960 * 3
+
+
+def test_differing_robots_are_refused() -> None:
+    """All slots have one space of observations, one of actions and one way of rendering."""
+    other = GOALS.replace(action_type="discrete")
+    makers = [partial(vslam_v0.parallel_env, config=config) for config in (GOALS, other)]
+    with pytest.raises(ValueError, match="observation_space: expected the same for all agents"):
+        ExplorationVecEnv(makers)
+    with pytest.raises(ValueError, match="makers: expected at least one function"):
+        ExplorationVecEnv([])
+    shown = partial(vslam_v0.parallel_env, config=GOALS, render_mode="rgb_array")
+    with pytest.raises(ValueError, match="render_mode: expected the same for all"):
+        ExplorationVecEnv([makers[0], shown])
+
+
+def test_bad_numbers_are_refused() -> None:
+    """Numbers of environments, workers and actions, and seeds, are checked; the cure is told."""
+    with pytest.raises(ValueError, match="num_envs: expected an int >= 1, got 0"):
+        make_vec_env(GOALS, 0)
+    with pytest.raises(ValueError, match="workers: expected an int >= 0, got -1"):
+        make_vec_env(GOALS, 1, workers=-1)
+    with pytest.raises(ValueError, match="workers: expected at most one per environment, 1, got 2"):
+        make_vec_env(GOALS, 1, workers=2)
+    env = make_vec_env(GOALS, 1)
+    with pytest.raises(ValueError, match="seed: expected an int >= 0, got -3"):
+        env.seed(-3)
+    env.reset()
+    with pytest.raises(ValueError, match="actions: expected 2 of them, got 3"):
+        env.step(np.zeros(3, np.int64))
+    with pytest.raises(RuntimeError, match=r"step_wait: .* Call step_async\(\) first"):
+        env.step_wait()
+
+
+@pytest.mark.slow
+def test_errors_of_workers_arrive() -> None:
+    """An error in a worker is raised here, says where it was, and ends the workers; so does the death of one."""
+    env = ExplorationVecEnv([_toy(fails_at=2)], workers=1)
+    env.reset()
+    env.step(np.zeros(1, np.int64))
+    with pytest.raises(ArithmeticError, match="no reward today") as raised:
+        env.step(np.zeros(1, np.int64))
+    assert "In a worker:" in raised.value.__notes__[0]
+    with pytest.raises(RuntimeError, match="expected running workers, got closed ones"):
+        env.step(np.zeros(1, np.int64))
+    env = ExplorationVecEnv([_toy(fails_at=9)], workers=1)
+    env.reset()
+    env._slots._processes[0].kill()
+    with pytest.raises(RuntimeError, match="worker 0: expected an answer of environments 0 to 0, got its end"):
+        env.step(np.zeros(1, np.int64))
