@@ -5,7 +5,8 @@ from typing import Any
 import numpy as np
 
 from slam_backend._jit import jit
-from slam_backend._particle_maps import LANES, ParticleMaps
+from slam_backend._kernels import LANES
+from slam_backend._particle_maps import ParticleMaps
 from slam_backend.errors import FloatArray, IntArray
 
 

@@ -1,8 +1,10 @@
 """The landmark sensor: true poses become noisy measurements of the landmarks that each camera sees."""
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from slam_backend._jit import jit
 from slam_backend.camera import StereoCamera
@@ -268,7 +270,7 @@ def _choose_and_see(
     descriptors: FloatArray,
     poses: FloatArray,
     mount: FloatArray,
-) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
+) -> tuple[IntArray, IntArray, FloatArray, NDArray[Any]]:
     """Return the landmarks that `_choose` chooses, how many for each robot, their points and true descriptors."""
     ids, counts = _choose(visible, keys, detection_probability, places)
     looks = np.empty((len(ids), descriptors.shape[1]))
