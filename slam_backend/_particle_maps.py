@@ -240,24 +240,31 @@ class ParticleMaps:
         Where existence is kept and `odds` are not given, landmarks get the prior.
         """
         keep = (counts > 0).any(axis=1)
-        values, counts, descriptors = values[keep], counts[keep], descriptors[keep]
-        n, m = len(values), self.num_particles
+        padded = np.zeros((int(keep.sum()), 9, self.padded))
+        padded[:, :, : self.num_particles] = values[keep]
+        tiles = padded.reshape(len(padded), 9, -1, LANES).transpose(0, 2, 1, 3)
+        odds = None if odds is None else odds[keep]
+        self.load_tiles(tiles, counts[keep], descriptors[keep], ids[keep], identities[keep], next_id, odds)
+
+    def load_tiles(
+        self, tiles: FloatArray, counts: NDArray[np.integer[Any]], descriptors: NDArray[np.float32], ids: IntArray,
+        identities: IntArray, next_id: int, odds: FloatArray | None = None,
+    ) -> None:  # fmt: skip
+        """Replace all landmarks by these, each held by a particle: `load` with values as `blocks` holds them."""
+        n, m = len(tiles), self.num_particles
         self.__init__(m, self.log_odds_prior)  # type: ignore[misc]
         self.tops[2] = next_id
         if not n:
             return
         self.make_room(n, descriptors.shape[1])
         slots, rows = np.arange(n), np.arange(n)
-        padded = np.zeros((n, 9, self.padded))
-        padded[:, :, :m] = values
-        blocks = self.blocks
-        blocks[rows] = padded.reshape(n, 9, -1, LANES).transpose(0, 2, 1, 3)
+        self.blocks[:n] = tiles
         self.counts[rows, :m] = counts
         self.row_of[slots], self.map_of[slots] = rows, 0
-        self.ids[slots], self.identities[slots] = ids[keep], identities[keep]
+        self.ids[slots], self.identities[slots] = ids, identities
         self.descriptors[slots] = descriptors
         if self.log_odds_prior is not None:
-            self.odds[slots, :m] = self.log_odds_prior if odds is None else odds[keep]
+            self.odds[slots, :m] = self.log_odds_prior if odds is None else odds
         self._set_heads(n)
         self.tops[0] -= n  # the lowest rows and slots lie on top of the stacks
         self.tops[1] -= n

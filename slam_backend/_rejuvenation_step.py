@@ -127,14 +127,14 @@ def write_maps(maps: ParticleMaps, particles: Particles) -> None:
     slots = slots[wanted]
     rows = np.searchsorted(particles.ids[order := np.argsort(particles.ids)], maps.ids[slots])
     rows = order[rows]
-    _, held = maps.dense(slots)
-    odds = maps.dense_odds(slots)
     m = maps.num_particles
+    odds = maps.dense_odds(slots)
     if odds is not None:
-        mean = (odds * (held > 0)).sum(axis=1) / np.maximum((held > 0).sum(axis=1), 1)
+        held = maps.dense(slots)[1] > 0
+        mean = (odds * held).sum(axis=1) / np.maximum(held.sum(axis=1), 1)
         odds = np.repeat(mean[:, None], m, axis=1)
     counts = np.repeat(particles.counts[rows][:, None], m, axis=1)
-    maps.load(
-        particles.landmarks[rows], counts, maps.descriptors[slots], maps.ids[slots], maps.identities[slots],
+    maps.load_tiles(
+        particles.tiles[rows], counts, maps.descriptors[slots], maps.ids[slots], maps.identities[slots],
         maps.next_id, odds,
     )  # fmt: skip

@@ -47,6 +47,9 @@ def warm_up() -> float:
         watching = FastSlam(num_particles=4, existence=ExistenceModel(), resample_threshold=1.0)
         for _ in range(STEPS):
             watching.step([move], [plain])
+        smoothing = FastSlam(num_particles=4, rejuvenate_every=2)
+        for _ in range(STEPS):
+            smoothing.step([move], [plain])
         team = TeamSlam(2, num_particles=4, attempts=AttemptOptions(every=1))
         for _ in range(STEPS):
             team.step([None, None], [plain, plain])

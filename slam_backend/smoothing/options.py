@@ -24,14 +24,14 @@ class SmoothingOptions:
         tolerance: The descent ends when the cost is expected to fall by less than this (half a squared distance).
     """
 
-    max_keys: int = 150
-    fresh_keys: int = 60
+    max_keys: int = 120
+    fresh_keys: int = 50
     kernel: float = 16.0
     noise_scale: float = 1.0
     closure_after: int = 100
     least_ess: float = 0.3
     max_iterations: int = 15
-    tolerance: float = 1e-3
+    tolerance: float = 0.01
 
     def __post_init__(self) -> None:
         check_int("max_keys", self.max_keys, 2, "Two poses are the least that can be smoothed.")
@@ -40,5 +40,5 @@ class SmoothingOptions:
         check_int("closure_after", self.closure_after, 0, "Use 0 to look for no closures.")
         check_float("kernel", self.kernel, "Use 0 for plain squares.", at_least=0.0)
         check_float("noise_scale", self.noise_scale, "Use 1 for the noise as it is.", above=0.0)
-        check_float("tolerance", self.tolerance, "Use 1e-3.", above=0.0)
+        check_float("tolerance", self.tolerance, "Use 0.01.", above=0.0)
         check_float("least_ess", self.least_ess, "Give a share of M.", at_least=0.0, at_most=1.0)

@@ -47,7 +47,7 @@ class Particles:
         log_densities: (M,) float64. Of the newest poses under the Gaussian about the mode, up to a constant: 0 for the
             first particle, whose path is the mode.
         ids: (l,) int64. Landmarks that have a sighting.
-        landmarks: (l, 9, M) float64. Their means (3) and covariances (6), map frame.
+        tiles: (l, P / 64, 9, 64) float64. Their means (3) and covariances (6), map frame, in blocks of lanes.
         counts: (l,) int64. Measurements of each.
         means, covariances: (K, 3), (K, 3, 3) float64. The newest poses under the Gaussian about the mode.
     """
@@ -57,7 +57,7 @@ class Particles:
     log_weights: FloatArray
     log_densities: FloatArray
     ids: IntArray
-    landmarks: FloatArray
+    tiles: FloatArray
     counts: IntArray
     means: FloatArray
     covariances: FloatArray
@@ -160,7 +160,7 @@ def _particles(graph: PathGraph, mode: Mode, draws: Draws, weights: FloatArray) 
         array[:, 2] = wrap_angle(array[:, 2])
     means[:, 2] = wrap_angle(means[:, 2])
     return Particles(
-        poses, starts, np.log(np.maximum(weights, 1e-300)), densities, graph.landmark_ids[seen], draws.landmarks[seen],
+        poses, starts, np.log(np.maximum(weights, 1e-300)), densities, graph.landmark_ids[seen], draws.tiles[seen],
         counts[seen].astype(np.int64), means, covariances,
     )  # fmt: skip
 

@@ -33,7 +33,7 @@ class Draws:
 
     @property
     def landmarks(self) -> FloatArray:
-        """(l, 9, M) float64. Means and covariances."""
+        """(l, 9, M) float64. Means and covariances. A copy."""
         rows = self.tiles.transpose(0, 2, 1, 3).reshape(len(self.tiles), 9, -1)
         return np.ascontiguousarray(rows[:, :, : self.poses.shape[2]])
 
@@ -52,13 +52,14 @@ def draw_paths(graph: PathGraph, mode: Mode, num_particles: int, rng: np.random.
     m = num_particles
     normals = rng.standard_normal((m, len(mode.factor))).T  # columns lie in a row, as LAPACK wants them
     normals[:, 0] = 0.0
-    spread = lapack.dtrtrs(mode.factor, normals, lower=0)[0]
+    log_proposals = -0.5 * np.einsum("nm,nm->m", normals, normals)
+    spread = lapack.dtrtrs(mode.factor, normals, lower=0, overwrite_b=1)[0]
     poses = np.repeat(mode.poses[:, :, None], m, axis=2)
     poses[mode.columns >= 0] += spread.reshape(-1, 3, m)
     rows = lane_rows(poses)
     tiles, log_likelihood = replay(mode, rows, m)
     log_odometry, spreads = weigh_odometry(graph, mode, rows, m)
-    log_weights = log_likelihood + log_odometry + 0.5 * np.einsum("nm,nm->m", normals, normals)
+    log_weights = log_likelihood + log_odometry - log_proposals
     return Draws(poses, tiles, log_weights, spreads)
 
 

@@ -134,11 +134,10 @@ class _System:
         )  # fmt: skip
 
     def factor(self, damping: float) -> FloatArray | None:
-        """Return U with U^T U = the matrix, its diagonal enlarged; None if there is none."""
-        matrix = self.matrix.T.copy(order="F")
+        """Return U with U^T U = the matrix, its diagonal enlarged, in the matrix's place; None if there is none."""
         if damping:
-            matrix[np.diag_indices(len(matrix))] *= 1.0 + damping
-        upper, info = lapack.dpotrf(matrix, lower=0, overwrite_a=1, clean=0)
+            self.matrix[np.diag_indices(len(self.matrix))] *= 1.0 + damping
+        upper, info = lapack.dpotrf(self.matrix.T, lower=0, overwrite_a=1, clean=0)
         return upper if info == 0 else None
 
     def move(self, landmarks: FloatArray, change: FloatArray) -> None:
