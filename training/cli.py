@@ -10,6 +10,8 @@ from training.bench_alignment_command import bench_alignment
 from training.bench_command import bench
 from training.bench_env_command import bench_env
 from training.bench_filter_command import bench_filter
+from training.bench_stereo_command import bench_stereo
+from training.paper_alignment_commands import fig2, fig3, fig4
 from training.paper_command import paper
 from training.replay_command import replay_mrclam
 from training.replay_one_command import replay_kitti, replay_victoria
@@ -32,9 +34,13 @@ replay.command("kitti")(replay_kitti)
 replay.command("stereo")(replay_stereo)
 app.add_typer(replay, name="replay")
 bench.command("filter")(bench_filter)
+bench.command("stereo")(bench_stereo)
 bench.command("env")(bench_env)
 bench.command("alignment")(bench_alignment)
 app.add_typer(bench, name="bench")
+paper.command("fig2")(fig2)
+paper.command("fig3")(fig3)
+paper.command("fig4")(fig4)
 app.add_typer(paper, name="paper")
 app.add_typer(worlds, name="worlds")
 
