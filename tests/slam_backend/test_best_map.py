@@ -19,7 +19,7 @@ def _filter_after_some_steps() -> FastSlam:
         noisy = points[seen] + rng.normal(0.0, 0.02, (5, 3))
         slam.step([np.array([0.0, 0.0, 0.001])], [Measurements(noisy, looks[seen])])
     slam._maps.release(slam._maps.used_slots()[[2, 5]])
-    extra = Measurements(points[:2] + [0.0, 0.0, 3.0], -looks[:2])
+    extra = Measurements(points[:2] + np.array([0.0, 0.0, 3.0]), -looks[:2])
     slam.step([None], [extra])
     return slam
 

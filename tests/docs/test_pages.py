@@ -1,0 +1,32 @@
+"""Programs on the pages run as they are written."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+DOCS = Path(__file__).parents[2] / "docs"
+BLOCK = re.compile(r"^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
+PAGES = ("own_world.md", "own_reward.md", "own_policy.md")
+
+
+def _programs(page: str) -> list[str]:
+    return BLOCK.findall((DOCS / page).read_text(encoding="utf-8"))
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_programs_run_as_written(page: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """Each program of a page runs by itself; the last one prints what the page is about; none is long."""
+    programs = _programs(page)
+    assert programs
+    for program in programs:
+        lines = [line for line in program.splitlines() if line.strip() and not line.startswith(("import", "from"))]
+        assert len(lines) <= 26
+        exec(compile(program, page, "exec"), {"__name__": "__page__"})
+    printed = capsys.readouterr().out
+    expected = {
+        "own_world.md": r"rooms 7 walls, \d+ landmarks",
+        "own_reward.md": r"\S+ 0\.0\n$",
+        "own_policy.md": r"\d+% of the floor seen, map error 0\.\d\d m",
+    }
+    assert re.search(expected[page], printed)

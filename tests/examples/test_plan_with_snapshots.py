@@ -1,0 +1,30 @@
+import importlib.util
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+PATH = Path(__file__).parents[2] / "examples" / "plan_with_snapshots.py"
+SPEC = importlib.util.spec_from_file_location("plan_with_snapshots", PATH)
+assert SPEC is not None
+assert SPEC.loader is not None
+example = importlib.util.module_from_spec(SPEC)
+SPEC.loader.exec_module(example)
+
+
+@pytest.mark.slow
+def test_planning_beats_its_base_policy() -> None:
+    """Over three episodes of 20 decisions random shooting in a twin removes more map error than its base policy."""
+    alone = [example.play(seed, 20, 0, 5) for seed in (200, 201, 202)]
+    planned = [example.play(seed, 20, 6, 5) for seed in (200, 201, 202)]
+    assert np.mean(planned) > 1.05 * np.mean(alone)
+
+
+def test_trying_plans_leaves_the_environment_alone() -> None:
+    """After plans were tried in a twin, the environment goes on as if nobody had looked ahead."""
+    envs = [example.vslam_v0.parallel_env(action_type="goal", num_robots=2, world="fig5") for _ in range(2)]
+    for env in envs:
+        env.reset(seed=5)
+    example.best_plan(envs[0], envs[0].clone(), 2, 2, np.random.default_rng(0))
+    paid = [example.follow(env, {}, 3) for env in envs]
+    assert paid[0] == paid[1]
