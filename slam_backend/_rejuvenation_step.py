@@ -31,7 +31,9 @@ class RejuvenationStep:
         self._every = options.rejuvenate_every
         self._graph: PathGraph | None = None
         self._waited = 0  # steps since the last time
+        self._read = 0  # measurements since then
         self._closed = False
+        self._last_closing = 0  # step in which landmarks not seen for long were matched
         self._last_seen: dict[int, int] = {}  # landmark -> step of the filter's own count
         self._count = 0
         self._guesses: list[dict[int, FloatArray]] = [{} for _ in range(num_robots)]
@@ -44,21 +46,26 @@ class RejuvenationStep:
 
     def hasten(self) -> None:
         """Be due at the next step, as after a merge."""
-        self._waited = self._every
+        self._waited = self._every  # without a graph yet, any reading is enough
 
     def due(self, associations: Sequence[IntArray]) -> bool:
         """Count a step, in which each robot saw these landmarks (n_i,), and tell whether it is time."""
         self._count += 1
         self._waited += 1
-        after = self._options.smoothing.closure_after
-        long_ago = 0
+        smoothing = self._options.smoothing
+        after, long_ago = smoothing.closure_after, 0
         for ids in associations:
             for name in ids.tolist():
                 if name >= 0:
+                    self._read += 1
                     long_ago += self._count - self._last_seen.get(name, self._count) > after
                     self._last_seen[name] = self._count
-        self._closed |= after > 0 and long_ago >= CLOSURE
-        return self._waited >= self._every or (self._closed and SOONEST * self._waited >= self._every)
+        if after > 0 and long_ago >= CLOSURE:
+            self._closed |= 2 * (self._count - self._last_closing) > after  # else it is the same one that goes on
+            self._last_closing = self._count
+        haste = SOONEST if self._closed else 1
+        sightings = 0 if self._graph is None else self._graph.num_sightings
+        return haste * self._waited >= self._every and haste * smoothing.effort * self._read >= sightings
 
     # ------------------------------------------------------------------ when it is due
 
@@ -88,7 +95,7 @@ class RejuvenationStep:
         for guesses, latest in zip(self._guesses, result.graph.latest, strict=True):
             for step in [step for step in guesses if step <= latest]:
                 del guesses[step]
-        self._waited, self._closed = 0, False
+        self._waited, self._read, self._closed = 0, 0, False
         return result
 
     def reorder(self, order: IntArray) -> None:
@@ -103,7 +110,7 @@ class RejuvenationStep:
         graph = self._graph
         return {
             "graph": None if graph is None else {name: getattr(graph, name) for name in graph.__dataclass_fields__},
-            "schedule": (self._waited, self._closed, self._count),
+            "schedule": (self._waited, self._read, self._closed, self._last_closing, self._count),
             "last_seen": dict(self._last_seen),
             "guesses": tuple(dict(guesses) for guesses in self._guesses),
         }
@@ -111,7 +118,7 @@ class RejuvenationStep:
     def set_state(self, state: Mapping[str, Any]) -> None:
         """Go on exactly as the one that gave `state`."""
         self._graph = None if state["graph"] is None else PathGraph(**state["graph"])
-        self._waited, self._closed, self._count = state["schedule"]
+        self._waited, self._read, self._closed, self._last_closing, self._count = state["schedule"]
         self._last_seen = dict(state["last_seen"])
         self._guesses = [dict(guesses) for guesses in state["guesses"]]
 

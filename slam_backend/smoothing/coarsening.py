@@ -130,9 +130,8 @@ def _joined(graph: PathGraph, representative: IntArray) -> PathGraph:
     before = np.maximum(graph.previous, 0)
     turn = np.zeros((len(kept), 3, 3))
     turn[:, :2, :2], turn[:, 2, 2] = rotation(offsets[before, 2]), 1.0
-    sightings = _combined(
-        root[graph.frozen_keys], graph.frozen_landmarks, *_moved(graph, offsets[graph.frozen_keys]), graph.counts
-    )
+    moved = _moved(graph, np.flatnonzero(~kept[graph.frozen_keys]), offsets)
+    sightings = _combined(root[graph.frozen_keys], graph.frozen_landmarks, *moved, graph.counts)
     return replace(
         graph,
         robots=graph.robots[kept],
@@ -161,14 +160,17 @@ def _upper(full: FloatArray) -> FloatArray:
     return full[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
 
 
-def _moved(graph: PathGraph, offsets: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return centres, informations and slopes of the frozen sightings, moved by offsets of their keys."""
-    turn = np.zeros((len(offsets), 3, 3))
-    turn[:, :2, :2], turn[:, 2, 2] = rotation(offsets[:, 2]), 1.0
-    centres = np.einsum("nij,nj->ni", turn, graph.centres)
-    centres[:, :2] += offsets[:, :2]
-    infos = _upper(turn @ _full(graph.infos) @ turn.transpose(0, 2, 1))
-    return centres, infos, np.einsum("nij,nj->ni", turn, graph.slopes)
+def _moved(graph: PathGraph, rows: IntArray, offsets: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return centres, informations and slopes of the frozen sightings, `rows` of them moved by their keys' offsets."""
+    centres, infos, slopes = graph.centres.copy(), graph.infos.copy(), graph.slopes.copy()
+    by = offsets[graph.frozen_keys[rows]]
+    turn = np.zeros((len(by), 3, 3))
+    turn[:, :2, :2], turn[:, 2, 2] = rotation(by[:, 2]), 1.0
+    centres[rows] = np.einsum("nij,nj->ni", turn, centres[rows])
+    centres[rows, :2] += by[:, :2]
+    infos[rows] = _upper(turn @ _full(infos[rows]) @ turn.transpose(0, 2, 1))
+    slopes[rows] = np.einsum("nij,nj->ni", turn, slopes[rows])
+    return centres, infos, slopes
 
 
 def _combined(

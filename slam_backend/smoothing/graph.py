@@ -148,6 +148,11 @@ class PathGraph:
         return len(self.poses)
 
     @property
+    def num_sightings(self) -> int:
+        """Frozen sightings, and raw measurements that may become some: what the effort of a rejuvenation grows with."""
+        return len(self.frozen_keys) + len(self.points)
+
+    @property
     def nbytes(self) -> int:
         """Bytes of all arrays."""
         return sum(getattr(self, name).nbytes for name in self.__dataclass_fields__)

@@ -111,7 +111,7 @@ def rejuvenate(
     """
     if any((log.kinds == EXACT).any() for log in logs):
         return Rejuvenation(graph, "poses that were given as exact", float("nan"), 0, None)
-    share = max(1, options.fresh_keys // len(logs))
+    share = max(1, options.max_keys // len(logs))
     rest = list(logs)
     while True:
         last = all(len(log) <= share for log in rest)

@@ -32,6 +32,32 @@ def test_particles_are_drawn_anew_when_it_is_due():
             assert np.ptp(slam.particles(0)[0], axis=0).min() > 0.0
 
 
+def test_a_rejuvenation_waits_for_enough_to_read():
+    """With little effort allowed it comes later than asked: only when enough was measured for what there is to redo."""
+    run = small_run()
+    slam = rejuvenated(run, every=2, smoothing=SmoothingOptions(effort=0.5))
+    tried = [slam.step(**reading).rejuvenation is not None for reading in run.readings()]
+    graph = slam._rejuvenation.get_state()["graph"]
+    assert tried[1]  # at first there is nothing to redo
+    assert 2 < np.diff(np.flatnonzero(tried)).max()
+    assert len(graph["points"]) > 0
+
+
+def test_a_closed_loop_is_smoothed_sooner():
+    """Landmarks matched that were not seen for long bring the next rejuvenation forward, once."""
+    run = small_run()
+    readings = list(run.readings())
+    smoothing = SmoothingOptions(closure_after=6)
+    slam = rejuvenated(run, every=100, smoothing=smoothing)
+    for reading in readings[:8]:
+        slam.step(**reading)
+    back = {"odometry": [np.zeros(3)], "measurements": [None]}
+    for _ in range(12):
+        assert slam.step(**back).rejuvenation is None
+    assert slam.step([np.zeros(3)], readings[7]["measurements"], readings[7]["identities"]).rejuvenation is not None
+    assert slam.step([np.zeros(3)], readings[7]["measurements"], readings[7]["identities"]).rejuvenation is None
+
+
 def test_all_particles_then_hold_the_same_landmarks_and_names_stay():
     """After a rejuvenation each particle holds each landmark, under the caller's own name, as often as it was seen."""
     run = small_run()
@@ -140,6 +166,7 @@ def test_bad_options_are_refused(options, message):
         ({"max_keys": 1}, "max_keys: expected an int >= 2"),
         ({"fresh_keys": 0}, "fresh_keys: expected an int >= 1"),
         ({"max_iterations": 0}, "max_iterations: expected an int >= 1"),
+        ({"effort": 0.0}, "effort: expected a finite number > 0"),
         ({"closure_after": -1}, "closure_after: expected an int >= 0"),
         ({"kernel": -1.0}, "kernel: expected a finite number >= 0"),
         ({"noise_scale": 0.0}, "noise_scale: expected a finite number > 0"),
