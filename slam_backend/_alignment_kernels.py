@@ -213,6 +213,29 @@ def drop_unverified(table: FloatArray, members: BoolArray, pose: FloatArray, flo
 
 
 @jit
+def largest_influence(table: FloatArray, members: BoolArray, pose: FloatArray, floor: float) -> tuple[float, float]:
+    """Return how far the translation [m], and the rotation [rad], would go at most if one member were left out.
+
+    To first order: the step from `pose`, at which all members together rest, with one's information taken away.
+    """
+    h, _ = information(table, members, pose, floor)
+    alone = np.zeros(len(table), np.bool_)
+    farthest, widest = 0.0, 0.0
+    for i in range(len(table)):
+        if members[i]:
+            alone[i] = True
+            own, pull = information(table, alone, pose, floor)
+            alone[i] = False
+            rest = h - own
+            if np.linalg.det(rest) <= 1e-9 * h[0, 0] * h[1, 1] * h[2, 2]:
+                return np.inf, np.inf
+            step = np.linalg.solve(rest, pull)
+            farthest = max(farthest, math.hypot(step[0], step[1]))
+            widest = max(widest, abs(step[2]))
+    return farthest, widest
+
+
+@jit
 def refine(table: FloatArray, start: FloatArray, floor: float, gate: float) -> tuple[FloatArray, BoolArray, float]:
     """Alternate inliers, added variance and Gauss-Newton steps until the pose rests.
 

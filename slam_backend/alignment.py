@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 from scipy.spatial import KDTree
-from scipy.special import pdtrc
+from scipy.special import bdtrc
 
 from slam_backend import _alignment_kernels as kernels
 from slam_backend import _proposals as proposals
@@ -133,7 +133,7 @@ def align_maps(
     inside = _fitting(table, matches, pose, floor, gate)
     members &= inside | _one_to_one(matches)  # of look-alikes that all fit, one shapes the motion
     inliers = matches[inside]
-    if len(inliers) < options.min_inliers or _by_chance(table, map_a, matches, pose, inside, options):
+    if len(inliers) < options.min_inliers or _by_chance(table, map_a, matches, pose, variance, options):
         return Alignment.refused("too few inliers")
     points_b = map_b.means[inliers[:, 1], :2]
     ratio = _strongest_rival(table, matches, hypotheses, pose, variance, points_b.mean(axis=0), options)
@@ -144,7 +144,8 @@ def align_maps(
     if _extent(points_b) < options.min_spread:
         return Alignment.refused("poorly spread", ratio)
     covariance = _covariance(kernels.information(table, members, pose, variance)[0])
-    if covariance is None or not _certain(covariance, options):
+    influence = kernels.largest_influence(table, members, pose, variance)
+    if covariance is None or not _certain(covariance, influence, options):
         return Alignment.refused("too uncertain", ratio)
     return Alignment(True, "", pose[0], pose[1], pose[2], covariance, inliers, ratio)
 
@@ -284,27 +285,36 @@ def _by_chance(
     map_a: LandmarkMap,
     matches: IntArray,
     pose: FloatArray,
-    inside: BoolArray,
+    variance: float,
     options: AlignmentOptions,
 ) -> bool:
     """Tell whether so many inliers would come together by chance somewhere among so many look-alikes.
 
-    Were all pairs wrong, a candidate's partner would be any landmark of map a, and fit if it lay near by chance. The
-    chance of as many as are `inside` (k,), two of which any motion can be made to fit, times the number of pairs that
-    a motion can be made from, is how often that is expected at all: a number of false alarms (Moisan and Stival 2004).
-    Where candidates are one-to-one by appearance, `min_inliers` alone decides.
+    Were all pairs wrong, a look-alike would be any landmark of map a, and fit if it lay near by chance; without
+    appearance, a landmark of b would lie anywhere in the area of map a, and fit if one is near there. The chance that
+    as many of b's landmarks fit as do, two of which any motion can be made to fit, times the number of pairs that a
+    motion can be made from, is how often that is expected at all: a number of false alarms (Moisan and Stival 2004).
+    All this at the scale of what is left between the maps, the fitted `variance`. Where candidates are one-to-one by
+    appearance, `min_inliers` alone decides.
     """
     if _one_to_one(matches):
         return False
-    moved = transform_points(pose, table[:, 3:6])
-    spread = (table[:, 6] + table[:, 9] + table[:, 12] + table[:, 15]) / 2.0 + options.position_floor**2
-    tree = KDTree(map_a.means[:, :2])
-    near = tree.query_ball_point(moved[:, :2], np.sqrt(options.position_gate * spread), return_length=True)
-    fitted = np.isin(matches[:, 1], matches[inside, 1])  # one of those near is the partner found, not chance
-    share = (np.asarray(near, dtype=np.float64) - fitted).clip(min=0.0) / len(map_a)
-    expected = np.bincount(matches[:, 1], share).clip(max=1.0).sum()
-    tests = 0.5 * len(matches) * (len(matches) - 1.0)
-    return bool(tests * pdtrc(np.count_nonzero(inside) - 3.0, expected) > FALSE_ALARMS)
+    inside = _fitting(table, matches, pose, variance, options.position_gate)
+    spread = (table[:, 6] + table[:, 9] + table[:, 12] + table[:, 15]) / 2.0 + variance
+    reach = np.sqrt(options.position_gate * spread)
+    if options.appearance:
+        moved = transform_points(pose, table[:, 3:5])
+        near = KDTree(map_a.means[:, :2]).query_ball_point(moved, reach, return_length=True)
+        fitted = np.isin(matches[:, 1], matches[inside, 1])  # one of those near is the partner found, not chance
+        share = (np.asarray(near, dtype=np.float64) - fitted).clip(min=0.0) / len(map_a)
+    else:
+        area = np.prod(np.ptp(map_a.means[:, :2], axis=0) + 2.0 * reach.mean())
+        share = np.pi * reach**2 / area
+    _, owner = np.unique(matches[:, 1], return_inverse=True)
+    chances = 1.0 - np.exp(-np.bincount(owner, share))
+    beyond = np.count_nonzero(inside) - 3
+    tail = bdtrc(beyond, max(len(chances) - 2, 1), chances.mean()) if beyond >= 0 else 1.0
+    return bool(0.5 * len(matches) * (len(matches) - 1.0) * tail > FALSE_ALARMS)
 
 
 def _strongest_rival(
@@ -381,7 +391,8 @@ def _covariance(h: FloatArray) -> FloatArray | None:
     return np.asarray(0.5 * (covariance + covariance.T))
 
 
-def _certain(covariance: FloatArray, options: AlignmentOptions) -> bool:
-    """Tell whether an alignment is certain enough to be believed."""
+def _certain(covariance: FloatArray, influence: tuple[float, float], options: AlignmentOptions) -> bool:
+    """Tell whether an alignment is certain enough to be believed, and no single match, left out, says otherwise."""
     position = math.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1])
-    return position <= options.max_sigma_position and math.sqrt(covariance[2, 2]) <= options.max_sigma_heading
+    sure = position <= options.max_sigma_position and math.sqrt(covariance[2, 2]) <= options.max_sigma_heading
+    return sure and influence[0] <= 0.5 * RIVAL_DISTANCE and influence[1] <= 0.5 * RIVAL_ANGLE

@@ -189,6 +189,49 @@ def test_one_far_match_cannot_turn_the_others() -> None:
     assert 12 not in found.inliers[:, 0]
 
 
+def test_the_influence_of_a_match_is_what_leaving_it_out_does() -> None:
+    """The largest step equals, to first order, the difference to the motion fitted without the worst match."""
+    rng = np.random.default_rng(19)
+    table = np.zeros((12, 18))
+    table[:, 3:6] = rng.uniform(0.0, [6.0, 4.0, 1.5], (12, 3))
+    table[:, :3] = transform_points(TURNED, table[:, 3:6]) + 0.05 * rng.standard_normal((12, 3))
+    table[4, :2] += [0.3, -0.2]
+    table[:, [6, 9, 11, 12, 15, 17]] = 0.0025
+
+    def fit(members: np.ndarray) -> np.ndarray:
+        pose = TURNED
+        for _ in range(20):
+            pose = kernels.gauss_newton_step(table, members, pose, 1e-8)
+        return pose
+
+    everyone = np.ones(12, np.bool_)
+    pose = fit(everyone)
+    steps = []
+    for i in range(12):
+        rest = everyone.copy()
+        rest[i] = False
+        steps.append(fit(rest) - pose)
+    farthest, widest = kernels.largest_influence(table, everyone, pose, 1e-8)
+    assert farthest == pytest.approx(max(np.hypot(*step[:2]) for step in steps), rel=0.05)
+    assert widest == pytest.approx(max(abs(step[2]) for step in steps), rel=0.05)
+    assert kernels.largest_influence(np.tile(table[:1], (3, 1)), np.ones(3, np.bool_), pose, 1e-8) == (np.inf, np.inf)
+
+
+def test_a_motion_that_hangs_on_one_match_is_not_believed() -> None:
+    """Where leaving out one match would move the result by half of what makes it false, it is refused."""
+    rng = np.random.default_rng(20)
+    points = rng.uniform(0.0, [3.0, 3.0, 1.5], (12, 3)) + [12.0, 0.0, 0.0]
+    points[0, :2] = [17.0, 1.5]
+    a = landmark_map(rng, points)
+    wide = replace(a, covariances=np.tile(0.01 * np.eye(3), (12, 1, 1)))
+    moved = wide.means.copy()
+    moved[0, 1] += 0.25
+    b = replace(wide, means=transform_points(inverse(TURNED), moved))
+    lax = AlignmentOptions(max_sigma_position=1.0, max_sigma_heading=0.2)
+    assert align_maps(wide, wide.moved(inverse(TURNED)), options=lax).success
+    assert align_maps(wide, b, options=lax).reason == "too uncertain"
+
+
 def test_members_without_extent_are_left_alone() -> None:
     """Coincident landmarks say nothing about the rotation, and none of them is taken out for it."""
     table = np.zeros((5, 18))
