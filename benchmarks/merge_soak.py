@@ -1,12 +1,15 @@
-"""Are wrong merges avoided, or found and undone? Episodes in random worlds whose landmarks look alike, back to back.
+"""Are wrong merges avoided, or found and undone? Runs in random worlds whose landmarks look alike, back to back.
 
     python benchmarks/merge_soak.py --minutes 10 --json merge_soak.json
     python benchmarks/merge_soak.py --minutes 10 --forced
+    python benchmarks/merge_soak.py --minutes 10 --kind environment
 
-Worlds, numbers of robots, radios and the share of landmarks that look like others change from episode to episode. A
-merge is false if it is more than 0.5 m or 5 degrees off; it counts if it is in force 200 steps later or at the end.
-With `--forced` robots do not merge by themselves: once two maps are large enough they are merged by a wrong motion,
-with the pairs of landmarks that it brings closest, and the question is how many of these the team undoes, and when.
+Runs are stereo runs through offices of aisles, 100 m per robot, with look-alikes in classes of one to three, false
+points and wrong descriptors; or episodes of the environment in all its families of worlds, up to all landmarks with a
+twin. Numbers of robots and contacts change from run to run. A merge is false if it is more than 0.5 m or 5 degrees off;
+it counts if it is in force 200 steps later or at the end. With `--forced` robots do not merge by themselves: once two
+maps are large enough they are merged by that wrong motion which fits them best, and the question is how many of these
+the team undoes, and when.
 """
 
 import os
@@ -15,7 +18,8 @@ os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
 
 import json
 import time
-from dataclasses import asdict, dataclass
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
 from itertools import count
 from pathlib import Path
 from typing import Annotated, Any
@@ -26,18 +30,25 @@ from rich.console import Console
 
 from agents.registry import make_policy
 from slam_backend.alignment import Alignment
-from slam_backend.errors import FloatArray, bad_argument, check_int
-from slam_backend.geometry import between, compose
+from slam_backend.attempts import AttemptOptions
+from slam_backend.errors import FloatArray, IntArray, bad_argument, check_choice, check_int
+from slam_backend.geometry import between, rotation
+from slam_backend.landmark_map import LandmarkMap
+from slam_backend.reports import MergeEvent
+from slam_backend.team import TeamSlam
 from training.episode import is_false_merge
 from training.run_folder import check_writable, plain
+from training.stereo_runs import STEP, RunSpec, simulate_run
 from vslam_env import ExplorationEnv, preset_config
 
+KINDS = ("aisles", "environment")
 WORLDS = ("office", "loops", "maze", "hall", "fig5")
 REPEATED = (0.0, 0.5, 1.0)  # shares of landmarks that look like another one
 RADIOS: tuple[dict[str, Any], ...] = ({}, {"comm_range": 8.0}, {"comm_line_of_sight": True}, {"comm_loss": 0.2})
 WINDOW = 200  # [steps] after which a false merge counts
+LOSES, FINDS = 0.02, 0.05  # probability per step that a link is lost, and found again
 ENOUGH = 20  # landmarks of either map before a merge is forced
-PAIRS = 8  # that a forced merge takes for common
+HYPOTHESES, COINCIDENCE = 2000, 0.25  # [-, m]: how a forced merge is found
 
 
 @dataclass(slots=True)
@@ -45,19 +56,19 @@ class MergeFate:
     """What became of a merge.
 
     Attributes:
-        seed: Of its episode.
-        world: Family.
-        repeated: Share of landmarks that look like another one.
+        seed: Of its run.
+        world: Family of worlds.
+        alike: How much landmarks look alike.
         step: When it was made.
         robots_a, robots_b: Which groups.
         error_m, error_deg: Of its motion.
         undone_after: Steps until it was undone; None: it was not.
-        ended_after: Steps until the episode ended.
+        ended_after: Steps until the run ended.
     """
 
     seed: int
     world: str
-    repeated: float
+    alike: str
     step: int
     robots_a: tuple[int, ...]
     robots_b: tuple[int, ...]
@@ -91,7 +102,7 @@ def make_env(seed: int, cycles: int, forced: bool) -> ExplorationEnv:
     return ExplorationEnv(config)
 
 
-def play(seed: int, cycles: int, forced: bool) -> list[MergeFate]:
+def play_environment(seed: int, cycles: int, forced: bool) -> list[MergeFate]:
     """Run one episode and return what became of its merges."""
     env = make_env(seed, cycles, forced)
     rng = np.random.default_rng([seed, 18])
@@ -105,7 +116,33 @@ def play(seed: int, cycles: int, forced: bool) -> list[MergeFate]:
             for agent, policy in zip(env.agents, policies, strict=True)
         }
         observations = env.step(actions)[0]
-    return fates(env, seed)
+    alike = f"{env.config.landmarks.repeated:.0%} with a twin"
+    return fates(env.events, env.true_start_poses, seed, env.config.world, alike, env.episode.tick)
+
+
+def play_aisles(seed: int, cycles: int, forced: bool) -> list[MergeFate]:
+    """Let a team live through one stereo run of `cycles` steps and return what became of its merges."""
+    rng = np.random.default_rng([seed, 17])
+    robots, look_alikes = int(rng.integers(2, 5)), int(rng.integers(1, 4))
+    spec = RunSpec(
+        robots=robots, length=cycles * STEP, measurements=5 * robots, association="unknown", look_alikes=look_alikes
+    )
+    run = simulate_run(spec, seed)
+    noise = spec.noise
+    camera = replace(noise.camera, sigma_px=2 * noise.sigma_px, sigma_disparity_px=2 * noise.sigma_disparity_px)
+    attempts = AttemptOptions(enabled=not forced)
+    team = TeamSlam(robots, seed=seed, attempts=attempts, num_particles=50, camera=camera, motion=noise.motion)
+    starts = run.true_paths[:, 0]
+    broken = not forced and rng.random() < 0.5
+    up = np.ones((robots, robots), dtype=np.bool_)
+    for reading in run.readings():
+        if broken:
+            change = np.triu(np.where(up, rng.random(up.shape) < LOSES, rng.random(up.shape) < FINDS), 1)
+            up = up ^ (change | change.T)
+        team.step(reading["odometry"], reading["measurements"], up)
+        if forced and not team.events and min(len(team.map(robot)) for robot in range(2)) >= ENOUGH:
+            team.merge(0, 1, wrong_alignment(starts, team.map(0), team.map(1), rng))
+    return fates(team.events, starts, seed, "aisles", f"classes of {look_alikes}", run.num_steps)
 
 
 def force(env: ExplorationEnv, rng: np.random.Generator) -> None:
@@ -114,30 +151,47 @@ def force(env: ExplorationEnv, rng: np.random.Generator) -> None:
     map_a, map_b = belief.filter_map(0), belief.filter_map(1)
     if min(len(map_a), len(map_b)) < ENOUGH:
         return
-    angle = rng.uniform(-np.pi, np.pi)
-    offset = rng.uniform(0.7, 3.0) * np.array([np.cos(angle), np.sin(angle), 0.0])
-    offset[2] = rng.normal(0.0, 0.2)
-    motion = between(*env.true_start_poses[:2]) + offset
-    points_b = np.column_stack([map_b.means[:, :2], np.zeros(len(map_b))])
-    pairs = nearest_pairs(map_a.means[:, :2], compose(motion, points_b)[:, :2])
-    wrong = Alignment(True, "", *motion.tolist(), np.diag([1e-3, 1e-3, 1e-4]), pairs, 0.0)
-    ledger.rename(belief.merge(0, 1, wrong))
+    ledger.rename(belief.merge(0, 1, wrong_alignment(env.true_start_poses, map_a, map_b, rng)))
 
 
-def nearest_pairs(points_a: FloatArray, points_b: FloatArray) -> Any:
-    """Return the rows (a, b) of the closest pairs, one-to-one."""
+def wrong_alignment(starts: FloatArray, map_a: LandmarkMap, map_b: LandmarkMap, rng: np.random.Generator) -> Alignment:
+    """Return the plainly wrong motion between the maps of robots 0 and 1 that fits them best, whatever they look like.
+
+    Of many motions that lay two landmarks of b on two of a, that one is taken which brings most one-to-one pairs within
+    `COINCIDENCE`; the pairs are its inliers.
+    """
+    truth = between(*starts[:2])
+    points_a, points_b = map_a.means[:, :2], map_b.means[:, :2]
+    best, pairs = np.empty(0), np.empty((0, 2), np.int64)
+    for _ in range(HYPOTHESES):
+        (i, j), (k, m) = rng.choice(len(points_a), 2, False), rng.choice(len(points_b), 2, False)
+        side_a, side_b = points_a[j] - points_a[i], points_b[m] - points_b[k]
+        if abs(np.hypot(*side_a) - np.hypot(*side_b)) > COINCIDENCE:
+            continue
+        angle = np.arctan2(side_a[1], side_a[0]) - np.arctan2(side_b[1], side_b[0])
+        motion = np.array([*(points_a[i] - rotation(angle) @ points_b[k]), angle])
+        error = between(truth, motion)
+        if not is_false_merge(float(np.hypot(*error[:2])), float(abs(np.degrees(error[2])))):
+            continue
+        found = coinciding(points_a, points_b @ rotation(angle).T + motion[:2])
+        if len(found) > len(pairs):
+            best, pairs = motion, found
+    return Alignment(True, "", *best.tolist(), np.diag([1e-3, 1e-3, 1e-4]), pairs, 0.0)
+
+
+def coinciding(points_a: FloatArray, points_b: FloatArray) -> IntArray:
+    """Return the rows (a, b) of points that are each other's nearest and lie within `COINCIDENCE`."""
     distances = np.linalg.norm(points_a[:, None] - points_b, axis=2)
-    pairs = []
-    for _ in range(PAIRS):
-        row, column = np.unravel_index(distances.argmin(), distances.shape)
-        pairs.append((row, column))
-        distances[row] = distances[:, column] = np.inf
-    return np.array(pairs)
+    nearest = distances.argmin(axis=1)
+    rows = np.arange(len(points_a))
+    mutual = (distances.argmin(axis=0)[nearest] == rows) & (distances[rows, nearest] < COINCIDENCE)
+    return np.column_stack([rows, nearest])[mutual]
 
 
-def fates(env: ExplorationEnv, seed: int) -> list[MergeFate]:
-    """Return what became of the merges of an episode that has ended."""
-    starts, events = env.true_start_poses, env.events
+def fates(
+    events: Sequence[MergeEvent], starts: FloatArray, seed: int, world: str, alike: str, steps: int
+) -> list[MergeFate]:
+    """Return what became of the merges of a run that has ended after so many steps."""
     found = []
     for i, event in enumerate(events):
         if event.kind == "merge":
@@ -145,21 +199,21 @@ def fates(env: ExplorationEnv, seed: int) -> list[MergeFate]:
             undone = next((e.step for e in events[i:] if e.kind == "undo" and e.alignment is event.alignment), None)
             found.append(
                 MergeFate(
-                    seed, env.config.world, env.config.landmarks.repeated, event.step, event.robots_a, event.robots_b,
+                    seed, world, alike, event.step, event.robots_a, event.robots_b,
                     float(np.hypot(*error[:2])), float(abs(np.degrees(error[2]))),
-                    None if undone is None else undone - event.step, env.episode.tick - event.step,
+                    None if undone is None else undone - event.step, steps - event.step,
                 )
             )  # fmt: skip
     return found
 
 
-def summarise(merges: list[MergeFate], episodes: int, steps: int) -> dict[str, Any]:
-    """Return the figures of all episodes together."""
+def summarise(merges: list[MergeFate], runs: int, steps: int) -> dict[str, Any]:
+    """Return the figures of all runs together."""
     false = [merge for merge in merges if merge.is_false]
     right = [merge for merge in merges if not merge.is_false]
     after = [merge.undone_after for merge in false if merge.undone_after is not None]
     return {
-        "episodes": episodes,
+        "runs": runs,
         "steps": steps,
         "merges": len(merges),
         "right_merges": len(right),
@@ -172,16 +226,19 @@ def summarise(merges: list[MergeFate], episodes: int, steps: int) -> dict[str, A
 
 
 def main(
-    minutes: Annotated[float, typer.Option(help="How long; the last episode is played to its end.")] = 10.0,
-    first_seed: Annotated[int, typer.Option(help="Of the first episode.")] = 100,
-    cycles: Annotated[int, typer.Option(help="Steps of an episode.")] = 1500,
+    minutes: Annotated[float, typer.Option(help="How long; the last run is played to its end.")] = 10.0,
+    first_seed: Annotated[int, typer.Option(help="Of the first run.")] = 100,
+    cycles: Annotated[int | None, typer.Option(help="Steps of a run.", show_default="400, episodes 1500")] = None,
+    kind: Annotated[str, typer.Option(help="aisles or environment.")] = "aisles",
     forced: Annotated[bool, typer.Option(help="Merge wrongly on purpose.")] = False,
     json_file: Annotated[Path | None, typer.Option("--json", help="Write all figures to this file.")] = None,
 ) -> None:
     """Run the soak and print it."""
     if not minutes > 0.0:
         raise bad_argument("minutes", "a number above 0", minutes, "Run for some time.")
-    check_int("cycles", cycles, 1, "Give a number of steps.")
+    check_choice("kind", kind, KINDS)
+    cycles = (400 if kind == "aisles" else 1500) if cycles is None else cycles
+    check_int("cycles", cycles, 2, "Give a number of steps.")
     check_int("first_seed", first_seed, 0, "Seeds are not negative.")
     if json_file is not None:
         check_writable(json_file, "json")
@@ -190,12 +247,12 @@ def main(
     for seed in count(first_seed):
         if time.monotonic() - begin > 60.0 * minutes:
             break
-        found = play(seed, cycles, forced)
+        found = (play_aisles if kind == "aisles" else play_environment)(seed, cycles, forced)
         merges, played = merges + found, played + 1
         for merge in found:
             fate = "in force" if merge.undone_after is None else f"undone after {merge.undone_after} steps"
             console.print(
-                f"seed {merge.seed} {merge.world} ({merge.repeated:.0%} alike): {merge.robots_a} + {merge.robots_b} at "
+                f"seed {merge.seed} {merge.world} ({merge.alike}): {merge.robots_a} + {merge.robots_b} at "
                 f"{merge.step}, {merge.error_m:.2f} m {merge.error_deg:.1f} deg off"
                 f"{', FALSE' if merge.is_false else ''}, {fate}"
             )
