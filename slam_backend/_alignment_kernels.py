@@ -18,7 +18,7 @@ MEDIAN_CHI2_3 = 2.3659738843753377
 SAME_DISTANCE, SAME_ANGLE = 0.25, math.radians(2.5)  # half of what makes two alignments differ
 MAX_ROUNDS = 30
 BISECTIONS = 12  # of a variance between 1e-8 and 1e-2 m^2, on the log scale: to 0.3 %
-# Matches shape the fit up to 99.9 % where the inliers' gate is 99 %: a hard limit at 99 % would cost 5 % of the variance.
+# Matches shape the fit up to 99.9 % where the inliers' gate is 99 %: a hard limit there would cost 5 % of the variance.
 FIT_GATE = 16.27 / 11.34
 # The median of k squared residuals of 3 degrees of freedom is above 1 + 2.2 / sqrt(k) times its own by chance in 2.5 %.
 CHANCE_EXCESS = 2.2

@@ -11,12 +11,15 @@ from training.bench_command import bench
 from training.bench_env_command import bench_env
 from training.bench_filter_command import bench_filter
 from training.bench_stereo_command import bench_stereo
+from training.evaluate_command import evaluate
+from training.mrclam_pairs_command import bench_mrclam
 from training.paper_alignment_commands import fig2, fig3, fig4
 from training.paper_command import paper
 from training.replay_command import replay_mrclam
 from training.replay_one_command import replay_kitti, replay_victoria
 from training.replay_pairs_command import replay_stereo
 from training.run import run
+from training.train_command import train
 from training.worlds_command import worlds
 
 app = typer.Typer(
@@ -27,6 +30,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 app.command("run")(run)
+app.command("train")(train)
+app.command("evaluate")(evaluate)
 replay = typer.Typer(help="Run the backend on the log of real robots.", no_args_is_help=True)
 replay.command("mrclam")(replay_mrclam)
 replay.command("victoria")(replay_victoria)
@@ -37,6 +42,7 @@ bench.command("filter")(bench_filter)
 bench.command("stereo")(bench_stereo)
 bench.command("env")(bench_env)
 bench.command("alignment")(bench_alignment)
+bench.command("mrclam")(bench_mrclam)
 app.add_typer(bench, name="bench")
 paper.command("fig2")(fig2)
 paper.command("fig3")(fig3)

@@ -220,7 +220,7 @@ def test_the_influence_of_a_match_is_what_leaving_it_out_does() -> None:
 def test_a_motion_that_hangs_on_one_match_is_not_believed() -> None:
     """Where leaving out one match would move the result by half of what makes it false, it is refused."""
     rng = np.random.default_rng(20)
-    points = rng.uniform(0.0, [3.0, 3.0, 1.5], (12, 3)) + [12.0, 0.0, 0.0]
+    points = rng.uniform([12.0, 0.0, 0.0], [15.0, 3.0, 1.5], (12, 3))
     points[0, :2] = [17.0, 1.5]
     a = landmark_map(rng, points)
     wide = replace(a, covariances=np.tile(0.01 * np.eye(3), (12, 1, 1)))
