@@ -15,6 +15,7 @@ from training.evaluate_command import evaluate
 from training.mrclam_pairs_command import bench_mrclam
 from training.paper_alignment_commands import fig2, fig3, fig4
 from training.paper_command import paper
+from training.paper_fig5_command import fig5
 from training.replay_command import replay_mrclam
 from training.replay_one_command import replay_kitti, replay_victoria
 from training.replay_pairs_command import replay_stereo
@@ -47,6 +48,7 @@ app.add_typer(bench, name="bench")
 paper.command("fig2")(fig2)
 paper.command("fig3")(fig3)
 paper.command("fig4")(fig4)
+paper.command("fig5")(fig5)
 app.add_typer(paper, name="paper")
 app.add_typer(worlds, name="worlds")
 
