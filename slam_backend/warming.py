@@ -6,9 +6,11 @@ import numpy as np
 
 from slam_backend.alignment import align_maps
 from slam_backend.attempts import AttemptOptions
+from slam_backend.camera import StereoCamera
 from slam_backend.compilation import watch_compilation
 from slam_backend.existence import ExistenceModel
 from slam_backend.filter import FastSlam
+from slam_backend.frontend import StereoFrontEnd
 from slam_backend.measurements import Measurements
 from slam_backend.metrics.maps import map_error
 from slam_backend.team import TeamSlam
@@ -19,7 +21,7 @@ LANDMARKS = 12  # more than an alignment asks for
 
 
 def warm_up() -> float:
-    """Run tiny filters and a tiny team along all paths that end in a kernel.
+    """Run tiny filters, a tiny team and a tiny pair of images along all paths that end in a kernel.
 
     Kernels are kept in numba's cache: beside the package if its folder can be written, else in the user's own cache
     folder, or where the variable NUMBA_CACHE_DIR says. A new version of the package, of numba or another processor
@@ -56,4 +58,7 @@ def warm_up() -> float:
         own = team.map(0)
         map_error(own.means, names, points)
         align_maps(own, own, "clique")
+        blocks = np.kron(np.random.default_rng(0).integers(0, 256, (8, 12)), np.ones((12, 12))).astype(np.uint8)
+        eye = StereoFrontEnd(StereoCamera(focal_px=100.0, width=128, height=96))
+        eye.measure(blocks[:, :128], blocks[:, 8:136])
     return watch.seconds

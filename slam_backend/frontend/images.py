@@ -40,4 +40,5 @@ def check_image(name: str, image: Any) -> Image:
     if min(array.shape) < SMALLEST or array.size > LARGEST:
         expected = f"at least {SMALLEST} rows and columns and at most {LARGEST} pixels"
         raise bad_argument(name, expected, f"shape {array.shape}", "Crop or scale it.")
-    return np.ascontiguousarray(array)
+    # Kernels are compiled for arrays that can be written; others would be compiled for anew.
+    return np.ascontiguousarray(array) if array.flags.writeable else array.copy()

@@ -8,6 +8,7 @@ from box_pairs import draw_boxes
 from scipy.ndimage import map_coordinates
 
 from slam_backend.camera import StereoCamera
+from slam_backend.compilation import watch_compilation
 from slam_backend.frontend import (
     KINDS,
     CornerOptions,
@@ -163,6 +164,18 @@ def test_impossible_options_are_refused(change: dict[str, Any], message: str) ->
     """The error names the option."""
     with pytest.raises(ValueError, match=message):
         FrontEndOptions(**change)
+
+
+def test_read_only_images_need_no_other_kernels(pair: tuple[np.ndarray, np.ndarray]) -> None:
+    """Images that cannot be written are measured by the kernels that are there, and stay as they are."""
+    eye = StereoFrontEnd(CAMERA)
+    expected = eye.measure(*pair)
+    frozen = [image.copy() for image in pair]
+    for image in frozen:
+        image.setflags(write=False)
+    with watch_compilation(lambda name: None) as watch:
+        np.testing.assert_array_equal(eye.measure(*frozen).pixels, expected.pixels)
+    assert watch.names == []
 
 
 def test_matching_along_rows_is_a_nearest_neighbour_search() -> None:
