@@ -25,11 +25,13 @@ def run(
     ] = None,
     robots: Annotated[int | None, typer.Option(help="How many, 1 to 8.", show_default="3")] = None,
     policy: Annotated[
-        str | None, typer.Option(help="frontier, random_goals or random_walk.", show_default="frontier")
+        str | None,
+        typer.Option(help="frontier, random_goals, random_walk, or a trained model's path.", show_default="frontier"),
     ] = None,
     seed: Seed = None,
     action_type: Annotated[
-        str | None, typer.Option(help="continuous, discrete or goal.", show_default="continuous")
+        str | None,
+        typer.Option(help="continuous, discrete or goal.", show_default="continuous; of a model goal"),
     ] = None,
     max_cycles: Annotated[int | None, typer.Option(help="Steps of the episode.", show_default="180 s worth")] = None,
     particles: Particles = None,
@@ -43,12 +45,15 @@ def run(
     config: Config = None,
 ) -> None:
     """Robots that do not know where they start explore a building, map it, and join their maps."""
+    from agents.registry import is_model
     from training.episode_scores import score_episode
     from training.figures import draw_errors, draw_maps
     from training.run_config import RunConfig
     from training.run_folder import RunFolder, plain
     from training.run_tables import print_tables
 
+    if action_type is None and policy is not None and is_model(policy):
+        action_type = "goal"
     given = {
         "world": world,
         "robots": robots,

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from agents.policy import Policy
-from agents.registry import make_policy
+from agents.registry import is_model, make_policy
 from slam_backend.errors import bad_argument, check_choice, check_int
 from vslam_env import vslam_v0
 from vslam_env.config import ACTION_TYPES, GOAL_DECISION_TICKS, PRESETS, SENSORS, TICK
@@ -24,7 +24,7 @@ class RunConfig:
     Attributes:
         world: A family name, or the path of a floor plan, a JSON file or a folder.
         robots: How many.
-        policy: A name of the registry of policies, the same for all robots.
+        policy: A name of the registry of policies, or the path of a trained model; the same for all robots.
         action_type: `"continuous"`, `"discrete"` or `"goal"`.
         max_cycles: Steps of the episode; None: as many as `EPISODE_S` takes.
         particles: Per filter.
@@ -66,6 +66,8 @@ class RunConfig:
         """Return the plain values that repeat this run from any folder, the seed apart."""
         is_path = self.world not in WORLD_FAMILIES
         told = {"world": str(Path(self.world).resolve()) if is_path else self.world, "max_cycles": self.num_steps}
+        if is_model(self.policy):
+            told["policy"] = str(Path(self.policy).resolve())
         return {name: value for name, value in (asdict(self) | told).items() if name != "seed"}
 
     @property

@@ -18,7 +18,10 @@ import tomli_w
 from slam_backend.errors import bad_argument, check_int
 from slam_backend.trajectory import Trajectory
 
-PACKAGES = ("vslam-env", "numpy", "scipy", "numba", "opencv-python-headless", "pymunk", "gymnasium", "pettingzoo")
+PACKAGES = (
+    "vslam-env", "numpy", "scipy", "numba", "opencv-python-headless", "pymunk", "gymnasium", "pettingzoo",
+    "stable-baselines3", "sb3-contrib", "torch",
+)  # fmt: skip
 CONFIG_FILE = "config.toml"
 METRICS_FILE = "metrics.json"
 

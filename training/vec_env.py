@@ -1,6 +1,6 @@
 """`ExplorationVecEnv`: environments as Stable-Baselines3 wants them, one slot per robot of each environment."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -136,6 +136,23 @@ class ExplorationVecEnv(VecEnv):  # type: ignore[misc]   # its types are not loo
     def get_images(self) -> list[NDArray[np.uint8] | None]:
         """Return one picture per environment, not per slot."""
         return self._slots.images()
+
+    def get_state(self) -> dict[str, Any]:
+        """Return all that decides how the environments go on, and the masks of their last observations."""
+        return {"environments": self.env_method("get_state", indices=self.first_slots), "masks": self._masks}
+
+    def set_state(self, state: Mapping[str, Any]) -> None:
+        """Go on exactly as the environments that gave `state`; the observations of that moment are the caller's.
+
+        Raises:
+            ValueError: If it is of another number of environments, or one of them refuses its part.
+        """
+        given = state["environments"]
+        if len(given) != len(self.first_slots):
+            raise bad_argument("state", f"one of {len(self.first_slots)} environments", len(given), "Make as many.")
+        for slot, one in zip(self.first_slots, given, strict=True):
+            self.env_method("set_state", one, indices=[slot])
+        self._masks = state["masks"]
 
     def close(self) -> None:
         """Close all environments and processes."""

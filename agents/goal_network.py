@@ -1,0 +1,79 @@
+"""The network of trained policies, computed by numpy: what it looks at, how that is scaled, and its logits."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_backend.errors import Float32Array
+
+Weights = Mapping[str, Float32Array]
+
+SHAPES: dict[str, tuple[int, ...]] = {
+    "local_grid": (3, 48, 48),
+    "pose_std": (3,),
+    "map_stats": (6,),
+    "scan": (32,),
+    "teammates": (7, 5),
+    "teammates_mask": (7,),
+    "candidates": (16, 5),
+    "action_mask": (17,),
+}
+NAMES = tuple(SHAPES)
+# The vectors are multiplied with these before they enter, so that all are of the order of one.
+VECTORS: dict[str, tuple[float, ...]] = {
+    "pose_std": (2.0, 2.0, 10.0),
+    "map_stats": (0.01, 5.0, 5.0, 0.1, 1.0, 0.25),
+    "scan": (0.125,),
+    "teammates": (0.1, 0.1, 1.0, 1.0, 2.0),
+    "teammates_mask": (1.0,),
+}
+CANDIDATE_SCALE = (0.1, 0.1, 0.1, 0.25, 1.0 / 60.0)
+GRID_SCALE = 1.0 / 255.0
+PATCHES = (4, 3)  # each convolution looks at patches that do not overlap
+CHANNELS = (16, 32)
+CONTEXT = 64  # width of all other layers
+VECTOR_SIZE = sum(int(np.prod(SHAPES[name])) for name in VECTORS)
+PICTURE_SIZE = CHANNELS[1] * (48 // (PATCHES[0] * PATCHES[1])) ** 2
+
+
+def logits(weights: Weights, observations: Mapping[str, NDArray[Any]]) -> Float32Array:
+    """Return how good each action seems (n, 17) float32, valid or not, on the scale of a softmax.
+
+    A convolution of the local grid and the vectors make a context; one and the same small network looks at it beside
+    each candidate, so that slots are treated alike.
+
+    Args:
+        weights: By the names of the learner's layers.
+        observations: (n, ...) by name, as the environment gives them.
+    """
+    picture = observations["local_grid"] * np.float32(GRID_SCALE)
+    for layer, patch in enumerate(PATCHES):
+        picture = np.maximum(_convolve(picture, weights, f"picture.{2 * layer}", patch), 0.0)
+    seen = np.maximum(_linear(weights, "picture_out", picture.reshape(len(picture), -1)), 0.0)
+    vectors = [
+        (observations[name] * np.array(scale, np.float32)).reshape(len(picture), -1) for name, scale in VECTORS.items()
+    ]
+    context = np.tanh(_linear(weights, "context", np.concatenate([seen, *vectors], axis=1)))
+    candidates = observations["candidates"] * np.array(CANDIDATE_SCALE, np.float32)
+    beside = _linear(weights, "slot", candidates) + _linear(weights, "slot_context", context)[:, None]
+    hidden = np.tanh(_linear(weights, "slot_hidden", np.tanh(beside)))
+    scores = _linear(weights, "slot_score", hidden)[..., 0]
+    stay = _linear(weights, "stay_score", context)
+    return np.concatenate([stay, scores], axis=1).astype(np.float32)
+
+
+def _linear(weights: Weights, name: str, rows: NDArray[Any]) -> NDArray[Any]:
+    product: NDArray[Any] = rows @ weights[f"{name}.weight"].T
+    return product + weights[f"{name}.bias"] if f"{name}.bias" in weights else product
+
+
+def _convolve(picture: NDArray[Any], weights: Weights, name: str, patch: int) -> NDArray[Any]:
+    """Look at patches (patch x patch) side by side: (n, c, h, w) becomes (n, channels, h / patch, w / patch)."""
+    n, channels, height, width = picture.shape
+    tiles = picture.reshape(n, channels, height // patch, patch, width // patch, patch).transpose(0, 2, 4, 1, 3, 5)
+    kernel = weights[f"{name}.weight"]
+    flat = tiles.reshape(n, height // patch, width // patch, -1) @ kernel.reshape(len(kernel), -1).T
+    moved: NDArray[Any] = np.moveaxis(flat + weights[f"{name}.bias"], -1, 1)
+    return moved

@@ -1,0 +1,171 @@
+"""Trained policies: the network in numpy, the file that holds it, and what is refused."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from agents import make_policy
+from agents.goal_network import CHANNELS, CONTEXT, PATCHES, PICTURE_SIZE, SHAPES, VECTOR_SIZE, logits
+from agents.trained import FORMAT, TrainedGoals, check_observation, load_model, save_model
+from vslam_env import vslam_v0
+from vslam_env.observation import observation_space
+
+SPACE = observation_space(32, 8.0, True, False)
+ABOUT = {"version": "0", "environment": ""}
+
+
+def _weights(seed: int = 0) -> dict[str, Any]:
+    rng = np.random.default_rng(seed)
+    shapes = {
+        "picture.0": (CHANNELS[0], 3, PATCHES[0], PATCHES[0]),
+        "picture.2": (CHANNELS[1], CHANNELS[0], PATCHES[1], PATCHES[1]),
+        "picture_out": (CONTEXT, PICTURE_SIZE),
+        "context": (CONTEXT, CONTEXT + VECTOR_SIZE),
+        "slot": (CONTEXT, 5),
+        "slot_hidden": (CONTEXT, CONTEXT),
+        "slot_score": (1, CONTEXT),
+        "stay_score": (1, CONTEXT),
+    }
+    weights = {}
+    for name, shape in shapes.items():
+        weights[f"{name}.weight"] = (rng.standard_normal(shape) / np.sqrt(np.prod(shape[1:]))).astype(np.float32)
+        weights[f"{name}.bias"] = rng.standard_normal(shape[0]).astype(np.float32)
+    weights["slot_context.weight"] = (0.1 * rng.standard_normal((CONTEXT, CONTEXT))).astype(np.float32)
+    return weights
+
+
+def _observation(seed: int = 0) -> dict[str, Any]:
+    SPACE.seed(seed)
+    observation = SPACE.sample()
+    observation["candidates"] = np.random.default_rng(seed).uniform(-5.0, 5.0, (16, 5)).astype(np.float32)
+    observation["map_stats"] = np.array([40.0, 0.1, 0.3, 8.0, 0.5, 2.0], np.float32)
+    observation["action_mask"][:] = [1, *([1, 0, 1, 1] * 4)]
+    return observation
+
+
+def test_slots_are_treated_alike() -> None:
+    """Candidates in other slots get the same logits there, and the logit of staying is as before."""
+    observation, order = _observation(), np.random.default_rng(5).permutation(16)
+    moved = observation | {"candidates": observation["candidates"][order]}
+    before, after = (logits(_weights(), {k: v[None] for k, v in o.items()})[0] for o in (observation, moved))
+    np.testing.assert_allclose(after[1:], before[1:][order], atol=1e-5)
+    assert after[0] == pytest.approx(before[0], abs=1e-5)
+    assert np.ptp(before) > 0.1
+
+
+def test_rows_do_not_meet() -> None:
+    """Several observations at once get the logits that each gets alone."""
+    some = [_observation(seed) for seed in range(3)]
+    together = logits(_weights(), {name: np.stack([o[name] for o in some]) for name in SHAPES})
+    for row, observation in zip(together, some, strict=True):
+        alone = logits(_weights(), {name: observation[name][None] for name in SHAPES})[0]
+        np.testing.assert_allclose(row, alone, atol=1e-5)
+
+
+def test_actions_are_drawn_from_the_softmax_of_the_valid_ones() -> None:
+    """Masked actions never come; the others come as often as the softmax says; greedy takes the best of them."""
+    observation, weights = _observation(3), _weights()
+    scores = logits(weights, {name: observation[name][None] for name in SHAPES})[0].astype(np.float64)
+    valid = observation["action_mask"] != 0
+    chances = np.where(valid, np.exp(scores), 0.0) / np.exp(scores[valid]).sum()
+    policy, rng = TrainedGoals(weights), np.random.default_rng(0)
+    policy.reset()
+    belief: Any = None  # it decides by the observation alone
+    counts = np.bincount([policy.act(observation, belief, rng) for _ in range(2000)], minlength=17)
+    assert (counts[~valid] == 0).all()
+    spread = np.sqrt(2000.0 * chances * (1.0 - chances))
+    assert (np.abs(counts - 2000.0 * chances) <= 4.5 * spread + 1e-9).all()
+    greedy = TrainedGoals(weights, greedy=True)
+    assert greedy.act(observation, belief, rng) == int(np.where(valid, scores, -np.inf).argmax())
+
+
+def test_a_model_plays_as_any_policy(tmp_path: Path) -> None:
+    """`make_policy` takes the path of a model or of its folder, and the policy drives robots of every team size."""
+    save_model(tmp_path / "model.npz", _weights(), ABOUT)
+    for name in (str(tmp_path / "model.npz"), str(tmp_path)):
+        env = vslam_v0.parallel_env(world="fig5", num_robots=2, num_particles=5, action_type="goal", max_cycles=3)
+        observations, _ = env.reset(seed=1)
+        policy, rng = make_policy(name, "goal"), np.random.default_rng(0)
+        while env.agents:
+            actions = {agent: policy.act(observations[agent], env.belief(agent), rng) for agent in env.agents}
+            observations, _, _, _, infos = env.step(actions)
+            assert not any(info["invalid_action"] for info in infos.values())
+    with pytest.raises(ValueError, match="action_type: expected 'goal' for a trained policy, got 'discrete'"):
+        make_policy(str(tmp_path), "discrete")
+
+
+@pytest.mark.slow
+def test_a_fresh_process_plays_it_without_a_learner(tmp_path: Path) -> None:
+    """A saved model gives the same logits in another process, which imports neither torch nor Stable-Baselines3."""
+    save_model(tmp_path / "model.npz", _weights(), ABOUT)
+    np.savez(tmp_path / "seen.npz", **_observation())
+    program = (
+        "import sys, json, numpy as np; from agents.trained import load_model; from agents.goal_network import logits; "
+        f"w, _ = load_model({str(tmp_path)!r}); seen = np.load({str(tmp_path / 'seen.npz')!r}); "
+        "found = logits(w, {n: seen[n][None] for n in seen.files})[0].tolist(); "
+        "print(json.dumps([found, any(n in sys.modules for n in ('torch', 'stable_baselines3'))]))"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    found, learner = json.loads(done.stdout)
+    assert not learner
+    np.testing.assert_allclose(
+        found, logits(_weights(), {k: v[None] for k, v in _observation().items()})[0], rtol=1e-6, atol=1e-6
+    )
+
+
+def test_files_keep_everything(tmp_path: Path) -> None:
+    """Weights and what is told of them come back as they were."""
+    weights = _weights(4)
+    save_model(tmp_path / "a.npz", weights, {"steps": 7, **ABOUT})
+    kept, about = load_model(tmp_path / "a.npz")
+    assert kept.keys() == weights.keys()
+    for name, array in weights.items():
+        np.testing.assert_array_equal(kept[name], array)
+    assert about["steps"] == 7
+    assert about["format"] == FORMAT
+    assert [file.name for file in tmp_path.iterdir()] == ["a.npz"]
+
+
+def test_damaged_models_are_refused(tmp_path: Path) -> None:
+    """A missing, cut, changed or foreign file, or one of another version, is told by name with its cure."""
+    file = tmp_path / "model.npz"
+    with pytest.raises(ValueError, match=r"model: expected a model that vslam train wrote, got no such file. Check"):
+        load_model(file)
+    save_model(file, _weights(), ABOUT)
+    whole = file.read_bytes()
+    file.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(ValueError, match=r"model: .* got a broken file. .* cannot be read"):
+        load_model(file)
+    file.write_text("not a model")
+    with pytest.raises(ValueError, match=r"model: .* got a broken file"):
+        load_model(file)
+    with np.load(_saved(tmp_path / "b.npz"), allow_pickle=False) as content:
+        arrays = {name: content[name] for name in content.files}
+    np.savez(file, **arrays | {"slot.bias": arrays["slot.bias"] + 1.0})
+    with pytest.raises(ValueError, match=r"model: .* got a broken file. .* was changed"):
+        load_model(file)
+    about = json.loads(str(arrays["about"])) | {"format": FORMAT + 1, "version": "9.9"}
+    np.savez(file, **arrays | {"about": np.array(json.dumps(about))})
+    with pytest.raises(ValueError, match=r"expected one of format 1, got a model of format 2. .* made it, 9.9"):
+        load_model(file)
+
+
+def test_other_spaces_are_refused() -> None:
+    """Observations of another shape, or without the mask of goals, are refused by name."""
+    observation = _observation()
+    short = observation | {"scan": observation["scan"][:16]}
+    with pytest.raises(ValueError, match=r"observation: expected 'scan' of shape \(32,\), .* got shape \(16,\)"):
+        TrainedGoals(_weights()).act(short, None, np.random.default_rng(0))  # type: ignore[arg-type]
+    shapes = {name: np.shape(value) for name, value in observation.items() if name != "action_mask"}
+    with pytest.raises(ValueError, match=r"observation: expected 'action_mask' .* got no 'action_mask'. Use goal"):
+        check_observation(shapes)
+
+
+def _saved(file: Path) -> Path:
+    save_model(file, _weights(), ABOUT)
+    return file

@@ -1,0 +1,256 @@
+"""Trainings: they learn, repeat, go on where they stopped, and refuse what is damaged or not there."""
+
+import json
+import os
+import signal
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+from pettingzoo import ParallelEnv
+from typer.testing import CliRunner
+
+pytest.importorskip("torch", reason="torch is not installed: pip install .[train]")
+pytest.importorskip("stable_baselines3", reason="stable-baselines3 is not installed: pip install .[train]")
+pytest.importorskip("sb3_contrib", reason="sb3-contrib is not installed: pip install .[train]")
+pytest.importorskip("tensorboard", reason="tensorboard is not installed: pip install .[train]")
+
+import torch
+from sb3_contrib import MaskablePPO
+
+from agents.goal_network import logits
+from agents.trained import load_model
+from training.cli import app
+from training.learn import Training, check_device
+from training.learn_checkpoint import CHECKPOINT_FILE, read_checkpoint, write_checkpoint
+from training.learn_config import TrainConfig
+from training.learn_network import GoalPolicy
+from training.vec_env import ExplorationVecEnv
+from vslam_env.observation import observation_space
+
+SMOKE = TrainConfig.from_mapping({"preset": "smoke", "seed": 5})
+SPACE = observation_space(32, 8.0, True, False)
+runner = CliRunner()
+
+
+class _NearIsGood(ParallelEnv):  # type: ignore[misc]
+    """One robot in fresh surroundings at each step is paid the more, the shorter the path to what it chose."""
+
+    possible_agents = ("robot_0",)
+    render_mode = None
+
+    def observation_space(self, agent: str) -> Any:
+        return SPACE
+
+    def action_space(self, agent: str) -> Any:
+        return spaces.Discrete(17)
+
+    def reset(self, seed: int | None = None, options: Any = None) -> tuple[Any, Any]:
+        self.rng = np.random.default_rng(seed)
+        self.agents = ["robot_0"]
+        return self._seen(), {"robot_0": {}}
+
+    def step(self, actions: Any) -> tuple[Any, ...]:
+        action = int(actions["robot_0"])
+        gained = 0.0 if action == 0 else 1.0 / (1.0 + self.lengths[action - 1])
+        return self._seen(), {"robot_0": gained}, {"robot_0": False}, {"robot_0": False}, {"robot_0": {}}
+
+    def _seen(self) -> Any:
+        seen = {name: np.zeros(box.shape, box.dtype) for name, box in SPACE.spaces.items()}
+        slots = self.rng.permutation(16)[: self.rng.integers(2, 7)]
+        seen["candidates"][slots, 2] = self.rng.uniform(0.5, 15.0, len(slots))
+        seen["action_mask"][[0, *(1 + slots)]] = 1
+        self.lengths = seen["candidates"][:, 2].copy()
+        return {"robot_0": seen}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+    """Return the folder of an uninterrupted training, and its weights."""
+    folder = tmp_path_factory.mktemp("whole")
+    return folder, _trained(folder)
+
+
+def _trained(folder: Path, stop_after: int | None = None, resume: bool = False) -> dict[str, Any]:
+    training = Training(SMOKE, folder)
+    if resume:
+        training.restore()
+    training.watch.listen(lambda row: None, lambda: len(training.rows) == stop_after)
+    assert training.run() == (stop_after is None)
+    training.close()
+    weights: dict[str, Any] = training.model.policy.actor_weights()
+    return weights
+
+
+def _assert_same(ours: dict[str, Any], theirs: dict[str, Any]) -> None:
+    assert ours.keys() == theirs.keys()
+    for name in ours:
+        np.testing.assert_array_equal(ours[name], theirs[name])
+
+
+def test_both_forms_of_the_network_agree() -> None:
+    """Torch and numpy give the same logits for the same weights and observations."""
+    torch.manual_seed(3)
+    policy = GoalPolicy(SPACE, spaces.Discrete(17), lambda left: 1e-3)
+    with torch.no_grad():
+        for tensor in policy.parameters():
+            tensor.add_(0.1 * torch.randn_like(tensor))  # biases that begin as zeros count too
+    SPACE.seed(1)
+    some = [SPACE.sample() for _ in range(4)]
+    for observation in some:
+        observation["candidates"] *= 0.1
+        observation["map_stats"] *= np.array([1e-2, 0.1, 0.1, 1e-2, 1.0, 1.0], np.float32)
+    seen = {name: np.stack([observation[name] for observation in some]) for name in SPACE.spaces}
+    with torch.no_grad():
+        theirs = policy.get_distribution(policy.obs_to_tensor(seen)[0]).distribution.logits.numpy()
+    ours = logits(policy.actor_weights(), seen)
+    ours = ours - np.log(np.exp(ours).sum(axis=1, keepdims=True))
+    np.testing.assert_allclose(ours, theirs, atol=2e-5)
+    assert np.ptp(theirs) > 0.1
+
+
+@pytest.mark.slow
+def test_it_learns_what_is_good() -> None:
+    """Where short paths pay, a few updates make the network choose much shorter ones than chance does."""
+    torch.set_num_threads(1)
+    env = ExplorationVecEnv([_NearIsGood] * 12)
+    model = MaskablePPO(
+        GoalPolicy, env, n_steps=50, batch_size=100, n_epochs=6, learning_rate=3e-3, gamma=0.5, seed=1, device="cpu"
+    )
+    model.learn(3000)
+    seen = env.reset()
+    chances = torch.softmax(torch.tensor(logits(model.policy.actor_weights(), seen)), 1).numpy() * seen["action_mask"]
+    gains = np.hstack([np.zeros((12, 1)), 1.0 / (1.0 + seen["candidates"][:, :, 2])])
+    learnt = (chances * gains).sum(1) / chances.sum(1)
+    random = (seen["action_mask"][:, 1:] * gains[:, 1:]).sum(1) / seen["action_mask"][:, 1:].sum(1)
+    assert learnt.mean() > 1.2 * random.mean()
+
+
+@pytest.mark.slow
+def test_one_seed_gives_the_same_weights(whole: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
+    """A second training equals the first to the byte, and what it saved; another seed does not."""
+    again = _trained(tmp_path)
+    _assert_same(again, whole[1])
+    _assert_same(dict(load_model(tmp_path)[0]), whole[1])
+    fresh = Training(TrainConfig.from_mapping({"preset": "smoke", "seed": 6}), tmp_path).model.policy.actor_weights()
+    assert not np.array_equal(fresh["slot.weight"], whole[1]["slot.weight"])
+
+
+@pytest.mark.slow
+def test_resumed_equals_uninterrupted(whole: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
+    """A training that was stopped after its first rollout and resumed in a new object ends with the same weights."""
+    stopped = _trained(tmp_path, stop_after=1)
+    assert not np.array_equal(stopped["slot.weight"], whole[1]["slot.weight"])
+    _assert_same(_trained(tmp_path, resume=True), whole[1])
+    assert read_checkpoint(tmp_path / CHECKPOINT_FILE)["watch"] == read_checkpoint(whole[0] / CHECKPOINT_FILE)["watch"]
+
+
+def test_rows_tell_of_episodes(whole: tuple[Path, dict[str, Any]]) -> None:
+    """Each rollout has a row: a return that is the sum of its terms, and TensorBoard gets the same numbers."""
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    rows = read_checkpoint(whole[0] / CHECKPOINT_FILE)["watch"]["rows"]
+    assert [row["steps"] for row in rows] == [16.0, 32.0, 48.0]
+    assert all(row["return"] == pytest.approx(row["reward/map_error"]) for row in rows)
+    curves = EventAccumulator(str(whole[0] / "tensorboard"))
+    curves.Reload()
+    for name in ("return", "map_error", "map_recall", "merges", "reward/map_error"):
+        points = curves.Scalars(f"episode/{name}")
+        assert [point.step for point in points] == [16, 32, 48]
+        np.testing.assert_allclose([point.value for point in points], [row[name] for row in rows], rtol=1e-6)
+
+
+def test_damaged_checkpoints_are_refused(whole: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
+    """A missing, cut, foreign or changed checkpoint, one of another configuration or version, is told with its cure."""
+    training = Training(SMOKE, tmp_path)
+    file = tmp_path / CHECKPOINT_FILE
+    with pytest.raises(ValueError, match="resume: expected the checkpoint of a training, got no such file"):
+        training.restore()
+    bytes_whole = (whole[0] / CHECKPOINT_FILE).read_bytes()
+    file.write_bytes(bytes_whole[: len(bytes_whole) // 2])
+    with pytest.raises(ValueError, match=r"resume: .* got a broken file of \d+. .* was cut off or changed"):
+        training.restore()
+    file.write_bytes(b"something else")
+    with pytest.raises(ValueError, match=r"resume: .* got a broken file. .* is none: train anew"):
+        training.restore()
+    file.write_bytes(bytes_whole.replace(b'"torch": "', b'"torch": "0', 1))
+    with pytest.raises(ValueError, match=r"resume: expected a checkpoint made with torch .* Install torch==0"):
+        training.restore()
+    write_checkpoint(file, {"config": {**SMOKE.to_mapping(), "gamma": 0.5}, "seed": 5})
+    with pytest.raises(ValueError, match="resume: expected a checkpoint of the folder's configuration"):
+        training.restore()
+
+
+def test_a_missing_gpu_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A GPU is refused where torch finds none; so are devices that are none."""
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(ValueError, match="device: expected a GPU that torch can use, got a machine with 0 of them"):
+        check_device("cuda")
+    for name in ("gpu", "mps"):
+        with pytest.raises(ValueError, match=f"device: expected cpu, cuda or cuda:0, got '{name}'"):
+            check_device(name)
+
+
+@pytest.mark.parametrize(
+    ("values", "says"),
+    [
+        ({"speed": 3}, "config: expected one of preset, world, .* got 'speed'"),
+        ({"preset": "fast"}, "preset: expected one of 'quick', 'smoke', got 'fast'"),
+        ({"robots": 9}, "robots: expected an int from 1 to 8, got 9"),
+        ({"batch": 1}, "batch: expected an int >= 2, got 1"),
+        ({"gamma": 1.5}, "gamma: expected a finite number > 0 and <= 1, got 1.5"),
+        ({"world": "castle"}, "world: expected one of 'office'"),
+    ],
+)
+def test_bad_configurations_are_refused(values: dict[str, Any], says: str) -> None:
+    """Unknown keys and values out of range are refused by name."""
+    with pytest.raises(ValueError, match=says):
+        TrainConfig.from_mapping(values)
+
+
+@pytest.mark.slow
+def test_the_commands_train_go_on_evaluate_and_play(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ctrl-C saves, `--resume` ends the training, `evaluate` compares with paired seeds, `run` plays the model."""
+    out = tmp_path / "run"
+    begin = ["train", "--preset", "smoke", "--seed", "5", "--workers", "0", "--out", str(out)]
+    kept_run = Training.run
+
+    def interrupted(training: Training) -> bool:
+        tell = training.watch._tell
+        training.watch._tell = lambda row: (tell(row), os.kill(os.getpid(), signal.SIGINT))
+        return kept_run(training)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Training, "run", interrupted)
+        result = runner.invoke(app, begin)
+    assert result.exit_code == 0, result.output
+    assert "Stopped; the checkpoint holds all until here." in result.output
+    assert json.loads((out / "metrics.json").read_text())["complete"] is False
+    result = runner.invoke(app, ["train", "--resume", str(out), "--workers", "0"])
+    assert result.exit_code == 0, result.output
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["complete"] is True
+    assert metrics["decisions"] == 48
+    assert (out / "learning.png").stat().st_size > 10_000
+    assert len((out / "curves.csv").read_text().splitlines()) == 4
+    result = runner.invoke(app, ["train", "--resume", str(out), "--steps", "96"])
+    assert "resume: expected no other options that decide the training, got ['steps']" in str(result.exception)
+
+    tried = tmp_path / "tried"
+    result = runner.invoke(app, ["evaluate", str(out), "--seeds", "2", "--seed", "100", "--out", str(tried)])
+    assert result.exit_code == 0, result.output
+    metrics = json.loads((tried / "metrics.json").read_text())
+    assert [line["policy"] for line in metrics["policies"]] == ["model", "random_goals", "frontier"]
+    returns = {(row["policy"], row["seed"]): row["return"] for row in metrics["trials"]}
+    for lead in metrics["leads"]:
+        gaps = [returns["model", seed] - returns[lead["over"], seed] for seed in (100, 101)]
+        assert lead["lead"] == pytest.approx(np.mean(gaps))
+        assert lead["lead_low"] <= lead["lead"] <= lead["lead_high"]
+
+    played = tmp_path / "played"
+    arguments = ["run", "--policy", str(out), "--world", "fig5", "--robots", "2", "--particles", "5", "--max-cycles"]
+    result = runner.invoke(app, [*arguments, "3", "--no-video", "--out", str(played)])
+    assert result.exit_code == 0, result.output
+    assert json.loads((played / "metrics.json").read_text())["config"]["action_type"] == "goal"

@@ -1,0 +1,163 @@
+"""A training: MaskablePPO built from a configuration, run, saved, and gone on with as if it had never stopped."""
+
+import random
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from sb3_contrib import MaskablePPO
+from stable_baselines3.common.logger import configure
+
+from agents.trained import MODEL_FILE, save_model
+from slam_backend.errors import bad_argument
+from training.learn_checkpoint import CHECKPOINT_FILE, read_checkpoint, write_checkpoint
+from training.learn_config import SPLIT_TRAIN, SPLIT_TRY, TrainConfig
+from training.learn_network import GoalPolicy
+from training.learn_watch import Row, TrainingWatch
+from training.run_folder import installed_versions
+from training.vec_env import make_vec_env
+
+BOARD = "tensorboard"
+
+
+class Training:
+    """A training in a folder of its own.
+
+    All sums run on one thread: two trainings of one configuration give the same weights, be they interrupted or not,
+    in one process or several, as long as machine and packages are the same.
+
+    Args:
+        config: What is trained, and how.
+        folder: Where checkpoint, model and TensorBoard curves go.
+        workers: Processes that step the environments; 0: this one.
+        device: `"cpu"`, `"cuda"` or one of several, as torch names them.
+
+    Attributes:
+        model: The learner.
+        watch: What tells of it, and stops it.
+
+    Raises:
+        ValueError: If there is no such device, or the environment cannot be built.
+    """
+
+    def __init__(self, config: TrainConfig, folder: Path, workers: int = 0, device: str = "cpu") -> None:
+        check_device(device)
+        torch.set_num_threads(1)
+        self.config, self._folder = config, folder
+        self.env = make_vec_env(config.make_env_config(SPLIT_TRAIN), config.envs, workers)
+        self.model = MaskablePPO(
+            GoalPolicy,
+            self.env,
+            learning_rate=lambda left: left * config.learning_rate,
+            n_steps=config.max_cycles,
+            batch_size=config.batch,
+            n_epochs=config.epochs,
+            gamma=config.gamma,
+            gae_lambda=config.gae_lambda,
+            clip_range=config.clip,
+            ent_coef=config.entropy,
+            seed=config.seed,
+            device=device,
+        )
+        self.watch = TrainingWatch(self.env, self.save, config.checkpoint_updates)
+
+    @property
+    def rows(self) -> list[Row]:
+        """One row per rollout so far."""
+        return self.watch.rows
+
+    def run(self) -> bool:
+        """Train to the end, or until `watch` is told to stop; save a checkpoint and the model.
+
+        Returns:
+            Whether the training is complete.
+        """
+        left = self.config.updates * self.config.rollout - self.model.num_timesteps
+        if left > 0:
+            self.model.set_logger(configure(str(self._folder / BOARD), [BOARD]))
+            self.model.learn(left, callback=self.watch, reset_num_timesteps=self.model._last_obs is None)
+            self.model.logger.close()
+            if not self.watch.stopped:
+                self.save()
+        return not self.watch.stopped
+
+    def save(self) -> None:
+        """Write the checkpoint, and the model as it is now."""
+        model = self.model
+        content = {
+            "config": self.config.to_mapping(),
+            "seed": self.config.seed,
+            "policy": {name: tensor.cpu() for name, tensor in model.policy.state_dict().items()},
+            "optimizer": model.policy.optimizer.state_dict(),
+            "counts": (model.num_timesteps, model._n_updates, model._current_progress_remaining),
+            "last": (model._last_obs, model._last_episode_starts),
+            "environments": self.env.get_state(),
+            "watch": self.watch.get_state(),
+            "draws": (random.getstate(), np.random.get_state(), torch.get_rng_state(), _cuda_state()),  # noqa: NPY002
+        }
+        write_checkpoint(self._folder / CHECKPOINT_FILE, content)
+        self.save_model(self._folder / MODEL_FILE)
+
+    def save_model(self, file: Path) -> None:
+        """Write the model that `agents.trained` plays."""
+        about = {
+            "version": installed_versions()["vslam-env"],
+            "environment": self.config.make_env_config(SPLIT_TRY).to_toml(),
+            "steps": int(self.model.num_timesteps),
+            "seed": self.config.seed,
+            "config": self.config.to_mapping(),
+        }
+        save_model(file, self.model.policy.actor_weights(), about)
+
+    def restore(self) -> None:
+        """Go on from the folder's checkpoint.
+
+        Raises:
+            ValueError: If there is none, it is damaged, or of another configuration or version.
+        """
+        kept = read_checkpoint(self._folder / CHECKPOINT_FILE)
+        if (kept["config"], kept["seed"]) != (self.config.to_mapping(), self.config.seed):
+            cure = "Give back the folder its own config.toml, or train anew."
+            raise bad_argument("resume", "a checkpoint of the folder's configuration", "a checkpoint of another", cure)
+        model = self.model
+        model.policy.load_state_dict(kept["policy"])
+        model.policy.optimizer.load_state_dict(kept["optimizer"])
+        model.num_timesteps, model._n_updates, model._current_progress_remaining = kept["counts"]
+        model._last_obs, model._last_episode_starts = kept["last"]
+        self.env.set_state(kept["environments"])
+        self.watch.set_state(kept["watch"])
+        python, numpy, generator, cuda = kept["draws"]
+        random.setstate(python)
+        np.random.set_state(numpy)  # noqa: NPY002   # the learner draws from the global one
+        torch.set_rng_state(generator)
+        if cuda is not None and torch.cuda.is_available():
+            torch.cuda.set_rng_state_all(cuda)
+
+    def close(self) -> None:
+        """Close the environments and their processes."""
+        self.env.close()
+
+
+def check_device(device: str) -> str:
+    """Return a device that torch has here.
+
+    Raises:
+        ValueError: If it is no device, or this machine has none of its kind.
+    """
+    try:
+        kind = torch.device(device).type
+    except RuntimeError as error:
+        raise bad_argument("device", "cpu, cuda or cuda:0", device, "Leave it out to use the processor.") from error
+    if kind not in ("cpu", "cuda"):
+        raise bad_argument("device", "cpu, cuda or cuda:0", device, "Leave it out to use the processor.")
+    if kind == "cuda":
+        found = torch.cuda.device_count() if torch.cuda.is_available() else 0
+        if (torch.device(device).index or 0) >= found:
+            cure = "Leave --device out to use the processor, or install a torch that finds the GPU."
+            raise bad_argument("device", "a GPU that torch can use", f"a machine with {found} of them", cure)
+    return device
+
+
+def _cuda_state() -> Any:
+    return torch.cuda.get_rng_state_all() if torch.cuda.is_available() else None

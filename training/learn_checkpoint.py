@@ -1,0 +1,76 @@
+"""Checkpoints of a training: one file that is whole or not there, marked with what made it."""
+
+import hashlib
+import json
+import pickle
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from slam_backend.errors import bad_argument
+from training.run_folder import installed_versions
+
+FORMAT = 1  # raised when what a checkpoint holds changes
+MAGIC = b"vslam train checkpoint "
+CHECKPOINT_FILE = "checkpoint.bin"
+DECISIVE = ("vslam-env", "torch", "stable-baselines3", "sb3-contrib", "numpy")  # a training goes on exactly with these
+
+
+def write_checkpoint(file: Path, content: Mapping[str, Any]) -> None:
+    """Write a checkpoint; an interrupted write leaves the one before.
+
+    The file is a marked pickle: like any pickle, load it only from where you would run code from.
+
+    Raises:
+        ValueError: If it cannot be written.
+    """
+    packed = pickle.dumps(dict(content), protocol=5)
+    mark = {
+        "format": FORMAT,
+        "versions": _versions(),
+        "bytes": len(packed),
+        "sha256": hashlib.sha256(packed).hexdigest(),
+    }
+    part = file.with_name(f".{file.name}.part")
+    try:
+        part.write_bytes(MAGIC + json.dumps(mark).encode() + b"\n" + packed)
+        part.replace(file)
+    except OSError as error:
+        cure = f"Choose another than {str(file)!r}: {error.strerror}."
+        raise bad_argument("out", "a place that can be written", "no access", cure) from error
+
+
+def read_checkpoint(file: Path) -> dict[str, Any]:
+    """Read a checkpoint that `write_checkpoint` wrote.
+
+    Raises:
+        ValueError: If it is missing, cut off, changed, or of other versions with which it would not go on exactly.
+    """
+    expected = "the checkpoint of a training"
+    if not file.is_file():
+        cure = f"There is no {str(file)!r}: the run ended before its first checkpoint. Train anew."
+        raise bad_argument("resume", expected, "no such file", cure)
+    head, _, packed = file.read_bytes().partition(b"\n")
+    try:
+        if not head.startswith(MAGIC):
+            raise ValueError("another kind of file")
+        mark = json.loads(head[len(MAGIC) :])
+        size, digest, version, versions = (mark[name] for name in ("bytes", "sha256", "format", "versions"))
+    except (ValueError, KeyError, TypeError) as error:
+        raise bad_argument("resume", expected, "a broken file", f"{str(file)!r} is none: train anew.") from error
+    if len(packed) != size or hashlib.sha256(packed).hexdigest() != digest:
+        cure = f"{str(file)!r} was cut off or changed: copy it again, or train anew."
+        raise bad_argument("resume", f"{expected}, {size} bytes", f"a broken file of {len(packed)}", cure)
+    if version != FORMAT:
+        raise bad_argument("resume", f"one of format {FORMAT}", f"a checkpoint of format {version}", "Train anew.")
+    for package, here in _versions().items():
+        if versions.get(package) != here:
+            cure = f"Install {package}=={versions.get(package)}, or train anew."
+            raise bad_argument("resume", f"a checkpoint made with {package} {here}", versions.get(package), cure)
+    content: dict[str, Any] = pickle.loads(packed)
+    return content
+
+
+def _versions() -> dict[str, str]:
+    installed = installed_versions()
+    return {name: installed[name] for name in DECISIVE if name in installed}

@@ -1,0 +1,93 @@
+"""`TrainingWatch`: what a training tells between its steps: episodes, checkpoints, progress, and when to stop."""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback
+
+from training.vec_env import ExplorationVecEnv
+
+LAST = ("map_error", "map_recall", "map_precision", "coverage", "merges", "collisions")  # at an episode's end
+
+Row = dict[str, float]
+
+
+class TrainingWatch(BaseCallback):  # type: ignore[misc]   # its types are not looked at
+    """Sums up the episodes of each rollout, and saves and stops between rollouts only.
+
+    Args:
+        env: What is trained on.
+        save: Called between two rollouts when a checkpoint is due.
+        every: A checkpoint is due after so many rollouts.
+
+    Attributes:
+        rows: Of all rollouts so far: `steps`, means over the episodes that ended of `return`, of `LAST` at their end,
+            of `invalid_actions` and of each reward term's sum.
+        stopped: Whether it was stopped early.
+    """
+
+    def __init__(self, env: ExplorationVecEnv, save: Callable[[], None], every: int) -> None:
+        super().__init__()
+        self._save, self._every = save, every
+        self._tell: Callable[[Row], None] = lambda row: None
+        self._should_stop: Callable[[], bool] = lambda: False
+        self.rows: list[Row] = []
+        self._sums: list[dict[str, float]] = [{} for _ in range(env.num_envs)]
+        self._ended: list[Row] = []
+        self._begun = 0
+        self.stopped = False
+
+    def listen(self, on_update: Callable[[Row], None], should_stop: Callable[[], bool]) -> None:
+        """Be told of rollouts, and be asked whether to stop.
+
+        Args:
+            on_update: Called with the row of each rollout.
+            should_stop: Asked between two rollouts; then a checkpoint is saved and the training ends.
+        """
+        self._tell, self._should_stop = on_update, should_stop
+
+    def get_state(self) -> dict[str, Any]:
+        """Return what it has summed up."""
+        return {"rows": [dict(row) for row in self.rows], "sums": [dict(sums) for sums in self._sums]}
+
+    def set_state(self, state: Mapping[str, Any]) -> None:
+        """Go on from what `get_state` gave."""
+        self.rows, self._sums = [dict(row) for row in state["rows"]], [dict(sums) for sums in state["sums"]]
+        self._begun = len(self.rows)
+
+    def _on_rollout_start(self) -> None:
+        self._ended = []
+        done = len(self.rows)
+        if done > self._begun:
+            self.stopped = self._should_stop()
+            if self.stopped or done % self._every == 0:
+                self._save()
+
+    def _on_step(self) -> bool:
+        if self.stopped:
+            return False  # what this step did is forgotten: the checkpoint was saved before it
+        for slot, (info, done) in enumerate(zip(self.locals["infos"], self.locals["dones"], strict=True)):
+            sums = self._sums[slot]
+            for name, value in info.items():
+                if name.startswith("reward/") or name == "invalid_action":
+                    sums[name] = sums.get(name, 0.0) + value
+            if done:
+                self._ended.append(_finished(sums, info))
+                self._sums[slot] = {}
+        return True
+
+    def _on_rollout_end(self) -> None:
+        row: Row = {"steps": float(self.model.num_timesteps)}
+        for name in self._ended[0] if self._ended else ():
+            row[name] = float(np.mean([episode[name] for episode in self._ended]))
+            self.logger.record(f"episode/{name}", row[name])
+        self.rows.append(row)
+        self._tell(row)
+
+
+def _finished(sums: Mapping[str, float], info: Mapping[str, Any]) -> Row:
+    """Return the figures of an episode that ended: its return, its end, and the sum of each reward term."""
+    terms = {name: value for name, value in sums.items() if name.startswith("reward/")}
+    last = {name: float(info[name]) for name in LAST}
+    return {"return": sum(terms.values()), **last, "invalid_actions": sums["invalid_action"], **terms}

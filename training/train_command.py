@@ -1,0 +1,163 @@
+"""The command `vslam train`: one network learns to choose goals for all robots; curves, checkpoints, a model."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+
+from training.command_options import Config, Json, finish, gather
+from training.compiling import prepare
+
+if TYPE_CHECKING:  # what computes is imported when the command runs, so that --help answers at once
+    from training.learn import Training
+    from training.learn_config import TrainConfig
+    from training.run_folder import RunFolder
+
+COMMAND = "train"
+
+
+def train(
+    preset: Annotated[str | None, typer.Option(help="quick or smoke.", show_default="quick")] = None,
+    world: Annotated[
+        str | None, typer.Option(help="A family or a path; see vslam worlds list.", show_default="office")
+    ] = None,
+    robots: Annotated[int | None, typer.Option(help="How many, 1 to 8.", show_default="3")] = None,
+    steps: Annotated[int | None, typer.Option(help="Decisions of all robots together.", show_default="200000")] = None,
+    envs: Annotated[int | None, typer.Option(help="Environments side by side.", show_default="8")] = None,
+    workers: Annotated[
+        int | None,
+        typer.Option(help="Processes that step them; 0: this one. Weights do not depend on it.", show_default="cores"),
+    ] = None,
+    device: Annotated[str, typer.Option(help="cpu, or cuda for the updates of the network.")] = "cpu",
+    seed: Annotated[int | None, typer.Option(help="Of all random draws.", show_default="0")] = None,
+    out: Annotated[Path | None, typer.Option(help="New run folder.", show_default="the next free one in runs")] = None,
+    resume: Annotated[
+        Path | None,
+        typer.Option(help="Run folder of a training that stopped: go on as if it had not.", show_default=False),
+    ] = None,
+    json: Json = None,
+    config: Config = None,
+) -> None:
+    """Train one network for all robots by PPO with masked goal actions; play it with vslam run --policy FOLDER.
+
+    Ctrl-C ends it after the running rollout and saves; --resume FOLDER then goes on and ends with the same weights as
+    a training that never stopped. A killed one loses what came after its last checkpoint.
+    """
+    from slam_backend.errors import bad_argument, check_int
+    from training.learn_config import TrainConfig
+    from training.learn_extra import need_learner
+    from training.run_folder import RunFolder, installed_versions, read_config
+
+    need_learner()
+    from training.learn import Training, check_device
+
+    given = {"preset": preset, "world": world, "robots": robots, "steps": steps, "envs": envs, "seed": seed}
+    if workers is not None:
+        check_int("workers", workers, 0, "Use 0 for none, or a number of processes.")
+    check_device(device)
+    if resume is None:
+        chosen = TrainConfig.from_mapping(gather(COMMAND, given, config, json, out))
+    else:
+        others = [name for name, value in {**given, "out": out, "config": config}.items() if value is not None]
+        if others:
+            cure = "A training goes on with its own; --workers, --device and --json may be given."
+            raise bad_argument("resume", "no other options that decide the training", others, cure)
+        values, kept_seed = read_config(resume, COMMAND)
+        chosen = TrainConfig.from_mapping(values | {"seed": kept_seed})
+    crew = default_workers(chosen) if workers is None else workers
+    if resume is None:
+        prepare(lambda: _first_steps(chosen))  # a bad world shows before there is a folder
+        folder = RunFolder.create(out, COMMAND, chosen.to_mapping(), chosen.seed)
+    else:
+        prepare()
+        folder = RunFolder(resume, COMMAND, chosen.to_mapping(), chosen.seed, installed_versions())
+    console = Console()
+    training = Training(chosen, folder.path, crew, device)
+    try:
+        if resume is not None:
+            training.restore()
+        complete, seconds = _run_live(console, training)
+        _finish(console, folder, training, complete, seconds, json)
+    finally:
+        training.close()
+
+
+def default_workers(config: "TrainConfig") -> int:
+    """Return how many processes step the environments if nobody says it: the cores, at most one per environment."""
+    import os
+
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return 0 if cores == 1 else min(cores, config.envs)
+
+
+def _first_steps(config: "TrainConfig") -> None:
+    """Take two steps in the environment, which need all kernels but those of a merge."""
+    from training.learn_config import SPLIT_TRAIN
+    from vslam_env import vslam_v0
+
+    env = vslam_v0.parallel_env(config=config.make_env_config(SPLIT_TRAIN))
+    env.reset(seed=config.seed)
+    for _ in range(min(2, config.max_cycles)):
+        env.step(dict.fromkeys(env.agents, 0))
+
+
+def _run_live(console: Console, training: "Training") -> tuple[bool, float]:
+    """Train under a progress bar with the time left; Ctrl-C ends it after the running rollout.
+
+    Returns:
+        Whether it is complete, and how long it took [s].
+    """
+    import time
+
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    from training.interrupt import interrupt_flag
+
+    columns = (
+        TextColumn("{task.completed:,.0f} of {task.total:,.0f} decisions"),
+        BarColumn(20),
+        TextColumn("{task.fields[told]}"),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+    )
+    config, begin = training.config, time.perf_counter()
+    with interrupt_flag() as interrupted, Progress(*columns, console=console, speed_estimate_period=300.0) as bar:
+        total = config.updates * config.rollout
+        task = bar.add_task("", total=total, completed=len(training.rows) * config.rollout, told="first rollout")
+
+        def on_update(row: dict[str, float]) -> None:
+            told = f"return {row['return']:.3f}, E {row['map_error']:.2f} m, recall {row['map_recall']:.2f}"
+            bar.update(task, completed=row["steps"], told=told)
+
+        training.watch.listen(on_update, interrupted)
+        complete = training.run()
+    if not complete:
+        console.print("Stopped; the checkpoint holds all until here.", highlight=False)
+    return complete, time.perf_counter() - begin
+
+
+def _finish(
+    console: Console, folder: "RunFolder", training: "Training", complete: bool, seconds: float, json: Path | None
+) -> None:
+    """Write and show what the training led to."""
+    from training.figures_learning import draw_learning
+    from training.learn_curves import ends_of, to_csv
+
+    rows = training.rows
+    folder.write_text("curves.csv", to_csv(rows))
+    draw_learning(folder.path / "learning.png", rows)
+    ends: dict[str, Any] = ends_of(rows)
+    metrics = {"complete": complete, "decisions": int(rows[-1]["steps"]), "seconds_this_time": seconds, **ends}
+    first, last = ends["first"], ends["last"]
+    console.print(
+        f"Return of the first tenth {first['return']:.3f}, of the last {last['return']:.3f}; "
+        f"map error {first['map_error']:.3f} m, {last['map_error']:.3f} m.",
+        highlight=False,
+    )
+    finish(console, folder, folder.write_metrics(metrics), json)
+    if complete:
+        console.print(f"Next: vslam evaluate {folder.path}", soft_wrap=True, highlight=False)
+    else:
+        console.print(f"Go on: vslam train --resume {folder.path}", soft_wrap=True, highlight=False)
