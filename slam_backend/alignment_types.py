@@ -1,5 +1,6 @@
 """How an alignment of two maps is asked for and answered."""
 
+import math
 from dataclasses import dataclass
 from typing import Literal, Self
 
@@ -20,6 +21,8 @@ REASONS: tuple[Reason, ...] = (
     "poorly spread",
     "too uncertain",
 )
+RIVAL_DISTANCE = 0.5  # [m]; beyond these two an alignment counts as another one, and as a false one
+RIVAL_ANGLE = math.radians(5.0)
 FEWEST_INLIERS = 3  # two matches fit any motion between them: only a third is evidence
 
 

@@ -1,0 +1,57 @@
+"""Which landmarks of two maps may be the same, and the table of them that the kernels of alignment read."""
+
+import numpy as np
+
+from slam_backend import _alignment_kernels as kernels
+from slam_backend._matching import look_alikes, mutual_nearest, unlike_other_places
+from slam_backend.alignment_types import AlignmentOptions
+from slam_backend.errors import BoolArray, FloatArray, IntArray, bad_argument
+from slam_backend.landmark_map import LandmarkMap
+
+MOST_PAIRS = 10_000  # candidates by geometry alone
+
+
+def candidates(map_a: LandmarkMap, map_b: LandmarkMap, options: AlignmentOptions) -> tuple[IntArray, BoolArray]:
+    """Return the candidates (k, 2), and which of them stand out (k,): these are one-to-one."""
+    if map_a.descriptors.shape[1] != map_b.descriptors.shape[1]:
+        raise bad_argument(
+            "map_b",
+            f"descriptors of size {map_a.descriptors.shape[1]}, as in map_a",
+            map_b.descriptors.shape[1],
+            "Describe the landmarks of both maps with the same front end.",
+        )
+    if options.appearance:
+        clear = mutual_nearest(map_a.descriptors, map_b.descriptors, options.descriptor_gate)
+        for one, other, here, there in ((map_a, map_b, 0, 1), (map_b, map_a, 1, 0)):
+            descriptors, partners = one.descriptors[clear[:, here]], clear[:, there]
+            limits = (options.same_place, options.descriptor_ratio)
+            clear = clear[unlike_other_places(descriptors, partners, other.descriptors, other.means, *limits)]
+        alike = clear[:0]
+        if options.look_alikes:
+            alike = look_alikes(map_a.descriptors, map_b.descriptors, options.descriptor_gate, options.look_alikes)
+    else:
+        if len(map_a) * len(map_b) > MOST_PAIRS:
+            raise bad_argument(
+                "map_b", f"at most {MOST_PAIRS} pairs of landmarks without appearance", len(map_a) * len(map_b),
+                "Give smaller maps, or tell landmarks apart.",
+            )  # fmt: skip
+        clear, alike = np.empty((0, 2), np.int64), np.argwhere(np.ones((len(map_a), len(map_b)), np.bool_))
+    names = np.concatenate([clear, alike]) @ np.array([max(len(map_b), 1), 1])
+    unique, first = np.unique(names, return_index=True)
+    matches = np.column_stack([unique // max(len(map_b), 1), unique % max(len(map_b), 1)])
+    stands_out = first < len(clear)
+    rows_a, rows_b = matches.T
+    climb = map_a.means[rows_a, 2] - map_b.means[rows_b, 2]
+    variance = map_a.covariances[rows_a, 2, 2] + map_b.covariances[rows_b, 2, 2] + options.position_floor**2
+    level = climb**2 <= options.position_gate * variance
+    return matches[level], stands_out[level]
+
+
+def match_table(map_a: LandmarkMap, map_b: LandmarkMap, matches: IntArray) -> FloatArray:
+    """Return the (k, 18) table of matched landmarks that the kernels read."""
+    upper = np.triu_indices(3)
+    table = np.empty((len(matches), kernels.MATCH_COLUMNS))
+    for offset, source, rows in ((0, map_a, matches[:, 0]), (1, map_b, matches[:, 1])):
+        table[:, 3 * offset : 3 * offset + 3] = source.means[rows]
+        table[:, 6 + 6 * offset : 12 + 6 * offset] = source.covariances[rows][:, upper[0], upper[1]]
+    return table

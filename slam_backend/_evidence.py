@@ -1,0 +1,156 @@
+"""What an alignment rests on: which matches fit, whether chance, another motion or a mirror explains them as well."""
+
+import math
+
+import numpy as np
+from scipy.spatial import KDTree
+from scipy.special import bdtrc
+
+from slam_backend import _alignment_kernels as kernels
+from slam_backend.alignment_types import RIVAL_ANGLE, RIVAL_DISTANCE, AlignmentOptions
+from slam_backend.errors import BoolArray, FloatArray, IntArray
+from slam_backend.geometry import transform_points, wrap_angle
+from slam_backend.landmark_map import LandmarkMap
+
+RIVALS = 5  # most promising rivals that are refined
+FALSE_ALARMS = 1e-3  # expected number of sets of look-alikes that fit by chance as well
+MIRRORED = 3, 0.1  # the mirror image is believed if it fits so many more matches, and this share of the inliers more
+
+
+def one_to_one(matches: IntArray) -> bool:
+    """Tell whether no landmark appears twice in matches (k, 2)."""
+    return len(np.unique(matches[:, 0])) == len(np.unique(matches[:, 1])) == len(matches)
+
+
+def fitting(table: FloatArray, matches: IntArray, pose: FloatArray, floor: float, gate: float) -> BoolArray:
+    """Tell which candidates (k,) lie within the gate under `pose`; of several of one landmark the closest, greedily."""
+    distances = kernels.squared_distances(table, pose, floor)
+    inside = distances <= gate
+    rows = np.flatnonzero(inside)
+    if not one_to_one(matches[rows]):
+        taken_a, taken_b = set[int](), set[int]()
+        for i in rows[np.argsort(distances[rows], kind="stable")].tolist():
+            a, b = matches[i].tolist()
+            inside[i] = a not in taken_a and b not in taken_b
+            if inside[i]:
+                taken_a.add(a)
+                taken_b.add(b)
+    return inside
+
+
+def by_chance(
+    table: FloatArray,
+    map_a: LandmarkMap,
+    matches: IntArray,
+    pose: FloatArray,
+    variance: float,
+    options: AlignmentOptions,
+) -> bool:
+    """Tell whether so many inliers would come together by chance somewhere among so many look-alikes.
+
+    Were all pairs wrong, a look-alike would be any landmark of map a, and fit if it lay near by chance; without
+    appearance, a landmark of b would lie anywhere in the area of map a, and fit if one is near there. The chance that
+    as many of b's landmarks fit as do, two of which any motion can be made to fit, times the number of pairs that a
+    motion can be made from, is how often that is expected at all: a number of false alarms (Moisan and Stival 2004).
+    All this at the scale of what is left between the maps, the fitted `variance`. Where candidates are one-to-one by
+    appearance, `min_inliers` alone decides.
+    """
+    if one_to_one(matches):
+        return False
+    inside = fitting(table, matches, pose, variance, options.position_gate)
+    spread = (table[:, 6] + table[:, 9] + table[:, 12] + table[:, 15]) / 2.0 + variance
+    reach = np.sqrt(options.position_gate * spread)
+    if options.appearance:
+        moved = transform_points(pose, table[:, 3:5])
+        near = KDTree(map_a.means[:, :2]).query_ball_point(moved, reach, return_length=True)
+        fitted = np.isin(matches[:, 1], matches[inside, 1])  # one of those near is the partner found, not chance
+        share = (np.asarray(near, dtype=np.float64) - fitted).clip(min=0.0) / len(map_a)
+    else:
+        area = np.prod(np.ptp(map_a.means[:, :2], axis=0) + 2.0 * reach.mean())
+        share = np.pi * reach**2 / area
+    _, owner = np.unique(matches[:, 1], return_inverse=True)
+    chances = 1.0 - np.exp(-np.bincount(owner, share))
+    beyond = np.count_nonzero(inside) - 3
+    tail = bdtrc(beyond, max(len(chances) - 2, 1), chances.mean()) if beyond >= 0 else 1.0
+    return bool(0.5 * len(matches) * (len(matches) - 1.0) * tail > FALSE_ALARMS)
+
+
+def strongest_rival(
+    table: FloatArray,
+    matches: IntArray,
+    hypotheses: FloatArray,
+    pose: FloatArray,
+    variance: float,
+    centre_b: FloatArray,
+    options: AlignmentOptions,
+) -> float:
+    """Return how near the best hypothesis that differs even when refined comes to `pose`, as `Alignment.ratio` says."""
+    floor, gate = options.position_floor**2, options.position_gate
+
+    ours = fitting(table, matches, pose, variance, gate)
+    others = np.ascontiguousarray(hypotheses[differ(hypotheses[:, :3], pose, centre_b), :3])
+    promise = kernels.own_support(table, others, ours, floor, gate)
+    strongest = 0.0
+    for i in np.argsort(-promise, kind="stable")[:RIVALS]:
+        refined = kernels.refine(table, others[i].copy(), floor, gate)[0]
+        if differ(refined[None], pose, centre_b)[0]:
+            theirs = fitting(table, matches, refined, variance, gate)
+            own = max(float(np.count_nonzero(ours & ~theirs)), 0.5 * float(np.count_nonzero(ours)), 1.0)
+            strongest = max(strongest, float(np.count_nonzero(theirs & ~ours)) / own)
+    return strongest
+
+
+def is_mirrored(
+    table: FloatArray, matches: IntArray, pose: FloatArray, inside: BoolArray, options: AlignmentOptions
+) -> bool:
+    """Tell whether the mirror image about the line on which the inliers lie fits clearly more matches.
+
+    The one wall of a mirrored corridor fits a motion, too; but then all the rest fits the image.
+    """
+    points = table[inside, 3:5]
+    centre = points.mean(axis=0)
+    axis = np.linalg.eigh((points - centre).T @ (points - centre))[1][:, -1]
+    mirror = np.eye(3)
+    mirror[:2, :2] = 2.0 * np.outer(axis, axis) - np.eye(2)
+    image = table.copy()
+    image[:, 3:5] = centre + (table[:, 3:5] - centre) @ mirror[:2, :2]
+    upper = np.triu_indices(3)
+    full = np.empty((len(table), 3, 3))
+    full[:, upper[0], upper[1]] = full[:, upper[1], upper[0]] = table[:, 12:]
+    image[:, 12:] = (mirror @ full @ mirror)[:, upper[0], upper[1]]
+    fits = fitting(image, matches, pose, options.position_floor**2, options.position_gate)
+    more = np.count_nonzero(fits & ~inside) - np.count_nonzero(inside & ~fits)
+    return bool(more >= max(MIRRORED[0], MIRRORED[1] * np.count_nonzero(inside)))
+
+
+def differ(poses: FloatArray, pose: FloatArray, centre_b: FloatArray) -> BoolArray:
+    """Tell which of `poses` (h, 3) put the point `centre_b` (2,) elsewhere than `pose` does, or turn otherwise."""
+    cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    here = transform_points(pose, centre_b)
+    x = poses[:, 0] + cos * centre_b[0] - sin * centre_b[1] - here[0]
+    y = poses[:, 1] + sin * centre_b[0] + cos * centre_b[1] - here[1]
+    turned = np.abs(wrap_angle(poses[:, 2] - pose[2]))
+    return np.asarray((np.hypot(x, y) > RIVAL_DISTANCE) | (turned > RIVAL_ANGLE))
+
+
+def extent(points: FloatArray) -> float:
+    """Return how far points (k, 2) [m] reach along their main axis [m]."""
+    centred = points - points.mean(axis=0)
+    main_axis = np.linalg.eigh(centred.T @ centred)[1][:, -1]
+    return float(np.ptp(centred @ main_axis))
+
+
+def covariance_of(h: FloatArray) -> FloatArray | None:
+    """Return the covariance (3, 3) of a solution with information `h`; None if that leaves a direction open."""
+    scale = np.sqrt(np.diag(h))
+    if not (scale > 0.0).all() or np.linalg.eigvalsh(h / np.outer(scale, scale))[0] < 1e-12:
+        return None
+    covariance = np.linalg.solve(h, np.eye(3))
+    return np.asarray(0.5 * (covariance + covariance.T))
+
+
+def is_certain(covariance: FloatArray, influence: tuple[float, float], options: AlignmentOptions) -> bool:
+    """Tell whether an alignment is certain enough to be believed, and no single match, left out, says otherwise."""
+    position = math.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1])
+    sure = position <= options.max_sigma_position and math.sqrt(covariance[2, 2]) <= options.max_sigma_heading
+    return sure and influence[0] <= 0.5 * RIVAL_DISTANCE and influence[1] <= 0.5 * RIVAL_ANGLE
