@@ -14,6 +14,7 @@ from training.bench_stereo_command import bench_stereo
 from training.evaluate_command import evaluate
 from training.mrclam_pairs_command import bench_mrclam
 from training.paper_alignment_commands import fig2, fig3, fig4
+from training.drive_command import drive_by_hand
 from training.paper_command import paper
 from training.paper_fig5_command import fig5
 from training.replay_command import replay_mrclam
@@ -31,6 +32,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 app.command("run")(run)
+app.command("drive")(drive_by_hand)
 app.command("train")(train)
 app.command("evaluate")(evaluate)
 replay = typer.Typer(help="Run the backend on the log of real robots.", no_args_is_help=True)
