@@ -11,10 +11,10 @@ from training.bench_command import bench
 from training.bench_env_command import bench_env
 from training.bench_filter_command import bench_filter
 from training.bench_stereo_command import bench_stereo
+from training.drive_command import drive_by_hand
 from training.evaluate_command import evaluate
 from training.mrclam_pairs_command import bench_mrclam
 from training.paper_alignment_commands import fig2, fig3, fig4
-from training.drive_command import drive_by_hand
 from training.paper_command import paper
 from training.paper_fig5_command import fig5
 from training.replay_command import replay_mrclam
