@@ -13,6 +13,7 @@ from slam_backend.errors import BoolArray, FloatArray, bad_argument, check_int
 from vslam_env import EnvConfig, vslam_v0
 from vslam_env.config import MAX_ROBOTS
 from vslam_env.environment import ExplorationEnv
+from vslam_env.sensors import LandmarkSensor
 from vslam_env.world.visibility import view_limits, visible_landmarks
 
 COMMAND = "paper fig5"
@@ -133,6 +134,7 @@ def _as_seen(env: ExplorationEnv) -> Fig5:
     episode, sight = env.episode, env.config.landmark_sensor
     marks, poses = env.world.landmarks, env.true_poses
     assert marks is not None
+    assert isinstance(episode.setting.sensor, LandmarkSensor)
     nowhere = np.array([[1e6, 1e6, 1e6 + 1.0, 1e6]])  # a wall that hides nothing
     in_view = np.vstack(
         [
