@@ -16,7 +16,7 @@ from training.stereo_scenes import WALL, Named, Scene, office_views, panel_hall,
 from vslam_env.sensors.stereo_textures import STYLES, TextureConfig
 from vslam_env.world import make_world
 
-BUSY = TextureConfig(polygons=50.0, posters=0.3)  # enough corners for 200 landmarks in an image
+BUSY = TextureConfig(polygons=20.0, posters=0.6)  # enough corners for 100 landmarks in an image
 ANGLES_DEG = (0.0, 15.0, 30.0, 45.0, 60.0)
 RATIOS = (1.0, 1.25, 1.5, 2.0)
 DISTANCE = 2.5  # [m] of the reference views
@@ -95,10 +95,10 @@ def speed_row(width: int, landmarks: int, walls: int, descriptor: Any, steps: in
     camera = camera_of(width)
     scene = Scene(panel_hall(walls), camera, seed, BUSY)
     options = FrontEndOptions(
-        descriptor=descriptor, corners=CornerOptions(most=4 * landmarks), max_measurements=landmarks
+        descriptor=descriptor, corners=CornerOptions(most=round(2.6 * landmarks)), max_measurements=landmarks
     )
     front_end, rng = StereoFrontEnd(camera, options), np.random.default_rng(seed)
-    pose = np.array([1.5, 3.0, 0.1])
+    pose = np.array([1.5, 3.0, 0.5])
     view = scene.look(pose, rng)
     found = len(front_end.measure(view.left, view.right).measurements)
     render, measure = (

@@ -55,6 +55,7 @@ class EnvConfig:
         max_cycles: After so many calls of `env.step` the episode is truncated.
         stop_at_recall: The episode terminates when every robot's map holds this share of the landmarks; None: never.
         observation_type: `"dict"`: named arrays. `"flat"`: one float32 vector.
+        observe_images: Whether a robot observes its left image, as `"image"` (H, W, 1) uint8; with rendered eyes only.
         reward: Weights of the named reward terms.
         shared_reward: Each robot gets the mean of all robots' rewards, term by term.
         oracle_pose: The robots know their poses, each in its own start frame.
@@ -87,6 +88,7 @@ class EnvConfig:
     max_cycles: int = 1000
     stop_at_recall: float | None = None
     observation_type: Literal["dict", "flat"] = "dict"
+    observe_images: bool = False
     reward: Mapping[str, float] = field(default_factory=lambda: {"map_error": 1.0})
     shared_reward: bool = False
     oracle_pose: bool = False
@@ -123,7 +125,7 @@ class EnvConfig:
         if self.stop_at_recall is not None:
             check_float("stop_at_recall", self.stop_at_recall, "Give a share or None.", above=0.0, at_most=1.0)
         switches = ("oracle_pose", "oracle_association", "oracle_merge", "shared_start_view", "shared_reward")
-        for name in (*switches, "comm_line_of_sight"):
+        for name in (*switches, "comm_line_of_sight", "observe_images"):
             if not isinstance(getattr(self, name), bool):
                 raise bad_argument(name, "True or False", getattr(self, name), "Give a bool.")
         if not isinstance(self.reward, Mapping):
@@ -139,6 +141,9 @@ class EnvConfig:
         for name, kind in PARTS.items():
             if not isinstance(getattr(self, name), kind):
                 raise bad_argument(name, f"a {kind.__name__}", getattr(self, name), f"Build one: {kind.__name__}(...).")
+        if self.observe_images and (self.sensor, self.observation_type) != ("stereo", "dict"):
+            cure = 'Use sensor="stereo" and observation_type="dict".'
+            raise bad_argument("observe_images", "False without rendered eyes or named arrays", True, cure)
         check_float("scan.half_fov", self.scan.half_fov, "A scan spans less than a half circle.", at_most=1.57)
 
     @property

@@ -72,6 +72,10 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         self.agents: list[AgentID] = []
         goal, flat = config.action_type == "goal", config.observation_type == "flat"
         self._observed = observation_space(config.scan.num_rays, config.scan.max_range, goal, flat)
+        if config.observe_images and isinstance(self._observed, spaces.Dict):
+            shape = (config.stereo.camera.height, config.stereo.camera.width, 1)
+            image = spaces.Box(0, 255, shape, np.uint8)
+            self._observed = spaces.Dict({**self._observed.spaces, "image": image})
         self.observation_spaces = dict.fromkeys(self.possible_agents, self._observed)
         self.action_spaces = {agent: action_space(config.action_type) for agent in self.possible_agents}
         size = STATE_PER_ROBOT * config.num_robots + 2
@@ -377,6 +381,9 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         observations: dict[AgentID, Any] = {}
         for robot, agent in enumerate(self.agents):
             observation = observe_glimpse(episode.belief.glimpse(robot), episode.readings[robot].scan, goal)
+            image = episode.readings[robot].image
+            if image is not None:
+                observation["image"] = image[:, :, None].copy()
             if config.observation_type == "dict":
                 observations[agent] = observation
             elif goal:

@@ -17,7 +17,7 @@ from vslam_env.oracle import true_alignment
 from vslam_env.pose_errors import pose_errors
 from vslam_env.readings import Readings
 from vslam_env.reward import Standing
-from vslam_env.sensors import Frame
+from vslam_env.sensors import EyeFrame, Frame
 from vslam_env.setting import Setting
 from vslam_env.world import Simulator, read_odometry
 
@@ -188,6 +188,7 @@ class Episode:
                 pose=between(self.true_starts[robot], poses[robot]) if config.oracle_pose else None,
                 identities=frame.true_ids if config.oracle_association else None,
                 heard=None if heard is None else heard[robot],
+                image=frame.left if config.observe_images and isinstance(frame, EyeFrame) else None,
             )
             for robot, frame in enumerate(self.frames)
         )

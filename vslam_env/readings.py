@@ -2,6 +2,9 @@
 
 from dataclasses import dataclass, field
 
+import numpy as np
+from numpy.typing import NDArray
+
 from slam_backend.errors import BoolArray, FloatArray, IntArray
 from slam_backend.measurements import Measurements
 
@@ -19,6 +22,7 @@ class Readings:
         identities: (n,) int64. The true landmark behind each measurement, -1 for a false point, if
             `oracle_association` is on, else None.
         heard: (K,) bool. Which robots its radio hears, itself included; None: all, always.
+        image: (H, W) uint8. The left image, if `observe_images` is on, else None.
     """
 
     odometry: FloatArray | None
@@ -28,3 +32,4 @@ class Readings:
     pose: FloatArray | None = field(default=None)
     identities: IntArray | None = field(default=None)
     heard: BoolArray | None = field(default=None)
+    image: NDArray[np.uint8] | None = field(default=None)

@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend.camera import StereoCamera
 from slam_backend.errors import FloatArray, bad_argument
 from vslam_env.config import EnvConfig
 from vslam_env.coverage import CoverageMeter
@@ -85,14 +84,13 @@ def draw_setting(
     eyes: LandmarkSensor | StereoSensor
     if config.sensor == "stereo":
         eyes = StereoSensor(config.stereo, bare, free_space, paint, config.robot_radius)
-        landmarks, camera = eyes.landmarks, config.stereo.camera
+        landmarks = eyes.landmarks
     else:
         given = bare.landmarks
         landmarks = place_landmarks(bare, paint, config.landmarks, free_space) if given is None else given
         eyes = LandmarkSensor(config.landmark_sensor, bare.walls, landmarks, config.robot_radius)
-        camera = config.landmark_sensor.camera
     world = World(bare.name, bare.walls, landmarks, bare.start_poses)
-    true_starts = _starts(config, world, free_space, camera, start_poses, np.random.default_rng(starts))
+    true_starts = _starts(config, world, free_space, start_poses, np.random.default_rng(starts))
     true_starts.setflags(write=False)
     streams = {
         name: np.random.default_rng(stream)
@@ -107,7 +105,7 @@ def draw_setting(
         sensor=eyes,
         scan=Scan(config.scan, world.walls, config.robot_radius),
         coverage=CoverageMeter(free_space.free_area_cells, true_starts),
-        countable=free_space.visible_landmarks(landmarks, camera, config.landmark_sensor.max_incidence),
+        countable=free_space.visible_landmarks(landmarks, eyes.config.camera, eyes.config.max_incidence),
     )
 
 
@@ -115,11 +113,11 @@ def _starts(
     config: EnvConfig,
     world: World,
     free_space: FreeSpace,
-    camera: StereoCamera,
     start_poses: Any,
     rng: np.random.Generator,
 ) -> FloatArray:
     given = world.start_poses
+    sight = config.stereo if config.sensor == "stereo" else config.landmark_sensor
     if start_poses is not None:
         return free_space.check_starts(start_poses, config.num_robots)
     if given is not None:
@@ -135,7 +133,7 @@ def _starts(
         config.num_robots,
         rng,
         config.min_start_distance,
-        no_shared_view=None if config.shared_start_view else camera,
+        no_shared_view=None if config.shared_start_view else sight.camera,
         landmarks=world.landmarks,
-        max_incidence=config.landmark_sensor.max_incidence,
+        max_incidence=sight.max_incidence,
     )

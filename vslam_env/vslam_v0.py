@@ -26,6 +26,7 @@ def parallel_env(
     preset: str | None = None,
     reward: RewardSpec | None = None,
     observation_type: str | None = None,
+    observe_images: bool | None = None,
     oracle_pose: bool | None = None,
     oracle_association: bool | None = None,
     oracle_merge: bool | None = None,
@@ -55,6 +56,7 @@ def parallel_env(
         preset: `"easy"`, `"standard"` (default) or `"hard"`; see `preset_config`.
         reward: Weights of terms by name (default `{"map_error": 1.0}`), or a list of terms of your own.
         observation_type: `"dict"` (default) or `"flat"`.
+        observe_images: With `sensor="stereo"`: observations hold the left image, `"image"` (H, W, 1) uint8.
         oracle_pose: The robots know their poses in their own start frames.
         oracle_association: They know which landmark is which.
         oracle_merge: Groups in contact that share three landmarks merge with the true transform.
@@ -88,6 +90,7 @@ def parallel_env(
         "decision_ticks": decision_ticks,
         "max_cycles": max_cycles,
         "observation_type": observation_type,
+        "observe_images": observe_images,
         "shared_reward": shared_reward,
         "oracle_pose": oracle_pose,
         "oracle_association": oracle_association,

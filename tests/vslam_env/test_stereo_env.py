@@ -101,6 +101,27 @@ def test_impossible_eyes_are_refused() -> None:
         EnvConfig(stereo=StereoCamera())  # type: ignore[arg-type]
 
 
+def test_images_can_be_observed() -> None:
+    """An image observation is a copy of the robot's last left image, inside its space; the rest is as without."""
+    plain, seeing = _env(), _env(observe_images=True)
+    expected, _ = plain.reset(seed=6)
+    observed, _ = seeing.reset(seed=6)
+    for _ in range(3):
+        for agent, frame in zip(seeing.agents, seeing.episode.frames, strict=True):
+            assert isinstance(frame, EyeFrame)
+            assert seeing.observation_space(agent).contains(observed[agent])
+            image = observed[agent]["image"]
+            np.testing.assert_array_equal(image[:, :, 0], frame.left)
+            image[:] = 0
+            assert frame.left.any()
+            assert set(observed[agent]) == {*expected[agent], "image"}
+            np.testing.assert_array_equal(observed[agent]["pose"], expected[agent]["pose"])
+        expected, observed = (env.step(turning(env.agents))[0] for env in (plain, seeing))
+    for refused in ({"sensor": "landmark"}, {"observation_type": "flat"}):
+        with pytest.raises(ValueError, match="observe_images: expected False without rendered eyes or named arrays"):
+            _env(observe_images=True, **refused)
+
+
 def test_textures_follow_the_world_seed() -> None:
     """A world seed fixes walls and what is painted on them, whatever the seed of the rest."""
     pictures = []

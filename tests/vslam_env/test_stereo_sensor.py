@@ -52,6 +52,18 @@ def test_frames_hold_what_was_seen(sensor: StereoSensor) -> None:
         assert frame.measurements.covariances is None
 
 
+def test_visible_landmarks_are_those_that_are_measured(sensor: StereoSensor) -> None:
+    """Of the measured landmarks nearly all are visible ones, and nothing behind a robot is."""
+    visible, frames = sensor.visible(POSES), sensor.measure(POSES, np.random.default_rng(8))
+    assert visible.shape == (2, len(sensor.landmarks))
+    measured = np.concatenate([visible[robot, f.true_ids[f.true_ids >= 0]] for robot, f in enumerate(frames)])
+    assert measured.mean() > 0.8
+    ahead = np.array([np.cos(POSES[0, 2]), np.sin(POSES[0, 2])])
+    behind = (sensor.landmarks.positions[:, :2] - POSES[0, :2]) @ ahead < 0.0
+    assert behind.any()
+    assert not visible[0, behind].any()
+
+
 def test_the_same_draws_give_the_same_images(sensor: StereoSensor) -> None:
     """Images depend on the poses and the generator alone, not on what was taken before."""
     one = sensor.measure(POSES, np.random.default_rng(3))

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from slam_backend.camera import StereoCamera
-from slam_backend.errors import FloatArray, IntArray, bad_argument, check_float
+from slam_backend.errors import BoolArray, FloatArray, IntArray, bad_argument, check_float
 from slam_backend.frontend import CornerOptions, FrontEndOptions, StereoFrame, StereoFrontEnd
 from slam_backend.frontend.images import Image
 from vslam_env.sensors.landmark_sensor import Frame
@@ -14,6 +14,7 @@ from vslam_env.sensors.stereo_textures import TextureConfig, WallTextures, draw_
 from vslam_env.sensors.stereo_truth import TextureCorners
 from vslam_env.world.freespace import FreeSpace
 from vslam_env.world.spec import Landmarks, World
+from vslam_env.world.visibility import view_limits, visible_landmarks
 
 
 def few_spread() -> FrontEndOptions:
@@ -35,6 +36,7 @@ class StereoSensorConfig:
         imaging: Noise and exposure of the images.
         front_end: How images are measured.
         working_distance: True landmarks are the corners of the textures as a camera sees them from so far [m].
+        max_incidence: True landmarks seen at a larger angle to their face are not expected to be found [rad].
         tolerance: A measured point is the true landmark nearest to it on its wall within this distance [m].
     """
 
@@ -43,6 +45,7 @@ class StereoSensorConfig:
     imaging: ImagingConfig = field(default_factory=ImagingConfig)
     front_end: FrontEndOptions = field(default_factory=few_spread)
     working_distance: float = 3.0
+    max_incidence: float = float(np.radians(60.0))
     tolerance: float = 0.08
 
     def __post_init__(self) -> None:
@@ -51,6 +54,7 @@ class StereoSensorConfig:
             if not isinstance(getattr(self, name), kind):
                 cure = f"Build one: {kind.__name__}(...)."
                 raise bad_argument(f"stereo.{name}", f"a {kind.__name__}", getattr(self, name), cure)
+        check_float("stereo.max_incidence", self.max_incidence, "Give radians.", above=0.0, at_most=np.pi / 2)
         for name in ("working_distance", "tolerance"):
             check_float(f"stereo.{name}", getattr(self, name), "Give metres.", above=0.0)
 
@@ -99,6 +103,8 @@ class StereoSensor:
         resolution = config.camera.focal_px / config.working_distance
         options: CornerOptions = config.front_end.corners
         self.corners = TextureCorners(world, self.textures, free_space, resolution, options, config.tolerance)
+        self._walls, self._robot_radius = world.walls, robot_radius
+        self._view = view_limits(config.camera, config.max_incidence)
         self._eye = StereoEye(config.camera, config.imaging, world.walls, self.textures, robot_radius)
         self._front_end = StereoFrontEnd(config.camera, config.front_end)
 
@@ -106,6 +112,13 @@ class StereoSensor:
     def landmarks(self) -> Landmarks:
         """The true landmarks."""
         return self.corners.landmarks
+
+    def visible(self, poses: FloatArray) -> BoolArray:
+        """Tell which true landmarks (K, N) the robots at `poses` (K, 3) [m, m, rad], world frame, can see."""
+        marks, mount = self.landmarks, np.array(self.config.camera.mount)
+        return visible_landmarks(
+            poses, marks.positions, marks.normals, marks.walls, self._walls, self._robot_radius, mount, self._view
+        )
 
     def measure(self, poses: FloatArray, rng: np.random.Generator) -> list[Frame]:
         """Take and measure a pair of images with each robot's eyes.
