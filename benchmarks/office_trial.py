@@ -54,8 +54,8 @@ def summarise(trials: list[dict[str, Any]]) -> dict[str, Any]:
         "seeds": len(trials),
         "all_in_one_group": len(joined),
         "merges": len(merges),
-        # Nothing undoes a merge, so that each one is in force at the end.
-        "false_merges": sum(merge["false"] for merge in merges),
+        "false_merges": sum(merge["false"] and merge["undone_s"] is None for merge in merges),
+        "merges_undone": sum(merge["undone_s"] is not None for merge in merges),
         "last_merge_s_median": _median([trial["merges"][-1]["time_s"] for trial in joined if trial["merges"]]),
         "merge_error_m_median": _median([merge["error_m"] for merge in merges]),
         "merge_error_deg_median": _median([merge["error_deg"] for merge in merges]),
@@ -76,7 +76,8 @@ def _median(values: list[float]) -> float:
 def describe(trial: Mapping[str, Any]) -> str:
     """Return one line about a seed."""
     merges = ", ".join(
-        f"{m['time_s']:.0f} s ({m['error_m']:.2f} m {m['error_deg']:.1f} deg{', FALSE' if m['false'] else ''})"
+        f"{m['time_s']:.0f} s ({m['error_m']:.2f} m {m['error_deg']:.1f} deg{', FALSE' if m['false'] else ''}"
+        f"{', undone' if m['undone_s'] is not None else ''})"
         for m in trial["merges"]
     )
     team = trial["team"]

@@ -1,7 +1,7 @@
 """One episode of an environment under given policies, and the record of it that tables and figures are made of."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -36,6 +36,7 @@ class MergeRecord:
         landmarks: How many landmarks of either map were believed to be the same.
         error_m: Of the translation between the two map frames [m].
         error_deg: Of the rotation between them, >= 0 [degrees].
+        undone: When the team took it back [s]; None: it is in force.
     """
 
     tick: int
@@ -45,6 +46,7 @@ class MergeRecord:
     landmarks: int
     error_m: float
     error_deg: float
+    undone: float | None = None
 
     @property
     def is_false(self) -> bool:
@@ -188,6 +190,9 @@ class _Log:
             for robot in merge.robots_a + merge.robots_b:
                 self._alone_until.setdefault(robot, merge.time)
         self._merges.extend(merges)
+        for event in events:
+            if event.kind == "undo":
+                self._take_back(event)
         return Progress(len(self._ticks) - 1, tick * TICK, infos, merges)
 
     def finish(self, odometry: FloatArray) -> EpisodeRecord:
@@ -227,6 +232,12 @@ class _Log:
         self._estimated.append(np.stack([self._env.belief(agent).pose for agent in self._agents]))
         self._errors.append([float(infos[agent]["map_error"]) for agent in self._agents])
         self._coverage.append(float(infos[self._agents[0]]["coverage"]))
+
+    def _take_back(self, event: MergeEvent) -> None:
+        """Note the undo of a merge: of the last one between these groups."""
+        pair = event.robots_a, event.robots_b
+        last = max(i for i, merge in enumerate(self._merges) if (merge.robots_a, merge.robots_b) == pair)
+        self._merges[last] = replace(self._merges[last], undone=event.step * TICK)
 
     def _compared(self, event: MergeEvent) -> MergeRecord:
         """Compare a merge with the true motion between the start poses that the two map frames stand for."""

@@ -28,7 +28,14 @@ def score_episode(record: EpisodeRecord) -> dict[str, Any]:
         "team": {key: _mean([robot[key] for robot in robots]) for key in robots[0] if key != "robot"},
         "merges": [
             merge_row(
-                merge.tick, merge.time, merge.robots_a, merge.robots_b, merge.landmarks, merge.error_m, merge.error_deg
+                merge.tick,
+                merge.time,
+                merge.robots_a,
+                merge.robots_b,
+                merge.landmarks,
+                merge.error_m,
+                merge.error_deg,
+                merge.undone,
             )
             for merge in record.merges
         ],
@@ -48,11 +55,12 @@ def merge_row(
     landmarks: int,
     error_m: float,
     error_deg: float,
+    undone: float | None,
 ) -> dict[str, Any]:
     """Return one entry of `merges`, the same for runs and replays.
 
     `step` counts the steps of the filters, which are the ticks of a run; `landmarks` is how many were shared; `false`
-    is None where the errors are NaN.
+    is None where the errors are NaN, `undone_s` where the merge is in force.
     """
     return {
         "step": step,
@@ -63,6 +71,7 @@ def merge_row(
         "error_m": error_m,
         "error_deg": error_deg,
         "false": is_false_merge(error_m, error_deg) if np.isfinite(error_m) else None,
+        "undone_s": None if undone is None else round(undone, 3),
     }
 
 

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, Self
 
 import numpy as np
@@ -118,6 +118,7 @@ class Merge:
         map_b: Of the other group.
         claims_a: (N,) int64. Row in `MrclamLog.positions` of the landmark whose sighting began each one of `map_a`.
         claims_b: Likewise of `map_b`.
+        undone: When the team took it back, seconds since the first step [s]; None: it is in force.
     """
 
     time: float
@@ -126,6 +127,7 @@ class Merge:
     map_b: LandmarkMap
     claims_a: IntArray
     claims_b: IntArray
+    undone: float | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -195,6 +197,9 @@ def replay(
                 sides = [groups[side[0]] for side in (event.robots_a, event.robots_b)]
                 claims = [ledger.claims(side[0], maps[side].ids) for side in sides]
                 merges.append(Merge(since, event, maps[sides[0]], maps[sides[1]], claims[0], claims[1]))
+            if event.kind == "undo":
+                when = float(readings.times[step] - readings.times[0])
+                merges = [replace(m, undone=when) if m.event.alignment is event.alignment else m for m in merges]
         ledger.record(report, [_true_rows(frame) for frame in seen])
         for robot in robots:
             paths[robot, step] = team.pose_from_start(robot).mean

@@ -160,6 +160,7 @@ def summarise(replay: Replay, log: MrclamLog, paths: Sequence[PathScore | None])
                 len(merge.event.alignment.inliers),
                 error[0] if error else nan,
                 float(np.rad2deg(error[1])) if error else nan,
+                merge.undone,
             )
         )
     duration = float(replay.times[-1] - replay.times[0])

@@ -61,5 +61,8 @@ def _merges(rows: list[Mapping[str, Any]]) -> Table:
     for row in rows:
         sides = [", ".join(map(str, row[side])) for side in ("robots_a", "robots_b")]
         errors = f"{row['error_m']:.3f}", f"{row['error_deg']:.2f}"
-        table.add_row(f"{row['time_s']:.1f}", *sides, str(row["landmarks"]), *errors, "false" if row["false"] else "")
+        verdict = "false" if row["false"] else ""
+        if row["undone_s"] is not None:
+            verdict += f"{', ' if verdict else ''}undone at {row['undone_s']:.1f} s"
+        table.add_row(f"{row['time_s']:.1f}", *sides, str(row["landmarks"]), *errors, verdict)
     return table

@@ -30,7 +30,7 @@ ROOM = World(
     start_poses=np.array([[2.0, 1.5, 0.2], [1.5, 3.5, -0.4]]),
 )
 STEPS = 31
-MERGE_KEYS = {"step", "time_s", "robots_a", "robots_b", "landmarks", "error_m", "error_deg", "false"}
+MERGE_KEYS = {"step", "time_s", "robots_a", "robots_b", "landmarks", "error_m", "error_deg", "false", "undone_s"}
 
 
 def play(**options: object) -> EpisodeRecord:
