@@ -14,7 +14,7 @@ from slam_backend.reports import MergeEvent
 from vslam_env.actions import GoalDriver, action_space, checked_actions, command_of
 from vslam_env.belief import Belief
 from vslam_env.config import EnvConfig
-from vslam_env.episode import Episode, Recorder
+from vslam_env.episode import Episode, Recorder, Tap
 from vslam_env.errors_of_maps import MapScores
 from vslam_env.observation import flatten, observation_space, observe_glimpse
 from vslam_env.readings import Readings
@@ -39,7 +39,6 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
     Attributes:
         config: All that defines this environment.
         max_cycles: After so many steps the episode is truncated; may be assigned.
-        recorder: A function to be called with the readings of every tick, those of the reset included; None: nothing.
     """
 
     metadata: ClassVar[dict[str, Any]] = {
@@ -60,7 +59,7 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
             check_choice("render_mode", render_mode, RENDER_MODES, "Choose one of these, or None.")
         self.render_mode = render_mode
         self.max_cycles = config.max_cycles
-        self.recorder: Recorder | None = None
+        self._tap = Tap()  # kept apart, so that an episode does not keep its environment alive
         self._source: WorldSource = config.world if world is None else world
         check_source(self._source)
         if config.world_split is not None and is_one_building(self._source):
@@ -130,7 +129,7 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         setting = draw_setting(
             self.config, self._source, self._root.spawn(1)[0], world_seed, options.get("start_poses")
         )
-        self._episode = Episode(self.config, setting, self._record)
+        self._episode = Episode(self.config, setting, self._tap)
         self._episode.begin()
         self.agents = self.possible_agents[:]
         self._cycle = 0
@@ -265,6 +264,15 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         """The running episode, for diagnosis: the simulator's books, paths, seeds."""
         return self._running_episode("episode")
 
+    @property
+    def recorder(self) -> Recorder | None:
+        """A function to be called with the readings of every tick, those of the reset included; may be assigned."""
+        return self._tap.recorder
+
+    @recorder.setter
+    def recorder(self, recorder: Recorder | None) -> None:
+        self._tap.recorder = recorder
+
     def scene(self) -> Scene:
         """Return what a picture shows now."""
         return scene_of(self._running_episode("scene"), self._standing)
@@ -306,7 +314,7 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
             self._episode = None
             return
         if self._episode is None:
-            self._episode = Episode(self.config, state["episode"]["setting"], self._record)
+            self._episode = Episode(self.config, state["episode"]["setting"], self._tap)
         self._episode.set_state(state["episode"])
         self._drivers = [GoalDriver() for _ in state["drivers"]]
         for driver, kept in zip(self._drivers, state["drivers"], strict=True):
@@ -330,10 +338,6 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         return _unpickled, (made_from, self.max_cycles, self.get_state())
 
     # ------------------------------------------------------------------ within
-
-    def _record(self, readings: tuple[Readings, ...]) -> None:
-        if self.recorder is not None:
-            self.recorder(readings)
 
     def _running_episode(self, name: str) -> Episode:
         if self._episode is None:

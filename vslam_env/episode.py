@@ -1,6 +1,7 @@
 """`Episode`: one world with robots in it, what they perceive and believe, and the simulator's books; tick by tick."""
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import combinations
 from typing import Any
 
@@ -24,6 +25,13 @@ from vslam_env.world import Simulator, read_odometry
 Recorder = Callable[[tuple[Readings, ...]], None]
 
 
+@dataclass(slots=True)
+class Tap:
+    """Where readings can be listened to: an environment keeps it over its episodes."""
+
+    recorder: Recorder | None = None
+
+
 class Episode:
     """From a reset to the next.
 
@@ -32,7 +40,7 @@ class Episode:
     Args:
         config: Of the environment.
         setting: What was drawn at the reset.
-        recorder: Called with the readings of each tick, the first ones included.
+        tap: Its recorder is called with the readings of each tick, the first ones included.
 
     Attributes:
         setting: What was drawn at the reset; of these:
@@ -50,9 +58,9 @@ class Episode:
         merge_ticks: Tick and groups of each merge.
     """
 
-    def __init__(self, config: EnvConfig, setting: Setting, recorder: Recorder | None = None) -> None:
+    def __init__(self, config: EnvConfig, setting: Setting, tap: Tap | None = None) -> None:
         self._config = config
-        self._recorder = recorder
+        self._tap = Tap() if tap is None else tap
         self._streams = {name: np.random.default_rng(0) for name in setting.stream_states}
         self._settle(setting)
         self.body = Body(
@@ -192,8 +200,8 @@ class Episode:
             )
             for robot, frame in enumerate(self.frames)
         )
-        if self._recorder is not None:
-            self._recorder(self.readings)
+        if self._tap.recorder is not None:
+            self._tap.recorder(self.readings)
         report = self.belief.step(self.readings)
         self.ledger.record(report, [frame.true_ids for frame in self.frames])
         self.merge_ticks += [(self.tick, made.robots_a, made.robots_b) for made in report.renamings]

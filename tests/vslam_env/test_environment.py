@@ -1,4 +1,6 @@
+import gc
 import math
+import weakref
 from dataclasses import fields
 from typing import Any
 
@@ -383,3 +385,19 @@ def test_pose_errors_are_differences_of_placed_poses() -> None:
     errors = pose_errors(starts, estimated, true)
     np.testing.assert_allclose(errors[:, 0], np.linalg.norm(placed[:, :2] - true[:, :2], axis=1))
     np.testing.assert_allclose(errors[:, 1], np.abs(wrap_angle(placed[:, 2] - true[:, 2])))
+
+
+def test_an_environment_goes_with_its_last_name() -> None:
+    """Nothing keeps a dropped environment, its filters and its grids, alive until the garbage collector comes."""
+    env = small_env()
+    env.recorder = lambda readings: None
+    env.reset(seed=1)
+    env.step(turning(env.agents))
+    twin = env.clone()
+    kept = [weakref.ref(part) for part in (env, env.episode, env.episode.belief, twin.episode)]
+    gc.disable()
+    try:
+        del env, twin
+        assert [part() for part in kept] == [None] * 4
+    finally:
+        gc.enable()
