@@ -1,5 +1,6 @@
 from collections.abc import Callable
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,18 @@ def _step(actions: Any, **kwargs: Any) -> Callable[[], Any]:
     return act
 
 
+def _world_file(name: str, content: bytes) -> Callable[[], Any]:
+    """Reset an environment whose world is a file of that content."""
+
+    def act() -> Any:
+        with TemporaryDirectory() as folder:
+            path = Path(folder) / name
+            path.write_bytes(content)
+            return small_env(world=path).reset(seed=0)
+
+    return act
+
+
 class _Nameless:
     weight = 1.0
 
@@ -52,7 +65,7 @@ CASES: dict[str, tuple[Callable[[], Any], str]] = {
     "too many robots": (lambda: small_env(num_robots=9), "num_robots: expected an int from 1 to 8, got 9"),
     "no particles": (lambda: small_env(num_particles=0), "num_particles: expected an int >= 1, got 0"),
     "robots as text": (lambda: small_env(num_robots="many"), "num_robots: expected a valid integer.*got 'many'"),
-    "unknown sensor": (lambda: small_env(sensor="stereo"), "sensor: expected 'landmark', got 'stereo'"),
+    "unknown sensor": (lambda: small_env(sensor="sonar"), "sensor: expected 'landmark'.*, got 'sonar'"),
     "unknown action type": (lambda: small_env(action_type="jump"), "action_type: expected 'continuous', .*'jump'"),
     "unknown observations": (
         lambda: small_env(observation_type="image"),
@@ -148,6 +161,23 @@ CASES: dict[str, tuple[Callable[[], Any], str]] = {
         _step({"robot_0": 1.5, "robot_1": 0}, action_type="goal"),
         "expected an int from 0 to 16, got 1.5",
     ),
+    "broken image": (_world_file("plan.png", b"no picture"), "world: expected an image that OpenCV can read"),
+    "broken walls": (_world_file("plan.json", b"{"), "world: expected a JSON file, got a syntax error"),
+    "broken map": (_world_file("map.yaml", b"image: [1, 2"), "world: expected a YAML file, got a syntax error"),
+    "map without an image": (_world_file("map.yaml", b"resolution: 1"), "expected a mapping with the key 'image'"),
+    "walls that enclose nothing": (
+        _world_file("plan.json", b'{"walls": [[0, 0, 5, 0]]}'),
+        "world: expected walls that enclose a space",
+    ),
+    "world seed below zero": (_reset(options={"world_seed": -1}), r"options\['world_seed'\]: expected an int >= 0"),
+    "shared reward as text": (lambda: small_env(shared_reward="yes"), "shared_reward: expected .*, got 'yes'"),
+    "split of one building": (lambda: small_env(world_split="train"), "world_split: expected None for a world"),
+    "oracle as number": (lambda: small_env(oracle_pose=1), "oracle_pose: expected a valid boolean, got 1"),
+    "landmarks too dense": (
+        lambda: small_env().config.replace(landmarks={"density": -1.0}),
+        "landmarks.density: expected a finite number > 0, got -1",
+    ),
+    "no state": (lambda: small_env().set_state([]), "state: expected what get_state returned, got a list"),
     "team in a solo environment": (lambda: SoloExplorationEnv(num_robots=2), "num_robots: expected 1, got 2"),
     "fewer starts than robots": (
         _reset(world=World("two", WALLS, start_poses=MEETING), num_robots=3),
