@@ -16,7 +16,7 @@ if TYPE_CHECKING:  # what computes is imported when the command runs, so that --
 
 COMMAND = "run"
 VIDEO_SIZE = (960, 720)
-EYE_WIDTH = 640  # of what one robot sees, beside the map [px]
+EYE_WIDTH = 480  # of what one robot sees, beside the map [px]
 
 
 def run(

@@ -22,12 +22,14 @@ from training.stereo_tables import markdown
 
 
 def test_a_speed_row_times_what_it_says() -> None:
-    """At 320 x 240 px with 40 walls there are 100 landmarks in the frame, and a pair takes both of its parts."""
+    """At 320 x 240 px with 40 walls there are 100 landmarks in the frame, and both parts of a pair are timed."""
     row = speed_row(320, 100, 40, "usurf", 2, 3)
     assert row["landmarks"] == row["wanted"] == 100
     assert (row["width"], row["height"], row["walls"]) == (320, 240, 40)
-    assert row["pair_least_ms"] == pytest.approx(row["render"]["min_ms"] + row["front_end"]["min_ms"])
-    assert row["render"]["calls"] == 2
+    for part in ("render", "front_end"):
+        assert row[part]["calls"] == 2
+        assert 0.0 < row[part]["min_ms"] <= row[part]["median_ms"]
+        assert row[part]["processor_ms"] > 0.0
 
 
 def test_halls_have_their_number_of_walls() -> None:
