@@ -11,6 +11,7 @@ from training.bench_command import bench
 from training.bench_env_command import bench_env
 from training.bench_filter_command import bench_filter
 from training.bench_stereo_command import bench_stereo
+from training.bench_train_command import bench_train
 from training.drive_command import drive_by_hand
 from training.evaluate_command import evaluate
 from training.mrclam_pairs_command import bench_mrclam
@@ -44,6 +45,7 @@ app.add_typer(replay, name="replay")
 bench.command("filter")(bench_filter)
 bench.command("stereo")(bench_stereo)
 bench.command("env")(bench_env)
+bench.command("train")(bench_train)
 bench.command("alignment")(bench_alignment)
 bench.command("mrclam")(bench_mrclam)
 app.add_typer(bench, name="bench")

@@ -1,0 +1,276 @@
+"""`TrainBenchConfig`: what `vslam bench train` times; where the time of a training goes, and what workers gain."""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from functools import partial
+from typing import Any, Self
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from pettingzoo import ParallelEnv
+from sb3_contrib import MaskablePPO
+
+from slam_backend.errors import bad_argument, check_int
+from training.env_timing import StepTimes, time_steps
+from training.learn_config import SPLIT_TRAIN, TrainConfig
+from training.learn_network import GoalPolicy
+from training.machine_rates import describe_machine
+from training.vec_env import ExplorationVecEnv, make_vec_env
+from vslam_env import vslam_v0
+from vslam_env.config import EnvConfig
+
+GOAL_ADAPTER_US, GOAL_TWO_WORKERS = 5.0, 1.8
+ADAPTER_STEPS = 400
+RECORDED = 20  # steps of an environment that are played again and again
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrainBenchConfig:
+    """All that decides the benchmark; the environments are those of `vslam train`'s preset `quick`.
+
+    Attributes:
+        world: A family or a path.
+        robots: K.
+        envs: Environments side by side.
+        workers: Numbers of processes to time; 0: this one alone.
+        steps: Of the environments, timed per number of workers.
+        seed: Of the episodes.
+    """
+
+    world: str = "office"
+    robots: int = 3
+    envs: int = 4
+    workers: tuple[int, ...] = (0, 1, 2)
+    steps: int = 40
+    seed: int = 100
+
+    def __post_init__(self) -> None:
+        check_int("envs", self.envs, 1, "Use at least one environment.")
+        check_int("steps", self.steps, 2, "Time a few steps.")
+        check_int("seed", self.seed, 0, "Use 0 or a positive number.")
+        for workers in self.workers:
+            if not 0 <= check_int("workers", workers, 0, "Use 0 for none.") <= self.envs:
+                raise bad_argument("workers", f"at most one per environment, {self.envs}", workers, "Use fewer.")
+        self.environment()
+
+    @classmethod
+    def from_mapping(cls, values: Mapping[str, Any]) -> Self:
+        """Build a config from plain values, as `to_mapping` gives them; unknown names are refused."""
+        known = [f.name for f in fields(cls)]
+        for name in values:
+            if name not in known:
+                raise bad_argument("config", "one of " + ", ".join(known), name, "Correct the name in the file.")
+        chosen: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in values.items()}
+        return cls(**chosen)
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return the plain values that repeat this benchmark, the seed apart."""
+        return {name: value for name, value in asdict(self).items() if name != "seed"}
+
+    def environment(self) -> EnvConfig:
+        """Return the environments' configuration."""
+        return TrainConfig(world=self.world, robots=self.robots).make_env_config(SPLIT_TRAIN)
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """One part of a training's time, per decision of a robot [us]."""
+
+    name: str
+    median_us: float
+    min_us: float
+
+
+@dataclass(frozen=True, slots=True)
+class WorkerRow:
+    """Decisions of robots per second with a number of workers, from the median and from the fastest step."""
+
+    workers: int
+    per_second: float
+    best_per_second: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrainBenchResult:
+    """What was measured.
+
+    Attributes:
+        machine: As `describe_machine` tells.
+        parts: Of a training in one process.
+        workers: In the order asked for.
+        complete: Whether nothing is missing.
+    """
+
+    machine: dict[str, Any]
+    parts: tuple[Part, ...]
+    workers: tuple[WorkerRow, ...]
+    complete: bool
+
+    def goals(self) -> list[dict[str, Any]]:
+        """Return goals with what was measured."""
+        found = []
+        for part in self.parts:
+            if part.name == "adapter":
+                found.append({"name": "adapter, us per decision", "measured": part.median_us,
+                              "goal": GOAL_ADAPTER_US, "at_least": False,
+                              "met": part.median_us <= GOAL_ADAPTER_US})  # fmt: skip
+        rates = {row.workers: row.per_second for row in self.workers}
+        if 2 in rates and 1 in rates:
+            gain = rates[2] / rates[1]
+            found.append({"name": "two workers over one", "measured": gain, "goal": GOAL_TWO_WORKERS,
+                          "at_least": True, "met": gain >= GOAL_TWO_WORKERS})  # fmt: skip
+        return found
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return it as plain values."""
+        return {
+            "machine": self.machine,
+            "parts": [asdict(part) for part in self.parts],
+            "workers": [asdict(row) for row in self.workers],
+            "goals": self.goals(),
+            "complete": self.complete,
+        }
+
+
+class Replay(ParallelEnv[str, Any, Any]):  # type: ignore[misc]   # PettingZoo has no type information
+    """Gives back what an environment once returned, so that nothing but the adapter around it takes time."""
+
+    render_mode = None
+
+    def __init__(self, config: EnvConfig, seed: int) -> None:
+        env = vslam_v0.parallel_env(config=config.replace(max_cycles=RECORDED + 1))
+        self.possible_agents = env.possible_agents
+        self.agents = env.possible_agents
+        self._spaces = env.observation_space(self.agents[0]), env.action_space(self.agents[0])
+        rng = np.random.default_rng(seed)
+        self._first = env.reset(seed=seed)
+        seen, self._told = self._first[0], []
+        for _ in range(RECORDED):
+            actions = {agent: int(rng.choice(np.flatnonzero(seen[agent]["action_mask"]))) for agent in env.agents}
+            self._told.append(env.step(actions))
+            seen = self._told[-1][0]
+        self._next = 0
+
+    def observation_space(self, agent: str) -> Any:
+        """Return that of the environment."""
+        return self._spaces[0]
+
+    def action_space(self, agent: str) -> Any:
+        """Return that of the environment."""
+        return self._spaces[1]
+
+    def reset(self, seed: int | None = None, options: Any = None) -> Any:
+        """Return what the environment's reset returned."""
+        return self._first
+
+    def step(self, actions: Any) -> Any:
+        """Return what its next step returned, from the beginning again after the last."""
+        self._next = (self._next + 1) % RECORDED
+        return self._told[self._next]
+
+
+def run_bench(
+    config: TrainBenchConfig,
+    on_trial: Callable[[str], None] = lambda name: None,
+    should_stop: Callable[[], bool] = lambda: False,
+) -> TrainBenchResult:
+    """Time the parts of a training, then the environments alone over workers.
+
+    Args:
+        config: What is timed.
+        on_trial: Called with the name of each trial before it begins.
+        should_stop: Asked between trials.
+    """
+    parts: list[Part] = []
+    rows: list[WorkerRow] = []
+    trials: list[tuple[str, Callable[[], None]]] = [
+        ("adapter", lambda: parts.extend(time_adapter(config))),
+        ("learner", lambda: parts.extend(time_learner(config))),
+    ]
+    trials += [(f"{n} workers", lambda n=n: rows.append(time_workers(config, n))) for n in config.workers]  # type: ignore[misc]
+    done = 0
+    for name, trial in trials:
+        if should_stop():
+            break
+        on_trial(name)
+        trial()
+        done += 1
+    for row in rows:
+        if row.workers == 0:
+            parts.insert(0, Part("environment", 1e6 / row.per_second, 1e6 / row.best_per_second))
+    return TrainBenchResult(describe_machine(), tuple(parts), tuple(rows), done == len(trials))
+
+
+def count_trials(config: TrainBenchConfig) -> int:
+    """Return how often `run_bench` calls `on_trial`."""
+    return 2 + len(config.workers)
+
+
+def time_adapter(config: TrainBenchConfig) -> list[Part]:
+    """Return what the adapter adds to a decision, and what the masks cost, over environments that take no time."""
+    make = partial(Replay, config.environment(), config.seed)
+    env = ExplorationVecEnv([make] * config.envs)
+    env.reset()
+    actions = [np.zeros(env.num_envs, np.int64)] * (ADAPTER_STEPS + 20)
+    alone = [make() for _ in range(config.envs)]
+    # Reads what the steps return, in turn and once a step: the replay's own time, which is no adapter's.
+    bare = time_steps(lambda _: [one.step(None) for one in alone], actions, 20)
+    stepped = time_steps(env.step, actions, 20)
+    masks = time_steps(lambda _: np.stack(env.env_method("action_masks")), actions, 20)
+    per = 1e6 / env.num_envs
+    adapter = Part(
+        "adapter", per * float(np.median(stepped) - np.median(bare)), per * float(stepped.min() - bare.min())
+    )
+    return [adapter, Part("masks", per * float(np.median(masks)), per * float(masks.min()))]
+
+
+def time_learner(config: TrainBenchConfig) -> list[Part]:
+    """Return what drawing actions from the network and updating it cost per decision, on one thread."""
+    torch.set_num_threads(1)
+    chosen = TrainConfig(world=config.world, robots=config.robots, envs=config.envs)
+    env = ExplorationVecEnv([partial(Replay, config.environment(), config.seed)] * config.envs)
+    model = MaskablePPO(
+        GoalPolicy, env, n_steps=chosen.max_cycles, batch_size=chosen.batch, n_epochs=chosen.epochs, seed=0,
+        device="cpu",
+    )  # fmt: skip
+    seen = env.reset()
+    masks: NDArray[Any] = np.stack(env.env_method("action_masks"))
+
+    def act(_: Any) -> None:
+        with torch.no_grad():
+            model.policy(model.policy.obs_to_tensor(seen)[0], action_masks=masks)
+
+    drawn = time_steps(act, [None] * 60, 10)
+    model.learn(env.num_envs * chosen.max_cycles)  # fills the buffer, and warms the update up
+    updates = []
+    for _ in range(3):
+        begin = time.perf_counter()
+        model.train()
+        updates.append(time.perf_counter() - begin)
+    per, whole = 1e6 / env.num_envs, 1e6 / (env.num_envs * chosen.max_cycles)
+    return [
+        Part("network, drawing", per * float(np.median(drawn)), per * float(drawn.min())),
+        Part("network, updating", whole * float(np.median(updates)), whole * min(updates)),
+    ]
+
+
+def time_workers(config: TrainBenchConfig, workers: int) -> WorkerRow:
+    """Time the environments under random valid goals, in this process or over workers."""
+    env = make_vec_env(config.environment(), config.envs, workers, config.seed)
+    try:
+        env.reset()
+        rng = np.random.default_rng(config.seed)
+
+        def step(_: Any) -> None:
+            env.step(_drawn(env.env_method("action_masks"), rng))
+
+        times = StepTimes.of(time_steps(step, range(config.steps + 5), 5))
+    finally:
+        env.close()
+    return WorkerRow(workers, env.num_envs * 1e6 / times.median_us, env.num_envs * 1e6 / times.min_us)
+
+
+def _drawn(masks: Sequence[NDArray[Any]], rng: np.random.Generator) -> NDArray[np.int64]:
+    return np.array([rng.choice(np.flatnonzero(mask)) for mask in masks], np.int64)
