@@ -10,6 +10,7 @@ from slam_backend.frontend import StereoFrame, StereoFrontEnd
 from slam_backend.frontend.images import Image
 from slam_backend.geometry import transform_points
 from vslam_env.sensors.stereo_camera import ImagingConfig, StereoEye
+from vslam_env.sensors.stereo_sensor import SPURIOUS_PX
 from vslam_env.sensors.stereo_textures import TextureConfig, WallTextures, draw_textures
 from vslam_env.sensors.stereo_truth import TextureCorners
 from vslam_env.world import FreeSpace, World
@@ -103,7 +104,9 @@ class Scene:
         robot = camera.robot_from_camera(frame.measurements.points)
         world = np.column_stack([transform_points(view.pose, robot[:, :2]), robot[:, 2]])
         disparities = camera.focal_px * camera.baseline / traced.depths
-        return Named(frame, world, corners.claims(traced, heights), disparities)
+        names = corners.claims(traced, heights)
+        names[np.abs(frame.pixels[:, 2] - disparities) > SPURIOUS_PX] = -1
+        return Named(frame, world, names, disparities)
 
 
 def office_views(scene: Scene, count: int, rng: np.random.Generator) -> list[View]:

@@ -16,6 +16,8 @@ from vslam_env.world.freespace import FreeSpace
 from vslam_env.world.spec import Landmarks, World
 from vslam_env.world.visibility import view_limits, visible_landmarks
 
+SPURIOUS_PX = 1.0  # a point whose disparity is farther off than this is none of what its ray meets
+
 
 def few_spread() -> FrontEndOptions:
     """Return the default front end of a robot.
@@ -129,7 +131,7 @@ class StereoSensor:
 
         Returns:
             One frame for each robot, with the true landmark behind each point, -1 where there is none: on edges that
-            are none of a texture, on robots, and where nothing stands.
+            are none of a texture, on robots, where nothing stands, and where the depth is wrong.
         """
         frames: list[Frame] = []
         for robot in range(len(poses)):
@@ -139,10 +141,17 @@ class StereoSensor:
         return frames
 
     def _claims(self, poses: FloatArray, robot: int, frame: StereoFrame) -> IntArray:
-        """Return the true landmark (n,) int64 behind each measured point: where its ray meets a wall, not its depth."""
+        """Return the true landmark (n,) int64 behind each measured point, -1 where there is none.
+
+        It is the one where the point's ray meets a wall, if the measured disparity is that of the wall to a pixel:
+        a point in mid-air is spurious, whatever stands behind it.
+        """
         camera = self.config.camera
         traced = self._eye.trace(poses, robot, frame.pixels[:, 0])
         with np.errstate(invalid="ignore"):
             rise = (0.5 * (camera.height - 1) - frame.pixels[:, 1]) / camera.focal_px * traced.depths
         heights = np.where(traced.walls >= 0, camera.mount[2] + rise, 0.0)
-        return self.corners.claims(traced, heights)
+        names = self.corners.claims(traced, heights)
+        spurious = np.abs(frame.pixels[:, 2] - camera.focal_px * camera.baseline / traced.depths) > SPURIOUS_PX
+        names[spurious] = -1
+        return names
