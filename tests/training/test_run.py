@@ -273,7 +273,7 @@ def test_an_interrupted_run_writes_what_it_has(monkeypatch: pytest.MonkeyPatch, 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("--world", "nowhere"), "world: expected one of 'office', 'fig5', or a path"),
+        (("--world", "nowhere"), "world: expected one of 'office', 'maze', 'loops', 'hall', 'fig5', or a path"),
         (("--policy", "nobody"), "policy: expected one of 'frontier', 'random_goals', 'random_walk', got 'nobody'."),
         (("--policy", "random_walk", "--action-type", "goal"), "action_type: expected 'continuous' or 'discrete'"),
         (("--robots", "0"), "robots: expected an int >= 1, got 0. Use 1 to 8 robots."),
