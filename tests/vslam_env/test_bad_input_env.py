@@ -65,7 +65,7 @@ CASES: dict[str, tuple[Callable[[], Any], str]] = {
     "too many robots": (lambda: small_env(num_robots=9), "num_robots: expected an int from 1 to 8, got 9"),
     "no particles": (lambda: small_env(num_particles=0), "num_particles: expected an int >= 1, got 0"),
     "robots as text": (lambda: small_env(num_robots="many"), "num_robots: expected a valid integer.*got 'many'"),
-    "unknown sensor": (lambda: small_env(sensor="sonar"), "sensor: expected 'landmark'.*, got 'sonar'"),
+    "unknown sensor": (lambda: small_env(sensor="sonar"), "sensor: expected one of 'landmark', 'stereo', got 'sonar'"),
     "unknown action type": (lambda: small_env(action_type="jump"), "action_type: expected 'continuous', .*'jump'"),
     "unknown observations": (
         lambda: small_env(observation_type="image"),
