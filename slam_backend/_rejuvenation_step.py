@@ -123,15 +123,14 @@ class RejuvenationStep:
         self._guesses = [dict(guesses) for guesses in state["guesses"]]
 
 
-def write_maps(maps: ParticleMaps, particles: Particles) -> None:
-    """Give all particles the landmarks of their paths; what no sighting supports, or was given up, is not there.
+def write_maps(maps: ParticleMaps, best: int, particles: Particles) -> None:
+    """Give all particles the landmarks of their paths: those that the most probable one held and a sighting supports.
 
-    Names, descriptors and odds stay; where a landmark's odds differ between particles, all get the mean of those that
-    held it.
+    What only others held was a mistake, as far as is known: the log's association is that of the most probable. Names,
+    descriptors and odds stay; where a landmark's odds differ between particles, all get the mean of those that held it.
     """
     slots = maps.used_slots()
-    wanted = np.isin(maps.ids[slots], particles.ids)
-    slots = slots[wanted]
+    slots = slots[(maps.of_particle(best, slots)[1] > 0) & np.isin(maps.ids[slots], particles.ids)]
     rows = np.searchsorted(particles.ids[order := np.argsort(particles.ids)], maps.ids[slots])
     rows = order[rows]
     m = maps.num_particles

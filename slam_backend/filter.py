@@ -357,7 +357,7 @@ class FastSlam:
         m = self.num_particles
         result = smoother.run(self._logs, self._starts[:, :, :m], self._maps, self._camera, self._rng)
         if (new := result.particles) is not None:
-            write_maps(self._maps, new)
+            write_maps(self._maps, self.best_particle, new)
             self._poses[:, :, :m], self._starts[:, :, :m] = new.poses, new.starts
             self._means[:] = self._poses
             self._covariances.fill(0.0)
