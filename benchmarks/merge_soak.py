@@ -32,7 +32,7 @@ from agents.registry import make_policy
 from slam_backend.alignment import Alignment
 from slam_backend.attempts import AttemptOptions
 from slam_backend.errors import FloatArray, IntArray, bad_argument, check_choice, check_int
-from slam_backend.geometry import between, rotation
+from slam_backend.geometry import between, inverse, rotation
 from slam_backend.landmark_map import LandmarkMap
 from slam_backend.reports import MergeEvent
 from slam_backend.team import TeamSlam
@@ -64,6 +64,7 @@ class MergeFate:
         error_m, error_deg: Of its motion.
         undone_after: Steps until it was undone; None: it was not.
         ended_after: Steps until the run ended.
+        end_m, end_deg: Of one group's frame in the other's as the team has it at the end; NaN if undone.
     """
 
     seed: int
@@ -76,6 +77,8 @@ class MergeFate:
     error_deg: float
     undone_after: int | None
     ended_after: int
+    end_m: float
+    end_deg: float
 
     @property
     def is_false(self) -> bool:
@@ -117,7 +120,8 @@ def play_environment(seed: int, cycles: int, forced: bool) -> list[MergeFate]:
         }
         observations = env.step(actions)[0]
     alike = f"{env.config.landmarks.repeated:.0%} with a twin"
-    return fates(env.events, env.true_start_poses, seed, env.config.world, alike, env.episode.tick)
+    placed = [inverse(env.belief(agent).start_from_group) for agent in env.possible_agents]
+    return fates(env.events, env.true_start_poses, placed, seed, env.config.world, alike, env.episode.tick)
 
 
 def play_aisles(seed: int, cycles: int, forced: bool) -> list[MergeFate]:
@@ -142,7 +146,8 @@ def play_aisles(seed: int, cycles: int, forced: bool) -> list[MergeFate]:
         team.step(reading["odometry"], reading["measurements"], up)
         if forced and not team.events and min(len(team.map(robot)) for robot in range(2)) >= ENOUGH:
             team.merge(0, 1, wrong_alignment(starts, team.map(0), team.map(1), rng))
-    return fates(team.events, starts, seed, "aisles", f"classes of {look_alikes}", run.num_steps)
+    placed = [inverse(team.start_from_group(robot)) for robot in range(robots)]
+    return fates(team.events, starts, placed, seed, "aisles", f"classes of {look_alikes}", run.num_steps)
 
 
 def force(env: ExplorationEnv, rng: np.random.Generator) -> None:
@@ -188,20 +193,36 @@ def coinciding(points_a: FloatArray, points_b: FloatArray) -> IntArray:
     return np.column_stack([rows, nearest])[mutual]
 
 
+def off_by(starts: FloatArray, event: MergeEvent, motion: FloatArray) -> tuple[float, float]:
+    """Return by how much [m, degrees] a motion between two groups' frames is wrong."""
+    error = between(between(starts[event.robots_a[0]], starts[event.robots_b[0]]), motion)
+    return float(np.hypot(*error[:2])), float(abs(np.degrees(error[2])))
+
+
 def fates(
-    events: Sequence[MergeEvent], starts: FloatArray, seed: int, world: str, alike: str, steps: int
-) -> list[MergeFate]:
-    """Return what became of the merges of a run that has ended after so many steps."""
+    events: Sequence[MergeEvent], starts: FloatArray, placed: Sequence[FloatArray], seed: int, world: str, alike: str,
+    steps: int,
+) -> list[MergeFate]:  # fmt: skip
+    """Return what became of the merges of a run that has ended after so many steps.
+
+    Args:
+        events: Of the run.
+        starts: (K, 3) true start poses, world frame.
+        placed: (K, 3) start poses as believed at the end, each in its map frame.
+        seed, world, alike: Of the run.
+        steps: Of the run.
+    """
     found = []
     for i, event in enumerate(events):
         if event.kind == "merge":
-            error = between(between(starts[event.robots_a[0]], starts[event.robots_b[0]]), event.alignment.transform)
             undone = next((e.step for e in events[i:] if e.kind == "undo" and e.alignment is event.alignment), None)
+            end = between(placed[event.robots_a[0]], placed[event.robots_b[0]])
             found.append(
                 MergeFate(
                     seed, world, alike, event.step, event.robots_a, event.robots_b,
-                    float(np.hypot(*error[:2])), float(abs(np.degrees(error[2]))),
+                    *off_by(starts, event, event.alignment.transform),
                     None if undone is None else undone - event.step, steps - event.step,
+                    *(off_by(starts, event, end) if undone is None else (float("nan"), float("nan"))),
                 )
             )  # fmt: skip
     return found
@@ -221,6 +242,7 @@ def summarise(merges: list[MergeFate], runs: int, steps: int) -> dict[str, Any]:
         "false_merges": len(false),
         "false_merges_undone": len(after),
         "false_merges_in_force": sum(merge.counts for merge in false),
+        "false_at_the_end": sum(is_false_merge(merge.end_m, merge.end_deg) for merge in merges),
         "steps_until_undone_median": float(np.median(after)) if after else float("nan"),
     }
 
@@ -250,7 +272,11 @@ def main(
         found = (play_aisles if kind == "aisles" else play_environment)(seed, cycles, forced)
         merges, played = merges + found, played + 1
         for merge in found:
-            fate = "in force" if merge.undone_after is None else f"undone after {merge.undone_after} steps"
+            fate = (
+                f"in force, {merge.end_m:.2f} m {merge.end_deg:.1f} deg off at the end"
+                if merge.undone_after is None
+                else f"undone after {merge.undone_after} steps"
+            )
             console.print(
                 f"seed {merge.seed} {merge.world} ({merge.alike}): {merge.robots_a} + {merge.robots_b} at "
                 f"{merge.step}, {merge.error_m:.2f} m {merge.error_deg:.1f} deg off"
