@@ -8,6 +8,7 @@ import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 # Told apart by colour-blind eyes too.
 COLOURS = {
@@ -61,6 +62,9 @@ def _draw_panel(ax: Axes, lines: Sequence[Mapping[str, Any]], key: str) -> None:
     elif key == "median_ms":
         ax.set_yscale("log")
         ax.axhline(5.0, color="0.5", lw=0.8, ls=":")
+        ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        ax.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        ax.yaxis.set_minor_formatter(NullFormatter())
     else:
         ax.axhline(1.1, color="0.5", lw=0.8, ls=":")
         ax.set_ylim(0.8, 1.3)
