@@ -9,7 +9,6 @@ from slam_backend.branches import Branch, fork, landmark_counts, missing, parts,
 from slam_backend.errors import IntArray
 from slam_backend.filter import FastSlam
 from slam_backend.records import Records
-from slam_backend.reports import MergeUndone
 from slam_backend.watching import Watch
 
 
@@ -140,42 +139,3 @@ def _oldest_of(watch: Watch) -> int:
 def _numbers(watch: Watch) -> set[int]:
     older = [_numbers(one) for side in watch.sides for one in side.watches]
     return {side.trunk["number"] for side in watch.sides}.union(*older)
-
-
-def undone(group: Group, records: Records, epoch: int) -> tuple[Group, Group]:
-    """Take back the last merge of a group, which is watched: both sides go on as if it had not been.
-
-    Each side's joint filter is taken up again as it was, and takes in what the group's joint filter knows of its
-    robots since, in order of time. Robots out of contact keep their forks until they return.
-
-    Args:
-        group: Not to be used any more.
-        records: Of the team.
-        epoch: Of the restored filters.
-    """
-    now = group.trunk
-    watch = now.watches[-1]
-    number_a, number_b = (side.trunk["number"] for side in watch.sides)
-    records.entries.append(MergeUndone((number_a, number_b, now.number)))
-    restored = []
-    for side in watch.sides:
-        trunk = Branch.from_state(side.trunk)
-        trunk.live, trunk.epoch = tuple(robot for robot in trunk.robots if robot in now.live), epoch
-        wanted = {robot: now.known[robot] for robot in trunk.robots if now.known[robot] > trunk.known[robot]}
-        records.note_replay(trunk, replay(trunk, records.log, wanted, most=None))
-        restored.append(Group(trunk))
-    for branch in group.branches[1:]:
-        _hand_over(branch, restored, records)
-    return restored[0], restored[1]
-
-
-def _hand_over(branch: Branch, restored: list[Group], records: Records) -> None:
-    """Give a fork to the restored group of its robots; one that both need is copied."""
-    homes = [group for group in restored if any(robot in group.robots for robot in branch.live)]
-    for group in homes[1:]:
-        own = tuple(robot for robot in branch.live if robot in group.robots)
-        copied = fork(branch, own, records.new_number(), records.rng)
-        records.copied(branch.number, copied.number)
-        group.branches.append(copied)
-    branch.live = tuple(robot for robot in branch.live if robot in homes[0].robots)
-    homes[0].branches.append(branch)

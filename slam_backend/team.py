@@ -11,7 +11,7 @@ their group go on with a fork of the joint filter, which is told on their return
 import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,24 +21,22 @@ from slam_backend.alignment import Alignment, AlignmentOptions, align_maps
 from slam_backend.attempts import AttemptOptions, AttemptSchedule, PairKey
 from slam_backend.branches import Branch, take_in
 from slam_backend.contacts import check_contacts, reach
-from slam_backend.errors import FloatArray, IntArray, bad_argument, check_int, check_seed
+from slam_backend.errors import IntArray, bad_argument, check_int, check_seed
 from slam_backend.filter import FastSlam
 from slam_backend.filter_options import FilterOptions
-from slam_backend.fusion import check_inliers
-from slam_backend.geometry import inverse
-from slam_backend.groups import Group, undone
+from slam_backend.group_changes import contradicted, merge_groups, undone
+from slam_backend.groups import Group
 from slam_backend.input_log import RobotInput
 from slam_backend.landmark_map import LandmarkMap
 from slam_backend.measurements import Measurements
 from slam_backend.merge_options import MergeOptions
-from slam_backend.merging import inverse_alignment, merge_filters
-from slam_backend.mixture_merging import merge_mixtures
+from slam_backend.merging import inverse_alignment
 from slam_backend.records import Records
-from slam_backend.reports import MapDropped, MergeEvent, PoseEstimate, Renaming, TeamReport
-from slam_backend.watching import Side, Watch, begin_watch
+from slam_backend.reports import MapDropped, MergeEvent, Renaming, TeamReport
+from slam_backend.team_knowledge import TeamKnowledge
 
 
-class TeamSlam:
+class TeamSlam(TeamKnowledge):
     """Visual FastSLAM for a team whose robots do not know where they start.
 
     Args:
@@ -84,134 +82,14 @@ class TeamSlam:
         self._alignment = AlignmentOptions() if alignment is None else alignment
         self._merging = MergeOptions() if merging is None else merging
         self._schedule = AttemptSchedule(AttemptOptions() if attempts is None else attempts, self._alignment)
-        self._groups = [
+        groups = [
             Group(Branch((robot,), (robot,), FastSlam.from_options(1, options, rng), {robot: -1}, robot))
             for robot, rng in enumerate(map(np.random.default_rng, streams))
         ]
-        self._records = Records(count, of_forks)
+        super().__init__(groups, Records(count, of_forks))
         self._numbers = set(range(count))
-        self._num_robots = count
         self._step = 0
         self._epoch = 0
-        self._events: list[MergeEvent] = []
-
-    # ------------------------------------------------------------------ what the team knows
-
-    @property
-    def num_robots(self) -> int:
-        """K."""
-        return self._num_robots
-
-    @property
-    def groups(self) -> tuple[tuple[int, ...], ...]:
-        """The groups, each in ascending order of robots, by ascending first robot."""
-        return tuple(group.robots for group in self._groups)
-
-    @property
-    def events(self) -> tuple[MergeEvent, ...]:
-        """All attempts, merges and undos so far, in order."""
-        return tuple(self._events)
-
-    @property
-    def bytes_sent(self) -> IntArray:
-        """(K,) bytes that each robot has sent; `slam_backend.exchange` says what is counted. A copy."""
-        return self._records.exchange.bytes_sent.copy()
-
-    @property
-    def maps(self) -> tuple[int, ...]:
-        """Per robot the number of the map that it goes by; see `TeamReport`."""
-        return tuple(self._branch(robot).number for robot in range(self._num_robots))
-
-    @property
-    def diagnostics(self) -> tuple[dict[str, float], ...]:
-        """Per robot: ESS, NIS, landmarks held, and its accepted, new and rejected measurements of the last step."""
-        rows: list[dict[str, float]] = []
-        for robot in range(self.num_robots):
-            branch, index = self._find(robot)
-            report = branch.report
-            found = np.empty(0, np.int64) if report is None else report.associations[index]
-            made = np.empty(0, np.int64) if report is None else report.created[index]
-            new = int(np.count_nonzero((found >= 0) & (found == made)))
-            rows.append(
-                {
-                    "ess": self.ess(robot),
-                    "nis": float("nan") if report is None else report.nis,
-                    "landmarks": float(branch.filter.map_size),
-                    "accepted": float(np.count_nonzero(found >= 0) - new),
-                    "new": float(new),
-                    "rejected": float(np.count_nonzero(found < 0)),
-                }
-            )
-        return tuple(rows)
-
-    def members(self, robot: int) -> tuple[int, ...]:
-        """Return the robots whose places the robot's filter knows, itself included, in ascending order.
-
-        They are its group, but for a robot that has been out of contact since before a merge or an undo: it knows of
-        neither. The map frame is the start frame of the first of them.
-        """
-        return self._find(robot)[0].robots
-
-    def mates(self, robot: int) -> tuple[int, ...]:
-        """Return the robots that go by the same filter as this one now, itself included, in ascending order."""
-        return self._find(robot)[0].live
-
-    def keepers(self, robot: int) -> tuple[int, ...]:
-        """Return the robots that go by the joint filter of a robot's group, in ascending order: it merges by them."""
-        return self._group_of(robot).trunk.live
-
-    def ess(self, robot: int) -> float:
-        """Return the effective sample size of the robot's filter at its last step, in [1, M]."""
-        branch = self._find(robot)[0]
-        return float(branch.filter.num_particles) if branch.report is None else branch.report.ess
-
-    def pose(self, robot: int, seen_by: int | None = None) -> PoseEstimate:
-        """Return the robot's pose in the map frame.
-
-        Args:
-            robot: Whose.
-            seen_by: In whose filter, one of whose `members` is the robot; None: its own. Of a robot out of contact
-                others know where it was when contact was lost.
-
-        Raises:
-            ValueError: If a robot does not exist or that filter does not know it.
-        """
-        branch, index = self._find(robot)
-        if seen_by is not None:
-            branch = self._find(seen_by)[0]
-            if robot not in branch.robots:
-                raise bad_argument("robot", f"one of {branch.robots}", robot, "Ask about members of its filter.")
-            index = branch.robots.index(robot)
-        return branch.filter.pose(index)
-
-    def particles(self, robot: int) -> tuple[FloatArray, FloatArray]:
-        """Return the robot's poses (M, 3), map frame of its group, and their log-weights (M,). Copies."""
-        branch, index = self._find(robot)
-        return branch.filter.particles(index)
-
-    def pose_from_start(self, robot: int) -> PoseEstimate:
-        """Return the robot's pose in its own start frame; see `FastSlam.pose_from_start`."""
-        branch, index = self._find(robot)
-        return branch.filter.pose_from_start(index)
-
-    def particles_from_start(self, robot: int) -> FloatArray:
-        """Return the robot's poses (M, 3) in its own start frame; see `FastSlam.particles_from_start`."""
-        branch, index = self._find(robot)
-        return branch.filter.particles_from_start(index)
-
-    def map(
-        self, robot: int, estimate: Literal["best", "mixture"] = "best", min_count: int = 1
-    ) -> LandmarkMap:
-        """Return the map that the robot goes by in its map frame; see `FastSlam.map`."""
-        return self._find(robot)[0].filter.map(estimate, min_count)
-
-    def start_from_group(self, robot: int) -> FloatArray:
-        """Return (3,) the motion from the map frame of the robot's filter to the robot's own start frame.
-
-        It is that of the most probable particle, so that it fits `map(robot)`.
-        """
-        branch, index = self._find(robot)
-        return inverse(branch.filter.start_pose(index))
 
     # ------------------------------------------------------------------ one step
 
@@ -317,30 +195,11 @@ class TeamSlam:
             raise bad_argument("alignment", "a successful Alignment", got, "Align the two maps first.")
         if groups[1].robots < groups[0].robots:
             groups, alignment = groups[::-1], inverse_alignment(alignment)
-        a, b = (group.trunk for group in groups)
-        ids_a, ids_b = a.filter.map().ids, b.filter.map().ids
-        check_inliers(alignment.inliers, len(ids_a), len(ids_b))
-        pairs = np.column_stack([ids_a[alignment.inliers[:, 0]], ids_b[alignment.inliers[:, 1]]])
-        combine = merge_filters if self._merging.method == "particles" else merge_mixtures
-        count = self._merging.merged_particles
-        joint, renamed = combine(a.filter, b.filter, alignment, pairs, self._rng, count)
-        robots, live = a.robots + b.robots, a.live + b.live
-        joint.reorder(np.argsort(robots))
-        number = self._records.new_number()
-        self._epoch += 1
-        trunk = Branch(tuple(sorted(robots)), tuple(sorted(live)), joint, a.known | b.known, number, self._epoch)
-        forks = [branch for group in groups for branch in group.branches[1:]]
-        if self._merging.watch_steps:
-            new_ids = dict(renamed.tolist())
-            older = [*(w.copy() for w in a.watches), *(w.copy(new_ids) for w in b.watches)]
-            sides = (Side(a.get_state()), Side(b.get_state()))
-            before = (a.filter.map("mixture"), b.filter.map("mixture"))
-            fresh = begin_watch(number, alignment, sides, before, renamed, pairs)
-            trunk.watches = [*sorted(older, key=lambda watch: watch.number), fresh]
-        renaming = Renaming(a.robots, b.robots, renamed, (a.number, b.number, number))
-        self._records.entries.append(renaming)
-        self._events.append(MergeEvent(self._step, "merge", a.robots, b.robots, alignment))
-        self._replace(groups, [Group(trunk, forks)])
+        epoch = self._epoch + 1
+        joint, renaming = merge_groups(*groups, alignment, self._merging, self._records, self._rng, epoch)
+        self._epoch = epoch
+        self._events.append(MergeEvent(self._step, "merge", groups[0].robots, groups[1].robots, alignment))
+        self._replace(groups, [joint])
         return renaming
 
     def _replace(self, old: Sequence[Group], new: Sequence[Group]) -> None:
@@ -352,25 +211,13 @@ class TeamSlam:
         """Weigh the evidence about the merges that can still be undone, and undo what contradicts itself."""
         due = self._step % self._merging.watch_every == 0
         for group in list(self._groups):
-            false = self._contradicted(group.trunk) if due and group.trunk.watches else None
+            false = contradicted(group.trunk, self._merging, self._alignment) if due else None
             if false is not None:
                 self._undo(group, false.number)
                 continue
             for branch in group.branches:
                 while branch.watches and branch.watches[0].steps >= self._merging.watch_steps:
                     branch.watches.pop(0)
-
-    def _contradicted(self, trunk: Branch) -> Watch | None:
-        """Return the oldest merge that the evidence contradicts, and that can be undone with those on top of it now."""
-        watches = [w for w in trunk.watches if w.steps <= self._merging.watch_steps and w.together(trunk.live)]
-        joint = trunk.filter.map("mixture") if watches else None
-        for watch in watches:
-            above = [newer for newer in trunk.watches if newer.number > watch.number]
-            if joint is None or not all(newer.together(trunk.live) for newer in above):
-                continue
-            if watch.is_contradicted(joint, self._merging, self._alignment):
-                return watch
-        return None
 
     def _undo(self, group: Group, number: int) -> None:
         """Take back a merge of a group, and first those on top of it, the last one first."""
@@ -420,21 +267,6 @@ class TeamSlam:
     def _descriptor_size(self) -> int:
         """Return the length of the descriptors in use, 0 before the first one."""
         return max(branch.filter.descriptor_size for group in self._groups for branch in group.branches)
-
-    def _group_of(self, robot: int) -> Group:
-        if isinstance(robot, (int, np.integer)) and not isinstance(robot, bool):
-            for group in self._groups:
-                if robot in group.robots:
-                    return group
-        raise bad_argument("robot", f"an index from 0 to {self.num_robots - 1}", robot, "Count robots from 0.")
-
-    def _branch(self, robot: int) -> Branch:
-        return self._group_of(robot).branch_of(robot)
-
-    def _find(self, robot: int) -> tuple[Branch, int]:
-        """Return the branch that the robot goes by, and its place in it."""
-        branch = self._branch(robot)
-        return branch, branch.robots.index(robot)
 
     # ------------------------------------------------------------------ snapshots
 

@@ -1,0 +1,113 @@
+"""Two groups become one, a merge is doubted, and taken back."""
+
+import numpy as np
+
+from slam_backend.alignment import Alignment, AlignmentOptions
+from slam_backend.branches import Branch, fork, replay
+from slam_backend.fusion import check_inliers
+from slam_backend.groups import Group
+from slam_backend.merge_options import MergeOptions
+from slam_backend.merging import merge_filters
+from slam_backend.mixture_merging import merge_mixtures
+from slam_backend.records import Records
+from slam_backend.reports import MergeUndone, Renaming
+from slam_backend.watching import Side, Watch, begin_watch
+
+
+def merge_groups(
+    group_a: Group,
+    group_b: Group,
+    alignment: Alignment,
+    merging: MergeOptions,
+    records: Records,
+    rng: np.random.Generator,
+    epoch: int,
+) -> tuple[Group, Renaming]:
+    """Merge the joint filters of two groups; robots out of contact keep their forks. The merge is then watched.
+
+    Args:
+        group_a: Whose map frame and landmark ids stay. Not to be used any more.
+        group_b: Likewise not.
+        alignment: Motion from b's map frame to a's; `inliers` are rows of the trunks' maps.
+        merging: How.
+        records: Of the team.
+        rng: For pairing and draws.
+        epoch: Of the joint filter.
+
+    Raises:
+        ValueError: If the inliers name rows that do not exist or the same one twice; nothing has changed then.
+    """
+    a, b = group_a.trunk, group_b.trunk
+    ids_a, ids_b = a.filter.map().ids, b.filter.map().ids
+    check_inliers(alignment.inliers, len(ids_a), len(ids_b))
+    pairs = np.column_stack([ids_a[alignment.inliers[:, 0]], ids_b[alignment.inliers[:, 1]]])
+    combine = merge_filters if merging.method == "particles" else merge_mixtures
+    joint, renamed = combine(a.filter, b.filter, alignment, pairs, rng, merging.merged_particles)
+    robots, live = a.robots + b.robots, a.live + b.live
+    joint.reorder(np.argsort(robots))
+    number = records.new_number()
+    trunk = Branch(tuple(sorted(robots)), tuple(sorted(live)), joint, a.known | b.known, number, epoch)
+    if merging.watch_steps:
+        new_ids = dict(renamed.tolist())
+        older = [*(watch.copy() for watch in a.watches), *(watch.copy(new_ids) for watch in b.watches)]
+        sides, before = (Side(a.get_state()), Side(b.get_state())), (a.filter.map("mixture"), b.filter.map("mixture"))
+        fresh = begin_watch(number, alignment, sides, before, renamed, pairs)
+        trunk.watches = [*sorted(older, key=lambda watch: watch.number), fresh]
+    renaming = Renaming(a.robots, b.robots, renamed, (a.number, b.number, number))
+    records.entries.append(renaming)
+    return Group(trunk, [*group_a.branches[1:], *group_b.branches[1:]]), renaming
+
+
+def contradicted(trunk: Branch, merging: MergeOptions, options: AlignmentOptions) -> Watch | None:
+    """Return the oldest merge that the evidence contradicts, and that can be undone with those on top of it now.
+
+    For that, robots of both sides of each of them have to be in contact.
+    """
+    watches = [w for w in trunk.watches if w.steps <= merging.watch_steps and w.together(trunk.live)]
+    if not watches:
+        return None
+    joint = trunk.filter.map("mixture")
+    for watch in watches:
+        above = [newer for newer in trunk.watches if newer.number > watch.number]
+        if all(newer.together(trunk.live) for newer in above) and watch.is_contradicted(joint, merging, options):
+            return watch
+    return None
+
+
+def undone(group: Group, records: Records, epoch: int) -> tuple[Group, Group]:
+    """Take back the last merge of a group, which is watched: both sides go on as if it had not been.
+
+    Each side's joint filter is taken up again as it was, and takes in what the group's joint filter knows of its
+    robots since, in order of time. Robots out of contact keep their forks until they return.
+
+    Args:
+        group: Not to be used any more.
+        records: Of the team.
+        epoch: Of the restored filters.
+    """
+    now = group.trunk
+    watch = now.watches[-1]
+    number_a, number_b = (side.trunk["number"] for side in watch.sides)
+    records.entries.append(MergeUndone((number_a, number_b, now.number)))
+    restored = []
+    for side in watch.sides:
+        trunk = Branch.from_state(side.trunk)
+        trunk.live, trunk.epoch = tuple(robot for robot in trunk.robots if robot in now.live), epoch
+        wanted = {robot: now.known[robot] for robot in trunk.robots if now.known[robot] > trunk.known[robot]}
+        records.note_replay(trunk, replay(trunk, records.log, wanted, most=None))
+        restored.append(Group(trunk))
+    for branch in group.branches[1:]:
+        _hand_over(branch, restored, records)
+    return restored[0], restored[1]
+
+
+def _hand_over(branch: Branch, restored: list[Group], records: Records) -> None:
+    """Give a fork to the restored group of its robots; one that both need is copied."""
+    homes = [group for group in restored if any(robot in group.robots for robot in branch.live)]
+    for group in homes[1:]:
+        own = tuple(robot for robot in branch.live if robot in group.robots)
+        copied = fork(branch, own, records.new_number(), records.rng)
+        records.copied(branch.number, copied.number)
+        group.branches.append(copied)
+    branch.live = tuple(robot for robot in branch.live if robot in homes[0].robots)
+    homes[0].branches.append(branch)

@@ -1,0 +1,157 @@
+"""What a team of filters knows: groups, poses, maps, diagnostics. `TeamSlam` adds what changes them."""
+
+from typing import Literal
+
+import numpy as np
+
+from slam_backend.branches import Branch
+from slam_backend.errors import FloatArray, IntArray, bad_argument
+from slam_backend.geometry import inverse
+from slam_backend.groups import Group
+from slam_backend.landmark_map import LandmarkMap
+from slam_backend.records import Records
+from slam_backend.reports import MergeEvent, PoseEstimate
+
+
+class TeamKnowledge:
+    """All that can be asked of a team.
+
+    Args:
+        groups: One for each robot, in their order.
+        records: Of the team.
+    """
+
+    def __init__(self, groups: list[Group], records: Records) -> None:
+        self._groups = groups
+        self._records = records
+        self._num_robots = len(groups)
+        self._events: list[MergeEvent] = []
+
+    @property
+    def num_robots(self) -> int:
+        """K."""
+        return self._num_robots
+
+    @property
+    def groups(self) -> tuple[tuple[int, ...], ...]:
+        """The groups, each in ascending order of robots, by ascending first robot."""
+        return tuple(group.robots for group in self._groups)
+
+    @property
+    def events(self) -> tuple[MergeEvent, ...]:
+        """All attempts, merges and undos so far, in order."""
+        return tuple(self._events)
+
+    @property
+    def bytes_sent(self) -> IntArray:
+        """(K,) bytes that each robot has sent; `slam_backend.exchange` says what is counted. A copy."""
+        return self._records.exchange.bytes_sent.copy()
+
+    @property
+    def maps(self) -> tuple[int, ...]:
+        """Per robot the number of the map that it goes by; see `TeamReport`."""
+        return tuple(self._branch(robot).number for robot in range(self._num_robots))
+
+    @property
+    def diagnostics(self) -> tuple[dict[str, float], ...]:
+        """Per robot: ESS, NIS, landmarks held, and its accepted, new and rejected measurements of the last step."""
+        rows: list[dict[str, float]] = []
+        for robot in range(self.num_robots):
+            branch, index = self._find(robot)
+            report = branch.report
+            found = np.empty(0, np.int64) if report is None else report.associations[index]
+            made = np.empty(0, np.int64) if report is None else report.created[index]
+            new = int(np.count_nonzero((found >= 0) & (found == made)))
+            rows.append(
+                {
+                    "ess": self.ess(robot),
+                    "nis": float("nan") if report is None else report.nis,
+                    "landmarks": float(branch.filter.map_size),
+                    "accepted": float(np.count_nonzero(found >= 0) - new),
+                    "new": float(new),
+                    "rejected": float(np.count_nonzero(found < 0)),
+                }
+            )
+        return tuple(rows)
+
+    def members(self, robot: int) -> tuple[int, ...]:
+        """Return the robots whose places the robot's filter knows, itself included, in ascending order.
+
+        They are its group, but for a robot that has been out of contact since before a merge or an undo: it knows of
+        neither. The map frame is the start frame of the first of them.
+        """
+        return self._find(robot)[0].robots
+
+    def mates(self, robot: int) -> tuple[int, ...]:
+        """Return the robots that go by the same filter as this one now, itself included, in ascending order."""
+        return self._find(robot)[0].live
+
+    def keepers(self, robot: int) -> tuple[int, ...]:
+        """Return the robots that go by the joint filter of a robot's group, in ascending order: it merges by them."""
+        return self._group_of(robot).trunk.live
+
+    def ess(self, robot: int) -> float:
+        """Return the effective sample size of the robot's filter at its last step, in [1, M]."""
+        branch = self._find(robot)[0]
+        return float(branch.filter.num_particles) if branch.report is None else branch.report.ess
+
+    def pose(self, robot: int, seen_by: int | None = None) -> PoseEstimate:
+        """Return the robot's pose in the map frame.
+
+        Args:
+            robot: Whose.
+            seen_by: In whose filter, one of whose `members` is the robot; None: its own. Of a robot out of contact
+                others know where it was when contact was lost.
+
+        Raises:
+            ValueError: If a robot does not exist or that filter does not know it.
+        """
+        branch, index = self._find(robot)
+        if seen_by is not None:
+            branch = self._find(seen_by)[0]
+            if robot not in branch.robots:
+                raise bad_argument("robot", f"one of {branch.robots}", robot, "Ask about members of its filter.")
+            index = branch.robots.index(robot)
+        return branch.filter.pose(index)
+
+    def particles(self, robot: int) -> tuple[FloatArray, FloatArray]:
+        """Return the robot's poses (M, 3), map frame of its group, and their log-weights (M,). Copies."""
+        branch, index = self._find(robot)
+        return branch.filter.particles(index)
+
+    def pose_from_start(self, robot: int) -> PoseEstimate:
+        """Return the robot's pose in its own start frame; see `FastSlam.pose_from_start`."""
+        branch, index = self._find(robot)
+        return branch.filter.pose_from_start(index)
+
+    def particles_from_start(self, robot: int) -> FloatArray:
+        """Return the robot's poses (M, 3) in its own start frame; see `FastSlam.particles_from_start`."""
+        branch, index = self._find(robot)
+        return branch.filter.particles_from_start(index)
+
+    def map(self, robot: int, estimate: Literal["best", "mixture"] = "best", min_count: int = 1) -> LandmarkMap:
+        """Return the map that the robot goes by in its map frame; see `FastSlam.map`."""
+        return self._find(robot)[0].filter.map(estimate, min_count)
+
+    def start_from_group(self, robot: int) -> FloatArray:
+        """Return (3,) the motion from the map frame of the robot's filter to the robot's own start frame.
+
+        It is that of the most probable particle, so that it fits `map(robot)`.
+        """
+        branch, index = self._find(robot)
+        return inverse(branch.filter.start_pose(index))
+
+    def _group_of(self, robot: int) -> Group:
+        if isinstance(robot, (int, np.integer)) and not isinstance(robot, bool):
+            for group in self._groups:
+                if robot in group.robots:
+                    return group
+        raise bad_argument("robot", f"an index from 0 to {self.num_robots - 1}", robot, "Count robots from 0.")
+
+    def _branch(self, robot: int) -> Branch:
+        return self._group_of(robot).branch_of(robot)
+
+    def _find(self, robot: int) -> tuple[Branch, int]:
+        """Return the branch that the robot goes by, and its place in it."""
+        branch = self._branch(robot)
+        return branch, branch.robots.index(robot)
