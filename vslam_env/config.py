@@ -202,7 +202,7 @@ def preset_config(name: str, sensor: str = "landmark") -> EnvConfig:
     `easy`: odometry noise and bias halved, 10 landmarks a tick detected with probability 0.95, no false points,
     descriptor noise 0.1.
     `hard`: odometry noise and bias doubled, 3 landmarks a tick detected with probability 0.8, 0.1 false points,
-    descriptor noise 0.2.
+    descriptor noise 0.25, and every fifth landmark looks like another one.
     The filters assume the odometry noise of their preset.
     With `sensor="stereo"` only the odometry differs between presets, and filters assume what `stereo_belief` says.
 
@@ -221,13 +221,14 @@ def preset_config(name: str, sensor: str = "landmark") -> EnvConfig:
     standard, motion = EnvConfig(), OdometryModel()
     sensors = {
         "easy": {"max_measurements": 10, "detection_probability": 0.95, "false_points": 0.0, "descriptor_noise": 0.1},
-        "hard": {"max_measurements": 3, "detection_probability": 0.8, "false_points": 0.1, "descriptor_noise": 0.2},
+        "hard": {"max_measurements": 3, "detection_probability": 0.8, "false_points": 0.1, "descriptor_noise": 0.25},
     }
     assumed = {part: scale * getattr(motion, part) for part in ("sigma_along", "sigma_across", "sigma_heading")}
     return standard.replace(
         odometry={f.name: scale * getattr(standard.odometry, f.name) for f in dataclasses.fields(standard.odometry)},
         belief={"filter": {"motion": assumed}},
         landmark_sensor=sensors[name],
+        landmarks={"repeated": 0.2 if name == "hard" else 0.0},
     )
 
 

@@ -7,7 +7,7 @@ import pytest
 
 DOCS = Path(__file__).parents[2] / "docs"
 BLOCK = re.compile(r"^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
-PAGES = ("own_world.md", "own_reward.md", "own_policy.md")
+PAGES = ("environment.md", "own_world.md", "own_reward.md", "own_policy.md")
 
 
 def _programs(page: str) -> list[str]:
@@ -25,6 +25,7 @@ def test_programs_run_as_written(page: str, capsys: pytest.CaptureFixture[str]) 
         exec(compile(program, page, "exec"), {"__name__": "__page__"})
     printed = capsys.readouterr().out
     expected = {
+        "environment.md": r"^$",
         "own_world.md": r"rooms 7 walls, \d+ landmarks",
         "own_reward.md": r"\S+ 0\.0\n$",
         "own_policy.md": r"\d+% of the floor seen, map error 0\.\d\d m",
