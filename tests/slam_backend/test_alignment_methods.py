@@ -9,7 +9,7 @@ from slam_backend import _alignment_kernels as kernels
 from slam_backend import _clique_kernels as cliques
 from slam_backend import _proposals as proposals
 from slam_backend._matching import look_alikes
-from slam_backend.alignment import METHODS, AlignmentOptions, align_maps, candidate_matches, propose_motion
+from slam_backend.alignment import METHODS, REASONS, AlignmentOptions, align_maps, candidate_matches, propose_motion
 from slam_backend.geometry import between, inverse, transform_points
 from slam_backend.landmark_map import LandmarkMap
 
@@ -338,6 +338,39 @@ def test_a_symmetric_place_is_ambiguous_by_geometry_alone() -> None:
     found = align_maps(a, a.moved(TURNED), options=AlignmentOptions(appearance=False))
     assert found.reason == "ambiguous"
     assert found.ratio > 0.9
+
+
+POOR_MAPS = {
+    "empty": np.empty((0, 3)),
+    "one": np.ones((1, 3)),
+    "two": np.eye(3)[:2],
+    "one place": np.ones((15, 3)),
+    "collinear": np.column_stack([np.linspace(0.0, 9.0, 15), np.zeros((15, 2))]),
+    "two places": np.repeat([[0.0, 0.0, 1.0], [7.0, 1.0, 1.0]], 8, axis=0),
+    "far away": np.add(np.random.default_rng(0).uniform(0.0, 9.0, (15, 3)), [1e6, -1e6, 0.0]),
+}
+
+
+@pytest.mark.parametrize("name", POOR_MAPS)
+@pytest.mark.parametrize("method", METHODS)
+def test_poor_maps_are_refused_or_aligned_rightly(method: str, name: str) -> None:
+    """Whatever the method, looks and covariances, degenerate maps raise nothing; what is accepted is right."""
+    rng = np.random.default_rng(21)
+    points = POOR_MAPS[name]
+    for looks in (None, np.ones((len(points), 3))):
+        for variance in (4e-4, 0.0):
+            a = landmark_map(rng, points, looks)
+            a = replace(a, covariances=np.tile(variance * np.eye(3), (len(points), 1, 1)))
+            for options in (AlignmentOptions(), AlignmentOptions(appearance=False, min_inliers=3, min_spread=0.0)):
+                found = align_maps(a, a.moved(inverse(TURNED)), method, options=options)
+                assert found.success == (found.reason == "")
+                if found.success:
+                    apart = transform_points(found.transform, transform_points(inverse(TURNED), points)) - points
+                    assert np.abs(apart).max() < 1e-3
+                else:
+                    assert found.reason in REASONS
+    if name in ("empty", "one", "two", "one place"):
+        assert not found.success
 
 
 def test_large_maps_without_appearance_are_refused() -> None:
