@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from slam_backend.geometry import between, compose
+from slam_backend.geometry import between, compose, wrap_angle
 from vslam_env.world import OdometryNoise, draw_bias, read_odometry
 
 QUIET = OdometryNoise(sigma_distance=0.0, sigma_heading_per_metre=0.0, bias_distance=0.0, bias_heading_per_metre=0.0)
@@ -68,3 +68,21 @@ def test_negative_sigmas_are_refused() -> None:
     """A negative standard deviation is refused by name."""
     with pytest.raises(ValueError, match=r"odometry\.bias_distance: expected a finite number >= 0, got -1"):
         OdometryNoise(bias_distance=-1)
+
+
+def test_readings_are_the_noisy_motions() -> None:
+    """The compiled reading is the formula on arrays: stretched and turned motion in the previous frame."""
+    rng = np.random.default_rng(5)
+    before, after = rng.uniform(-3.0, 3.0, (2, 40, 3))
+    bias, noise = rng.normal(0.0, 0.02, (40, 2)), OdometryNoise()
+    read = read_odometry(before, after, bias, noise, np.random.default_rng(8))
+    draws = np.random.default_rng(8).standard_normal((40, 2))
+    moved = after - before
+    distance = np.hypot(moved[:, 0], moved[:, 1])
+    stretch = 1.0 + bias[:, 0] + noise.sigma_distance * draws[:, 0]
+    turn = distance * (bias[:, 1] + noise.sigma_heading_per_metre * draws[:, 1])
+    angle = 0.5 * turn - before[:, 2]
+    x, y = moved[:, 0], moved[:, 1]
+    expected = np.stack([np.cos(angle) * x - np.sin(angle) * y, np.sin(angle) * x + np.cos(angle) * y], axis=1)
+    np.testing.assert_allclose(read[:, :2], stretch[:, None] * expected, atol=1e-12)
+    np.testing.assert_allclose(read[:, 2], wrap_angle(moved[:, 2] + turn), atol=1e-12)

@@ -1,11 +1,12 @@
 """True odometry noise: what wheel encoders read of the way that robots really went."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
+from slam_backend._jit import jit
 from slam_backend.errors import FloatArray, check_float
-from slam_backend.geometry import wrap_angle
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,18 +61,30 @@ def read_odometry(
     Returns:
         (K, 3) float64 [m, m, rad], each robot's previous frame: (dx, dy, dtheta).
     """
-    moved = np.asarray(poses) - previous_poses
-    distance = np.hypot(moved[:, 0], moved[:, 1])
-    draws = rng.standard_normal((len(moved), 2))
-    stretch = 1.0 + bias[:, 0] + noise.sigma_distance * draws[:, 0]
-    turn = distance * (bias[:, 1] + noise.sigma_heading_per_metre * draws[:, 1])
-    into_robot = 0.5 * turn - previous_poses[:, 2]  # half of the misread turn falls before the middle of the way
-    c, s = np.cos(into_robot), np.sin(into_robot)
-    return np.stack(
-        [
-            stretch * (c * moved[:, 0] - s * moved[:, 1]),
-            stretch * (s * moved[:, 0] + c * moved[:, 1]),
-            wrap_angle(moved[:, 2] + turn),
-        ],
-        axis=1,
-    )
+    before, after = np.asarray(previous_poses, dtype=np.float64), np.asarray(poses, dtype=np.float64)
+    draws = rng.standard_normal((len(after), 2))
+    return _read(before, after, bias, draws, noise.sigma_distance, noise.sigma_heading_per_metre)
+
+
+@jit
+def _read(
+    before: FloatArray,
+    after: FloatArray,
+    bias: FloatArray,
+    draws: FloatArray,
+    sigma_distance: float,
+    sigma_heading_per_metre: float,
+) -> FloatArray:
+    """Return the readings (K, 3) of motions between poses (K, 3) under standard normal draws (K, 2)."""
+    read = np.empty((len(after), 3))
+    for k in range(len(after)):
+        dx, dy, turned = after[k, 0] - before[k, 0], after[k, 1] - before[k, 1], after[k, 2] - before[k, 2]
+        distance = math.hypot(dx, dy)
+        stretch = 1.0 + bias[k, 0] + sigma_distance * draws[k, 0]
+        turn = distance * (bias[k, 1] + sigma_heading_per_metre * draws[k, 1])
+        into_robot = 0.5 * turn - before[k, 2]  # half of the misread turn falls before the middle of the way
+        c, s = math.cos(into_robot), math.sin(into_robot)
+        read[k, 0] = stretch * (c * dx - s * dy)
+        read[k, 1] = stretch * (s * dx + c * dy)
+        read[k, 2] = (turned + turn + math.pi) % (2.0 * math.pi) - math.pi
+    return read
