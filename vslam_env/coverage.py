@@ -13,13 +13,16 @@ from vslam_env.navigation import FREE, GRID_SIZE, cell_of
 
 
 @jit
-def _count_seen(cells: Any, places: Any, seen: Any) -> int:
-    """Mark the places (n,) (flat indices, -1 = outside) whose cell is free; return how many are marked."""
+def _mark_seen(cells: Any, places: Any, floor: Any, seen: Any) -> int:
+    """Mark floor cells `floor` (n,) whose place (n,) in a flat grid is free; return how many were not marked before.
+
+    Places ascend, so that a grid is read from its beginning to its end.
+    """
     count = 0
     for i in range(len(places)):
-        if not seen[i] and places[i] >= 0:
-            seen[i] = cells[places[i]] == FREE
-        count += seen[i]
+        if cells[places[i]] == FREE and not seen[floor[i]]:
+            seen[floor[i]] = True
+            count += 1
     return count
 
 
@@ -42,12 +45,14 @@ class CoverageMeter:
         seen = np.zeros(self._count, np.bool_)
         count = 0
         for cells, places in zip(grids, self._places, strict=True):
-            count = _count_seen(cells.ravel(), places, seen)
+            count += _mark_seen(cells.ravel(), *places, seen)
         return count / max(self._count, 1)
 
 
-def _flat_cells(points: FloatArray) -> NDArray[np.int32]:
-    """Return indices (n,) into a flat grid of the cells in which points (n, 2), start frame, lie; -1 outside."""
+def _flat_cells(points: FloatArray) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Return the cells of a flat grid in which points (n, 2), start frame, lie, ascending, and the points' indices."""
     rows, cols = cell_of(points).T
-    inside = (rows >= 0) & (rows < GRID_SIZE) & (cols >= 0) & (cols < GRID_SIZE)
-    return np.where(inside, rows * GRID_SIZE + cols, -1).astype(np.int32)
+    inside = np.flatnonzero((rows >= 0) & (rows < GRID_SIZE) & (cols >= 0) & (cols < GRID_SIZE))
+    places = (rows * GRID_SIZE + cols)[inside]
+    order = np.argsort(places, kind="stable")
+    return places[order].astype(np.int32), inside[order].astype(np.int32)

@@ -148,3 +148,21 @@ def test_coverage_of_known_floor() -> None:
     row, col = cell_of([0.0, 1.0])
     assert grids[1].cells[row, col] == FREE
     assert np.isclose(meter.share([grid.cells for grid in grids]), 3 / 6)
+
+
+def test_coverage_is_a_union() -> None:
+    """Floor counts once however many robots have seen it, as a plain look-up of each cell in each grid says."""
+    rng = np.random.default_rng(6)
+    centres = rng.uniform(-35.0, 35.0, (500, 2))  # some lie outside a robot's grid
+    starts = rng.uniform(-3.0, 3.0, (3, 3))
+    grids = [SeenGrid() for _ in starts]
+    for grid in grids:
+        for _ in range(60):
+            grid.clear_disc([*rng.uniform(-30.0, 30.0, 2), 0.0], 2.0)
+    seen = np.zeros(len(centres), np.bool_)
+    for start, grid in zip(starts, grids, strict=True):
+        cells = cell_of(transform_points(inverse(start), centres))
+        inside = ((cells >= 0) & (cells < 300)).all(axis=1)
+        seen[inside] |= grid.cells[tuple(cells[inside].T)] == FREE
+    assert 0.05 < seen.mean() < 0.9
+    assert np.isclose(CoverageMeter(centres, starts).share([grid.cells for grid in grids]), seen.mean())
