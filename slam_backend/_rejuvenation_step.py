@@ -64,7 +64,7 @@ class RejuvenationStep:
             self._closed |= 2 * (self._count - self._last_closing) > after  # else it is the same one that goes on
             self._last_closing = self._count
         haste = SOONEST if self._closed else 1
-        sightings = 0 if self._graph is None else self._graph.num_sightings
+        sightings = 0 if self._graph is None else self._graph.num_sightings - smoothing.free_sightings
         return haste * self._waited >= self._every and haste * smoothing.effort * self._read >= sightings
 
     # ------------------------------------------------------------------ when it is due

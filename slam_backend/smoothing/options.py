@@ -20,19 +20,21 @@ class SmoothingOptions:
             than this, and that had not happened for half as many steps; the filter is then rejuvenated a fifth of
             `rejuvenate_every` after the last time. 0: never for that.
         effort: A rejuvenation waits, beyond `rejuvenate_every`, until the measurements read since the last one, times
-            this, are as many as the sightings that must be worked through: the mean effort per step is then bounded,
-            however long the run.
+            this, are as many as the sightings that must be worked through, `free_sightings` apart: the mean effort per
+            step is then bounded, however long the run.
+        free_sightings: So many cost nothing in this account.
         least_ess: Share of M that the effective sample size of the importance weights must reach.
         max_iterations: Of Gauss and Newton.
         tolerance: The descent ends when the cost is expected to fall by less than this (half a squared distance).
     """
 
-    max_keys: int = 120
-    fresh_keys: int = 50
+    max_keys: int = 180
+    fresh_keys: int = 60
     kernel: float = 16.0
     noise_scale: float = 1.0
     closure_after: int = 100
     effort: float = 4.0
+    free_sightings: int = 3000
     least_ess: float = 0.3
     max_iterations: int = 15
     tolerance: float = 0.01
@@ -42,6 +44,7 @@ class SmoothingOptions:
         check_int("fresh_keys", self.fresh_keys, 1, "The newest pose is always fresh.")
         check_int("max_iterations", self.max_iterations, 1, "Ten are enough as a rule.")
         check_float("effort", self.effort, "Use 4; more is dearer.", above=0.0)
+        check_int("free_sightings", self.free_sightings, 0, "Use 0 to count them all.")
         check_int("closure_after", self.closure_after, 0, "Use 0 to look for no closures.")
         check_float("kernel", self.kernel, "Use 0 for plain squares.", at_least=0.0)
         check_float("noise_scale", self.noise_scale, "Use 1 for the noise as it is.", above=0.0)

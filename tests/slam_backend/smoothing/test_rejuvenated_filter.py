@@ -35,7 +35,7 @@ def test_particles_are_drawn_anew_when_it_is_due():
 def test_a_rejuvenation_waits_for_enough_to_read():
     """With little effort allowed it comes later than asked: only when enough was measured for what there is to redo."""
     run = small_run()
-    slam = rejuvenated(run, every=2, smoothing=SmoothingOptions(effort=0.5))
+    slam = rejuvenated(run, every=2, smoothing=SmoothingOptions(effort=0.5, free_sightings=0))
     tried = [slam.step(**reading).rejuvenation is not None for reading in run.readings()]
     graph = slam._rejuvenation.get_state()["graph"]
     assert tried[1]  # at first there is nothing to redo
@@ -167,6 +167,7 @@ def test_bad_options_are_refused(options, message):
         ({"fresh_keys": 0}, "fresh_keys: expected an int >= 1"),
         ({"max_iterations": 0}, "max_iterations: expected an int >= 1"),
         ({"effort": 0.0}, "effort: expected a finite number > 0"),
+        ({"free_sightings": -1}, "free_sightings: expected an int >= 0"),
         ({"closure_after": -1}, "closure_after: expected an int >= 0"),
         ({"kernel": -1.0}, "kernel: expected a finite number >= 0"),
         ({"noise_scale": 0.0}, "noise_scale: expected a finite number > 0"),
