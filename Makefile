@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: demo test lint clean
+.PHONY: demo test lint clients compat clean
 
 demo: $(VENV)/.core  ## three robots explore an office, build maps and merge them; writes a folder under runs/
 	$(BIN)/vslam run --world office --robots 3 --policy frontier --seed 0
@@ -16,6 +16,26 @@ lint: $(VENV)/.dev  ## style, types, and the direction of imports
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+CLIENTS := torchrl rllib agilerl tianshou benchmarl
+
+clients: $(CLIENTS:%=client-%)  ## the page of each learner run as written, each in an environment of its own; gigabytes
+
+client-%: docs/learners/%.md docs/learners/%.txt
+	$(PYTHON) -m venv $(VENV)-clients/$*
+	$(VENV)-clients/$*/bin/python -m pip install --quiet --disable-pip-version-check --editable . --requirement docs/learners/$*.txt
+	$(VENV)-clients/$*/bin/python tests/docs/run_page.py docs/learners/$*.md
+
+compat: compat-opencv compat-pettingzoo  ## all tests with an older OpenCV, and with what RLlib and AgileRL pin
+
+compat-opencv: OTHER := opencv-python-headless==4.14.0.94
+compat-pettingzoo: OTHER := gymnasium==1.2.2 pettingzoo==1.26.1
+
+compat-%: pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)-compat/$*
+	$(VENV)-compat/$*/bin/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[dev]"
+	$(VENV)-compat/$*/bin/python -m pip install --quiet --disable-pip-version-check $(OTHER)
+	$(VENV)-compat/$*/bin/python -m pytest
 
 $(VENV)/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit("vslam_env needs Python >= 3.11, but $(PYTHON) is " + sys.version.split()[0] + ": say make PYTHON=python3.11" if sys.version_info < (3, 11) else 0)'
@@ -30,5 +50,5 @@ $(VENV)/.dev: pyproject.toml constraints.txt | $(VENV)/bin/python
 	touch $@ $(VENV)/.core
 
 clean:
-	rm -rf $(VENV) build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
+	rm -rf $(VENV) $(VENV)-clients $(VENV)-compat build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
 	find . -name __pycache__ -prune -exec rm -rf {} +

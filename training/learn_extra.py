@@ -15,5 +15,5 @@ def need_learner() -> None:
     """
     missing = [name for name in NEEDED if find_spec(name) is None]
     if missing:
-        cure = "Install them: pip install torch==2.13.0, which is small, then pip install 'vslam-env[train]'."
+        cure = "Install them: pip install torch==2.13.0, which is small, then pip install '.[train]' in a checkout."
         raise bad_argument("train", "the packages of the extra 'train'", f"no {', '.join(missing)}", cure)

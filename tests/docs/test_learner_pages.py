@@ -1,0 +1,37 @@
+"""Pages of learners: each has what `make clients` needs, and the one whose learner is installed here runs."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+BLOCK = re.compile(r"^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
+
+
+def _programs(page: Path) -> list[str]:
+    return BLOCK.findall(page.read_text(encoding="utf-8"))
+
+
+def test_each_learner_has_what_its_target_needs() -> None:
+    """The Makefile, the page on training and the folder name the same learners; each page has a program."""
+    named = re.search(r"^CLIENTS := (.*)$", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
+    assert named is not None
+    clients = set(named.group(1).split())
+    folder = ROOT / "docs" / "learners"
+    assert {page.stem for page in folder.glob("*.md")} == {file.stem for file in folder.glob("*.txt")} == clients
+    linked = re.findall(r"\(learners/(\w+)\.md\)", (ROOT / "docs" / "training.md").read_text(encoding="utf-8"))
+    assert set(linked) == clients
+    for client in clients:
+        (program,) = _programs(folder / f"{client}.md")
+        compile(program, client, "exec")
+        assert "torch==2.13.0" in (folder / f"{client}.txt").read_text(encoding="utf-8").split()
+
+
+@pytest.mark.slow
+def test_the_program_of_stable_baselines3_runs(capsys: pytest.CaptureFixture[str]) -> None:
+    """The program on the page on training runs as written."""
+    pytest.importorskip("stable_baselines3", reason="stable-baselines3 is not installed: pip install .[train]")
+    (program,) = _programs(ROOT / "docs" / "training.md")
+    exec(compile(program, "training.md", "exec"), {"__name__": "__page__"})
+    assert capsys.readouterr().out == "4 slots, 80 decisions\n"
