@@ -9,7 +9,7 @@ points and wrong descriptors; or episodes of the environment in all its families
 twin. Numbers of robots and contacts change from run to run. A merge is false if it is more than 0.5 m or 5 degrees off;
 it counts if it is in force 200 steps later or at the end. With `--forced` robots do not merge by themselves: once two
 maps are large enough they are merged by that wrong motion which fits them best, and the question is how many of these
-the team undoes, and when.
+the team undoes, and when; `--shift 0.6` takes the true motion shifted by so many metres instead.
 """
 
 import os
@@ -105,7 +105,7 @@ def make_env(seed: int, cycles: int, forced: bool) -> ExplorationEnv:
     return ExplorationEnv(config)
 
 
-def play_environment(seed: int, cycles: int, forced: bool) -> list[MergeFate]:
+def play_environment(seed: int, cycles: int, forced: bool, shift: float | None) -> list[MergeFate]:
     """Run one episode and return what became of its merges."""
     env = make_env(seed, cycles, forced)
     rng = np.random.default_rng([seed, 18])
@@ -113,7 +113,7 @@ def play_environment(seed: int, cycles: int, forced: bool) -> list[MergeFate]:
     observations, _ = env.reset(seed=seed)
     while env.agents:
         if forced and not env.events:
-            force(env, rng)
+            force(env, rng, shift)
         actions = {
             agent: policy.act(observations[agent], env.belief(agent), rng)
             for agent, policy in zip(env.agents, policies, strict=True)
@@ -124,7 +124,7 @@ def play_environment(seed: int, cycles: int, forced: bool) -> list[MergeFate]:
     return fates(env.events, env.true_start_poses, placed, seed, env.config.world, alike, env.episode.tick)
 
 
-def play_aisles(seed: int, cycles: int, forced: bool) -> list[MergeFate]:
+def play_aisles(seed: int, cycles: int, forced: bool, shift: float | None) -> list[MergeFate]:
     """Let a team live through one stereo run of `cycles` steps and return what became of its merges."""
     rng = np.random.default_rng([seed, 17])
     robots, look_alikes = int(rng.integers(2, 5)), int(rng.integers(1, 4))
@@ -145,18 +145,27 @@ def play_aisles(seed: int, cycles: int, forced: bool) -> list[MergeFate]:
             up = up ^ (change | change.T)
         team.step(reading["odometry"], reading["measurements"], up)
         if forced and not team.events and min(len(team.map(robot)) for robot in range(2)) >= ENOUGH:
-            team.merge(0, 1, wrong_alignment(starts, team.map(0), team.map(1), rng))
+            team.merge(0, 1, forced_alignment(starts, team.map(0), team.map(1), rng, shift))
     placed = [inverse(team.start_from_group(robot)) for robot in range(robots)]
     return fates(team.events, starts, placed, seed, "aisles", f"classes of {look_alikes}", run.num_steps)
 
 
-def force(env: ExplorationEnv, rng: np.random.Generator) -> None:
+def force(env: ExplorationEnv, rng: np.random.Generator, shift: float | None) -> None:
     """Merge robots 0 and 1 wrongly, if their maps are large enough."""
     belief, ledger = env.episode.belief, env.episode.ledger
     map_a, map_b = belief.filter_map(0), belief.filter_map(1)
     if min(len(map_a), len(map_b)) < ENOUGH:
         return
-    ledger.rename(belief.merge(0, 1, wrong_alignment(env.true_start_poses, map_a, map_b, rng)))
+    ledger.rename(belief.merge(0, 1, forced_alignment(env.true_start_poses, map_a, map_b, rng, shift)))
+
+
+def forced_alignment(
+    starts: FloatArray, map_a: LandmarkMap, map_b: LandmarkMap, rng: np.random.Generator, shift: float | None
+) -> Alignment:
+    """Return a wrong alignment of the maps of robots 0 and 1: off by `shift` [m], or else the one that fits best."""
+    if shift is not None:
+        return shifted_alignment(starts, map_a, map_b, rng, shift)
+    return wrong_alignment(starts, map_a, map_b, rng)
 
 
 def wrong_alignment(starts: FloatArray, map_a: LandmarkMap, map_b: LandmarkMap, rng: np.random.Generator) -> Alignment:
@@ -178,15 +187,30 @@ def wrong_alignment(starts: FloatArray, map_a: LandmarkMap, map_b: LandmarkMap, 
         error = between(truth, motion)
         if not is_false_merge(float(np.hypot(*error[:2])), float(abs(np.degrees(error[2])))):
             continue
-        found = coinciding(points_a, points_b @ rotation(angle).T + motion[:2])
+        found = coinciding(points_a, points_b, motion)
         if len(found) > len(pairs):
             best, pairs = motion, found
-    return Alignment(True, "", *best.tolist(), np.diag([1e-3, 1e-3, 1e-4]), pairs, 0.0)
+    return claimed(best, pairs)
 
 
-def coinciding(points_a: FloatArray, points_b: FloatArray) -> IntArray:
-    """Return the rows (a, b) of points that are each other's nearest and lie within `COINCIDENCE`."""
-    distances = np.linalg.norm(points_a[:, None] - points_b, axis=2)
+def shifted_alignment(
+    starts: FloatArray, map_a: LandmarkMap, map_b: LandmarkMap, rng: np.random.Generator, metres: float
+) -> Alignment:
+    """Return the true motion shifted by so many metres in any direction, with the pairs that this lays together."""
+    angle = rng.uniform(-np.pi, np.pi)
+    motion = between(*starts[:2]) + metres * np.array([np.cos(angle), np.sin(angle), 0.0])
+    return claimed(motion, coinciding(map_a.means[:, :2], map_b.means[:, :2], motion))
+
+
+def claimed(motion: FloatArray, pairs: IntArray) -> Alignment:
+    """Return an alignment that is sure of its motion (3,) and pairs (k, 2)."""
+    return Alignment(True, "", *motion.tolist(), np.diag([1e-3, 1e-3, 1e-4]), pairs, 0.0)
+
+
+def coinciding(points_a: FloatArray, points_b: FloatArray, motion: FloatArray) -> IntArray:
+    """Return the rows (a, b) of points that, b's moved, are each other's nearest and lie within `COINCIDENCE`."""
+    moved = points_b @ rotation(motion[2]).T + motion[:2]
+    distances = np.linalg.norm(points_a[:, None] - moved, axis=2)
     nearest = distances.argmin(axis=1)
     rows = np.arange(len(points_a))
     mutual = (distances.argmin(axis=0)[nearest] == rows) & (distances[rows, nearest] < COINCIDENCE)
@@ -253,12 +277,15 @@ def main(
     cycles: Annotated[int | None, typer.Option(help="Steps of a run.", show_default="400, episodes 1500")] = None,
     kind: Annotated[str, typer.Option(help="aisles or environment.")] = "aisles",
     forced: Annotated[bool, typer.Option(help="Merge wrongly on purpose.")] = False,
+    shift: Annotated[float | None, typer.Option(help="Forced merges are off by these metres and not turned.")] = None,
     json_file: Annotated[Path | None, typer.Option("--json", help="Write all figures to this file.")] = None,
 ) -> None:
     """Run the soak and print it."""
     if not minutes > 0.0:
         raise bad_argument("minutes", "a number above 0", minutes, "Run for some time.")
     check_choice("kind", kind, KINDS)
+    if shift is not None and not (forced and shift >= 0.0):
+        raise bad_argument("shift", "metres, with --forced", shift, "Add --forced, or leave it out.")
     cycles = (400 if kind == "aisles" else 1500) if cycles is None else cycles
     check_int("cycles", cycles, 2, "Give a number of steps.")
     check_int("first_seed", first_seed, 0, "Seeds are not negative.")
@@ -269,7 +296,7 @@ def main(
     for seed in count(first_seed):
         if time.monotonic() - begin > 60.0 * minutes:
             break
-        found = (play_aisles if kind == "aisles" else play_environment)(seed, cycles, forced)
+        found = (play_aisles if kind == "aisles" else play_environment)(seed, cycles, forced, shift)
         merges, played = merges + found, played + 1
         for merge in found:
             fate = (

@@ -59,13 +59,16 @@ class AttemptSchedule:
         self._alignment = alignment
         self._records: dict[PairKey, _Record] = {}
         self._proposed: dict[PairKey, set[tuple[int, int]]] = {}
+        self._bars: list[tuple[PairKey, int]] = []
 
     def is_due(self, step: int) -> bool:
         """Tell whether a pair may try at this step."""
         return self._options.enabled and step % self._options.every == self._options.every - 1
 
     def may_try(self, pair: PairKey, step: int) -> bool:
-        """Tell whether the pair's wait is over."""
+        """Tell whether the pair's wait is over, and nothing bars it."""
+        if any(step < until and _touches(pair, barred) for barred, until in self._bars):
+            return False
         return pair not in self._records or step >= self._records[pair].next_step
 
     def choose(self, maps: Mapping[PairKey, tuple[LandmarkMap, LandmarkMap]], step: int) -> PairKey | None:
@@ -101,14 +104,22 @@ class AttemptSchedule:
         record.wait = min(2 * record.wait, self._options.longest_wait)
 
     def bar(self, pair: PairKey, until: int) -> None:
-        """Keep a pair from trying before this step."""
-        self._records.setdefault(pair, _Record(self._options.every)).next_step = until
+        """Keep a pair, and every pair of groups that robots of either side belong to, from trying before this step."""
+        self._bars = [*(bar for bar in self._bars if bar[0] != pair), (pair, until)]
 
     def get_state(self) -> dict[str, Any]:
         """Return the options and a copy of the memory."""
-        return {"options": self._options, "alignment": self._alignment, "records": copy.deepcopy(self._records)}
+        memory = {"records": copy.deepcopy(self._records), "bars": tuple(self._bars)}
+        return {"options": self._options, "alignment": self._alignment} | memory
 
     def set_state(self, state: Mapping[str, Any]) -> None:
         """Take over options and a memory that `get_state` returned."""
         self._options, self._alignment = state["options"], state["alignment"]
         self._records = copy.deepcopy(state["records"])
+        self._bars = list(state["bars"])
+
+
+def _touches(pair: PairKey, barred: PairKey) -> bool:
+    """Tell whether one group of a pair has robots of the one barred side, and the other of the other."""
+    one, other = set(pair[0]), set(pair[1])
+    return any(one & set(a) and other & set(b) for a, b in (barred, barred[::-1]))

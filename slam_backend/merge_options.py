@@ -28,7 +28,7 @@ class MergeOptions:
     method: Literal["particles", "mixture"] = "particles"
     merged_particles: int | None = None
     watch_steps: int = 200
-    watch_every: int = 10
+    watch_every: int = 20
     barred_steps: int = 200
     max_moved: float = 0.2
 

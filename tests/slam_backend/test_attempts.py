@@ -47,6 +47,20 @@ def test_a_refused_pair_waits_twice_as_long_each_time() -> None:
     assert waits == [25, 50, 100, 200, 200, 200]
 
 
+def test_a_barred_pair_does_not_try_in_larger_groups_either() -> None:
+    """Robots of the one side do not try with robots of the other until the bar ends; others do, and each side may."""
+    plan = schedule()
+    plan.bar(((0,), (1, 3)), 60)
+    barred: list[PairKey] = [((0,), (1, 3)), ((0, 2), (1, 3)), ((0,), (3,)), ((1,), (0, 2))]
+    free: list[PairKey] = [((0,), (2,)), ((1, 3), (2,)), ((1,), (3,))]
+    assert not any(plan.may_try(pair, 59) for pair in barred)
+    assert all(plan.may_try(pair, 59) for pair in free)
+    assert all(plan.may_try(pair, 60) for pair in barred)
+    other = schedule()
+    other.set_state(plan.get_state())
+    assert not other.may_try(barred[0], 59)
+
+
 def test_a_refused_pair_needs_new_candidates() -> None:
     """The same candidates are not tried again, nor with two new ones; with three new ones they are."""
     plan = schedule()
