@@ -13,6 +13,7 @@ from slam_backend.filter_options import FilterOptions
 from slam_backend.fusion import fuse_landmarks, fuse_maps
 from slam_backend.landmark_map import LandmarkMap
 from slam_backend.measurements import Measurements
+from slam_backend.merge_options import MergeOptions
 from slam_backend.motion import OdometryModel
 from slam_backend.reports import MergeEvent, PoseEstimate, Renaming, StepReport, TeamReport
 from slam_backend.team import TeamSlam
@@ -29,6 +30,7 @@ __all__ = [
     "LandmarkMap",
     "Measurements",
     "MergeEvent",
+    "MergeOptions",
     "OdometryModel",
     "PoseEstimate",
     "Renaming",
