@@ -14,7 +14,9 @@ from slam_backend.landmark_map import LandmarkMap
 
 RIVALS = 5  # most promising rivals that are refined
 FALSE_ALARMS = 1e-3  # expected number of sets of look-alikes that fit by chance as well
-MIRRORED = 3, 0.1  # the mirror image is believed if it fits so many more matches, and this share of the inliers more
+# The mirror image is believed if it fits so many more matches, and these are a tenth of the inliers' number, or three
+# tenths of all that the motion leaves unexplained.
+MIRRORED, OF_INLIERS, OF_REST = 3, 0.1, 0.3
 
 
 def one_to_one(matches: IntArray) -> bool:
@@ -120,7 +122,8 @@ def is_mirrored(
     image[:, 12:] = (mirror @ full @ mirror)[:, upper[0], upper[1]]
     fits = fitting(image, matches, pose, options.position_floor**2, options.position_gate)
     more = np.count_nonzero(fits & ~inside) - np.count_nonzero(inside & ~fits)
-    return bool(more >= max(MIRRORED[0], MIRRORED[1] * np.count_nonzero(inside)))
+    share = min(OF_INLIERS * np.count_nonzero(inside), OF_REST * np.count_nonzero(~inside))
+    return bool(more >= max(MIRRORED, share))
 
 
 def differ(poses: FloatArray, pose: FloatArray, centre_b: FloatArray) -> BoolArray:

@@ -257,6 +257,9 @@ def test_mirrored_corridors_are_refused(method: str) -> None:
     assert not align_maps(a, mirrored, method).success
     assert align_maps(a, a.moved(TURNED), method).success
     assert align_maps(a, mirrored).reason == "mirrored"
+    poor = corridor(rng, 95, 5)  # nearly all on one wall
+    assert align_maps(poor, replace(poor, means=poor.means * [1.0, -1.0, 1.0])).reason == "mirrored"
+    assert align_maps(poor, poor.moved(TURNED), method).success
 
 
 def test_a_shared_cluster_makes_no_rival() -> None:
