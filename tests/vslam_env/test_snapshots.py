@@ -251,3 +251,22 @@ def test_files_are_whole_or_not_there(tmp_path: Path) -> None:
     assert [file.name for file in tmp_path.iterdir()] == ["state"]
     with pytest.raises(ValueError, match="path: expected a file that can be written"):
         save_state(state, tmp_path / "nowhere" / "state")
+
+
+@pytest.mark.parametrize(
+    ("changes", "steps"),
+    [
+        ({"comm_range": 4.0, "comm_loss": 0.3, "oracle_merge": True}, 60),
+        pytest.param({"sensor": "stereo"}, 8, marks=pytest.mark.slow),
+    ],
+)
+def test_radios_and_eyes_go_on(changes: dict[str, Any], steps: int) -> None:
+    """Robots that lose contact and robots that see with rendered eyes go on bit by bit as well."""
+    env = _env(**changes)
+    env.reset(seed=5, options={"start_poses": MEETING})
+    _go_on(env, steps // 2)
+    state = pickle.loads(pickle.dumps(env.get_state()))
+    other = _env(**changes)
+    other.reset(seed=8)
+    other.set_state(state)
+    assert _go_on(other, steps) == _go_on(env, steps)
