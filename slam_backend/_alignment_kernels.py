@@ -172,6 +172,20 @@ def fitted_variance(table: FloatArray, members: BoolArray, pose: FloatArray, flo
 
 
 @jit
+def unexplained(table: FloatArray, members: BoolArray, pose: FloatArray, floor: float) -> float:
+    """Return by how much, at least 1, the members' median D exceeds that of 3 degrees of freedom (a Birge ratio).
+
+    Above 1 only by chance, and where covariances are more over-confident than any variance that may be added explains.
+    """
+    chosen = table[members]
+    k = len(chosen)
+    if k < 2:
+        return 1.0
+    ratio = np.median(squared_distances(chosen, pose, floor)) / (MEDIAN_CHI2_3 * (1.0 - 1.0 / k))
+    return ratio if ratio > 1.0 + CHANCE_EXCESS / math.sqrt(k) else 1.0
+
+
+@jit
 def drop_unverified(table: FloatArray, members: BoolArray, pose: FloatArray, floor: float) -> None:
     """Take out, one after the other, members of which one to three say more about the rotation than all others.
 

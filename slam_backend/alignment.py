@@ -118,7 +118,8 @@ def align_maps(
         return Alignment.refused("mirrored", ratio)
     if extent(points_b) < options.min_spread:
         return Alignment.refused("poorly spread", ratio)
-    covariance = covariance_of(kernels.information(table, members, pose, variance)[0])
+    contradiction = kernels.unexplained(table, members, pose, variance)
+    covariance = covariance_of(kernels.information(table, members, pose, variance)[0] / contradiction)
     influence = kernels.largest_influence(table, members, pose, variance)
     if covariance is None or not is_certain(covariance, influence, options):
         return Alignment.refused("too uncertain", ratio)

@@ -232,6 +232,19 @@ def test_a_motion_that_hangs_on_one_match_is_not_believed() -> None:
     assert align_maps(wide, b, options=lax).reason == "too uncertain"
 
 
+def test_what_no_variance_explains_widens_the_covariance() -> None:
+    """Residuals three times as large as may be explained have a Birge ratio of nine; those of chance have one."""
+    rng = np.random.default_rng(22)
+    table = np.zeros((400, 18))
+    table[:, 3:6] = rng.uniform(0.0, 9.0, (400, 3))
+    everyone, nobody = np.ones(400, np.bool_), np.zeros(400, np.bool_)
+    for factor, ratio in ((3.0, 9.0), (1.0, 1.0), (0.1, 1.0)):
+        table[:, :3] = table[:, 3:6] + 0.1 * factor * rng.standard_normal((400, 3))
+        # The median of 400 has a standard deviation of 6 %.
+        assert kernels.unexplained(table, everyone, np.zeros(3), 0.01) == pytest.approx(ratio, rel=0.25)
+    assert kernels.unexplained(table, nobody, np.zeros(3), 0.01) == 1.0
+
+
 def test_members_without_extent_are_left_alone() -> None:
     """Coincident landmarks say nothing about the rotation, and none of them is taken out for it."""
     table = np.zeros((5, 18))
