@@ -15,6 +15,7 @@ from simulated_team import SIZE, SimulatedTeam
 from slam_backend.branches import MOST_REPLAYED
 from slam_backend.contacts import reach
 from slam_backend.exchange import LANDMARK_BYTES, POINT_BYTES, POSE_BYTES
+from slam_backend.existence import ExistenceModel
 from slam_backend.geometry import between, wrap_angle
 from slam_backend.merge_options import MergeOptions
 from slam_backend.reports import LandmarksCreated
@@ -72,14 +73,17 @@ def test_a_group_in_a_chain_goes_by_one_filter() -> None:
 # ---------------------------------------------------------------------- exactly, where nothing else happened
 
 
-@pytest.mark.parametrize("gap", [1, 20, 45])
-def test_a_replay_gives_what_unbroken_contact_would_have_given(gap: int) -> None:
+@pytest.mark.parametrize(
+    ("gap", "options"),
+    [(1, {}), (20, {}), (45, {}), (45, {"existence": ExistenceModel()}), (45, {"rejuvenate_every": 25})],
+)
+def test_a_replay_gives_what_unbroken_contact_would_have_given(gap: int, options: dict[str, Any]) -> None:
     """Where only the robot out of contact reads something, the joint filter ends bit for bit as if never broken.
 
     Particles, maps, weights, random stream and logs agree: what is read is taken in once, in order, later.
     """
     simulation = SimulatedTeam(num_robots=2, seed=5)
-    team, twin = (merged_team(copy.deepcopy(simulation), merging=FINAL) for _ in range(2))
+    team, twin = (merged_team(copy.deepcopy(simulation), merging=FINAL, **options) for _ in range(2))
     simulation.run(simulation.build(), 30)
     away = readings_of(simulation, gap, silent=(0,))
     back = readings_of(simulation, 1 + gap // (MOST_REPLAYED - 1), silent=(0,))
