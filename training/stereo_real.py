@@ -13,7 +13,7 @@ from slam_backend.frontend.descriptors import describe_points, nearest
 from slam_backend.frontend.images import Image
 from slam_backend.readers.calibration import Eye, Rectifier
 from slam_backend.readers.kitti_images import read_grey
-from training.bench_stereo import guard_rows
+from training.stereo_quality import guard_rows
 
 ALOE_SPAN = 3740.0 * 0.16  # focal length [px] times baseline [m] of the Middlebury rig of 2006
 ALOE_DISPARITIES = (15.0, 260.0)

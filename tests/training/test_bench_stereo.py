@@ -6,16 +6,9 @@ import pytest
 from typer.testing import CliRunner
 
 from slam_backend.frontend import GUARDS, StereoFrontEnd
-from training.bench_stereo import (
-    StereoBenchConfig,
-    camera_of,
-    guard_rows,
-    quality_row,
-    retrieval,
-    second_looks,
-    speed_row,
-)
+from training.bench_stereo import StereoBenchConfig, camera_of, speed_row
 from training.cli import app
+from training.stereo_quality import guard_rows, quality_row, retrieval, second_looks
 from training.stereo_real import aloe_rows, chessboard, planar_scores
 from training.stereo_scenes import WALL, Scene, panel_hall, wall_pose
 from training.stereo_tables import markdown
