@@ -16,16 +16,17 @@ from numpy.typing import ArrayLike
 from slam_backend import _kernels
 from slam_backend._best_map import best_map
 from slam_backend._existence_step import ExistenceStep
-from slam_backend._frame_buffers import UPPER, FrameBuffers, Turn
+from slam_backend._frame_buffers import FrameBuffers, Turn
 from slam_backend._particle_maps import ParticleMaps, aligned
 from slam_backend._rejuvenation_step import RejuvenationStep, write_maps
+from slam_backend._start_frames import seen_from_starts
 from slam_backend._step_input import check_step
 from slam_backend.adaptation import AdaptiveParticles, next_num_particles
 from slam_backend.camera import StereoCamera
 from slam_backend.errors import FloatArray, IntArray, bad_argument, check_array, check_choice, check_int, check_seed
 from slam_backend.existence import ExistenceModel
 from slam_backend.filter_options import FilterOptions
-from slam_backend.geometry import between, compose, rotate_covariances, rotation, wrap_angle
+from slam_backend.geometry import between, compose, rotate_covariances, wrap_angle
 from slam_backend.landmark_map import LandmarkMap
 from slam_backend.measurements import Measurements
 from slam_backend.motion import OdometryModel
@@ -232,13 +233,8 @@ class FastSlam:
             estimate = self._estimates[robot]
             pose = between(starts[:, 0], estimate.mean)
             return PoseEstimate(pose, rotate_covariances(-starts[2, 0], estimate.covariance))
-        turn = np.zeros((starts.shape[1], 3, 3))
-        turn[:, :2, :2], turn[:, 2, 2] = rotation(-starts[2]), 1.0
-        covariances = turn @ self._columns(self._covariances[robot])[:, UNPACK] @ turn.transpose(0, 2, 1)
-        means = np.ascontiguousarray(between(starts.T, self._columns(self._means[robot])).T)
-        padding = ((0, 0), (0, self._maps.padded - means.shape[1]))
-        packed = np.pad(np.ascontiguousarray(covariances[:, *UPPER].T), padding)
-        return _mixture(np.pad(means, padding), packed, self.weights)
+        seen = seen_from_starts(self._starts[robot], self._means[robot], self._covariances[robot], self.num_particles)
+        return _mixture(*seen, self.weights)
 
     def particles_from_start(self, robot: int = 0) -> FloatArray:
         """Return a robot's poses (M, 3), each seen from where it started in that particle."""

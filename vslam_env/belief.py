@@ -171,7 +171,7 @@ class TeamBelief:
         own, start, slots = self._estimates[robot], self._starts[robot], self._slots[robot]
         mates = [mate for mate in self._members[robot] if mate != robot]
         seen = [self._team.pose(mate, seen_by=robot) for mate in mates]
-        poses = compose(start, np.array([estimate.mean for estimate in seen])) if mates else NO_POSES
+        poses = np.array([compose(start, estimate.mean) for estimate in seen]) if mates else NO_POSES
         squares = [0.5 * (estimate.covariance[0, 0] + estimate.covariance[1, 1]) for estimate in seen]
         return Glimpse(
             robot=robot,

@@ -1,7 +1,8 @@
 import numpy as np
 
+from slam_backend._start_frames import seen_from_starts
 from slam_backend.filter import UNPACK, FastSlam
-from slam_backend.geometry import between, compose, wrap_angle
+from slam_backend.geometry import between, compose, rotation, wrap_angle
 from slam_backend.measurements import Measurements
 
 STARTS = np.array([[1.0, -2.0, 0.7], [4.0, 3.0, -2.0]])
@@ -45,3 +46,20 @@ def test_unknown_starts_do_not_blur_the_pose() -> None:
     difference = slam.particles_from_start(1) - particles
     difference[:, 2] = wrap_angle(difference[:, 2])
     assert np.allclose(difference, 0.0, atol=1e-12)
+
+
+def test_the_change_of_frame_is_that_of_matrices() -> None:
+    """Each particle's mean and covariance, seen from its start, are what rotation matrices make of them."""
+    rng = np.random.default_rng(7)
+    starts, means = rng.uniform(-3.0, 3.0, (2, 3, 11))
+    roots = rng.normal(0.0, 0.3, (11, 3, 3))
+    covariances = roots @ roots.transpose(0, 2, 1)
+    packed = covariances[:, *np.triu_indices(3)].T
+    seen, spread = seen_from_starts(starts, means, np.ascontiguousarray(packed), 9)
+    for m in range(9):
+        np.testing.assert_allclose(seen[:, m], between(starts[:, m], means[:, m]), atol=1e-12)
+        turn = np.eye(3)
+        turn[:2, :2] = rotation(-starts[2, m])
+        np.testing.assert_allclose(spread[UNPACK, m], turn @ covariances[m] @ turn.T, atol=1e-12)
+    assert not seen[:, 9:].any()
+    assert not spread[:, 9:].any()
