@@ -18,7 +18,7 @@ def _run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
     "command",
     [
         (), ("replay",), ("replay", "mrclam"), ("replay", "victoria"), ("replay", "kitti"), ("bench",),
-        ("bench", "filter"),
+        ("bench", "filter"), ("bench", "train"), ("train",), ("evaluate",),
     ],
 )  # fmt: skip
 def test_every_command_explains_itself(
