@@ -24,6 +24,8 @@ class SmoothingOptions:
             step is then bounded, however long the run.
         free_sightings: So many cost nothing in this account.
         least_ess: Share of M that the effective sample size of the importance weights must reach.
+        more_draws: Where M paths do not reach it, but so many times M may, so many are drawn and M of them chosen by
+            their weights; 1: never.
         max_iterations: Of Gauss and Newton.
         tolerance: The descent ends when the cost is expected to fall by less than this (half a squared distance).
     """
@@ -36,12 +38,14 @@ class SmoothingOptions:
     effort: float = 4.0
     free_sightings: int = 3000
     least_ess: float = 0.3
+    more_draws: int = 8
     max_iterations: int = 15
     tolerance: float = 0.01
 
     def __post_init__(self) -> None:
         check_int("max_keys", self.max_keys, 2, "Two poses are the least that can be smoothed.")
         check_int("fresh_keys", self.fresh_keys, 1, "The newest pose is always fresh.")
+        check_int("more_draws", self.more_draws, 1, "Use 1 to draw no more than M.")
         check_int("max_iterations", self.max_iterations, 1, "Ten are enough as a rule.")
         check_float("effort", self.effort, "Use 4; more is dearer.", above=0.0)
         check_int("free_sightings", self.free_sightings, 0, "Use 0 to count them all.")

@@ -11,7 +11,7 @@ from slam_backend.errors import FloatArray, IntArray
 from slam_backend.geometry import wrap_angle
 from slam_backend.log_arrays import EXACT, LogArrays
 from slam_backend.motion import OdometryModel
-from slam_backend.resampling import effective_sample_size
+from slam_backend.resampling import effective_sample_size, systematic
 from slam_backend.smoothing.coarsening import coarsened, compacted
 from slam_backend.smoothing.duplicates import find_duplicates, without_duplicates
 from slam_backend.smoothing.graph import PathGraph, extended, first_rows
@@ -45,7 +45,7 @@ class Particles:
         poses, starts: (K, 3, M) float64 [m, m, rad], map frame. Newest pose and start of each robot.
         log_weights: (M,) float64, normalised.
         log_densities: (M,) float64. Of the newest poses under the Gaussian about the mode, up to a constant: 0 for the
-            first particle, whose path is the mode.
+            first particle, whose path is the mode, unless more than M were drawn.
         ids: (l,) int64. Landmarks that have a sighting.
         tiles: (l, P / 64, 9, 64) float64. Their means (3) and covariances (6), map frame, in blocks of lanes.
         counts: (l,) int64. Measurements of each.
@@ -70,7 +70,7 @@ class Rejuvenation:
     Attributes:
         graph: To go on with next time.
         reason: Why there are no new particles; "" if there are.
-        ess: Effective sample size of the importance weights, in [1, M]; NaN if it did not come to that.
+        ess: Effective sample size of the importance weights of all draws, at most M; NaN if it did not come to that.
         iterations: Of the last descent.
         particles: The new ones, or None.
     """
@@ -124,15 +124,27 @@ def rejuvenate(
         if last:
             break
         rest = [log.since(int(graph.latest[i]) + 1) for i, log in enumerate(rest)]
-    weights = np.exp(draws.log_weights - draws.log_weights.max())
-    weights /= weights.sum()
-    ess = effective_sample_size(weights)
-    if not ess >= options.least_ess * num_particles:
+    weights, ess = _weighed(draws)
+    chosen = draws
+    needed = options.least_ess * num_particles
+    if needed > ess >= needed / options.more_draws:
+        many = draw_paths(grown, mode, options.more_draws * num_particles, rng)
+        weights, ess = _weighed(many)
+        chosen = many.taken(systematic(weights, rng, num_particles))
+        weights, ess = np.full(num_particles, 1.0 / num_particles), min(ess, float(num_particles))
+    if not ess >= needed:
         return Rejuvenation(graph, f"an effective sample size of {ess:.1f}", ess, mode.iterations, None)
     if looks is not None and len(looks.ids):
         duplicates = find_duplicates(grown, mode, draws, _descriptors(grown, looks), looks.gate)
         graph = compacted(without_duplicates(graph, duplicates))
-    return Rejuvenation(graph, "", ess, mode.iterations, _particles(grown, mode, draws, weights))
+    return Rejuvenation(graph, "", ess, mode.iterations, _particles(grown, mode, chosen, weights))
+
+
+def _weighed(draws: Draws) -> tuple[FloatArray, float]:
+    """Return normalised weights and their effective sample size."""
+    weights = np.exp(draws.log_weights - draws.log_weights.max())
+    weights /= weights.sum()
+    return weights, effective_sample_size(weights)
 
 
 def _descriptors(graph: PathGraph, looks: Looks) -> NDArray[np.float32]:

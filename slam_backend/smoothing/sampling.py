@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import lapack
 
-from slam_backend.errors import FloatArray
+from slam_backend.errors import FloatArray, IntArray
 from slam_backend.geometry import between
 from slam_backend.smoothing import _kernels
 from slam_backend.smoothing._kernels import LANES, POSE_ROWS, WORK_ROWS
@@ -36,6 +36,13 @@ class Draws:
         """(l, 9, M) float64. Means and covariances. A copy."""
         rows = self.tiles.transpose(0, 2, 1, 3).reshape(len(self.tiles), 9, -1)
         return np.ascontiguousarray(rows[:, :, : self.poses.shape[2]])
+
+    def taken(self, ancestors: IntArray) -> "Draws":
+        """Return as many paths as there are ancestors (M',), each a copy of its ancestor, weighed alike."""
+        m = len(ancestors)
+        padded = np.concatenate([ancestors, np.repeat(ancestors[:1], -m % LANES)])  # surplus lanes are copies
+        tiles = self.landmarks[:, :, padded].reshape(len(self.tiles), 9, -1, LANES).transpose(0, 2, 1, 3)
+        return Draws(self.poses[:, :, ancestors], np.ascontiguousarray(tiles), np.zeros(m), self.spreads)
 
 
 def draw_paths(graph: PathGraph, mode: Mode, num_particles: int, rng: np.random.Generator) -> Draws:

@@ -139,11 +139,27 @@ def test_where_there_is_nothing_to_smooth_the_filter_goes_on():
 def test_too_small_a_sample_size_is_refused():
     """Below the share of M that is asked for, the old particles stay, and the reason says the size."""
     run = small_run()
-    slam = rejuvenated(run, smoothing=SmoothingOptions(least_ess=1.0))
+    slam = rejuvenated(run, smoothing=SmoothingOptions(least_ess=1.0, more_draws=1))
     reports = [slam.step(**reading).rejuvenation for reading in run.readings()]
     reasons = [report.reason for report in reports if report is not None]
     assert len(reasons) == 2
     assert all(reason.startswith("an effective sample size of ") for reason in reasons)
+
+
+def test_more_paths_are_drawn_where_that_helps():
+    """Where M paths miss the sample size asked for, M of eight times as many reach it, and have the same mean."""
+    run = small_run()
+    many = rejuvenated(run, every=20, smoothing=SmoothingOptions(least_ess=1.0))
+    plain = rejuvenated(run, every=20)
+    for reading in run.readings():
+        reports = many.step(**reading).rejuvenation, plain.step(**reading).rejuvenation
+        if reports[0] is not None:
+            assert reports[0].reason == reports[1].reason == ""
+            assert reports[0].ess == 30.0 > reports[1].ess
+            covariance = plain.pose(0).covariance
+            off = many.particles(0)[0].mean(axis=0) - plain.pose(0).mean
+            assert 30.0 * off @ np.linalg.solve(covariance, off) < 16.3  # 99.9 % of 3 degrees of freedom
+            assert np.unique(many.particles(0)[0], axis=0).shape[0] > 20
 
 
 @pytest.mark.parametrize(
@@ -167,6 +183,7 @@ def test_bad_options_are_refused(options, message):
         ({"fresh_keys": 0}, "fresh_keys: expected an int >= 1"),
         ({"max_iterations": 0}, "max_iterations: expected an int >= 1"),
         ({"effort": 0.0}, "effort: expected a finite number > 0"),
+        ({"more_draws": 0}, "more_draws: expected an int >= 1"),
         ({"free_sightings": -1}, "free_sightings: expected an int >= 0"),
         ({"closure_after": -1}, "closure_after: expected an int >= 0"),
         ({"kernel": -1.0}, "kernel: expected a finite number >= 0"),
