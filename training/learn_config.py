@@ -14,7 +14,7 @@ SPLIT_TRAIN, SPLIT_TRY = "train", "validation"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrainConfig:
-    """MaskablePPO with one network for all robots, `goal` actions, a decision a second.
+    """MaskablePPO with one network for all robots and `goal` actions.
 
     A rollout is one episode of every robot. What is left out has the value of the preset `quick`.
 
@@ -45,15 +45,15 @@ class TrainConfig:
     robots: int = 3
     noise: str = "standard"
     particles: int = 30
-    decision_ticks: int = 10
-    max_cycles: int = 60
-    reward: Mapping[str, float] = field(default_factory=lambda: {"map_error": 10.0})
+    decision_ticks: int = 20
+    max_cycles: int = 45
+    reward: Mapping[str, float] = field(default_factory=lambda: {"map_error": 10.0, "coverage": 10.0})
     envs: int = 8
-    steps: int = 200_000
+    steps: int = 130_000
     batch: int = 360
-    epochs: int = 8
+    epochs: int = 10
     learning_rate: float = 2e-3
-    gamma: float = 0.98
+    gamma: float = 0.95
     gae_lambda: float = 0.9
     clip: float = 0.2
     entropy: float = 0.002

@@ -1,5 +1,6 @@
 """`RunConfig`: all that decides a run, and the environment and policies that it stands for."""
 
+import tomllib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -7,6 +8,7 @@ from typing import Any, Self
 
 from agents.policy import Policy
 from agents.registry import is_model, make_policy
+from agents.trained import load_model
 from slam_backend.errors import bad_argument, check_choice, check_int
 from vslam_env import vslam_v0
 from vslam_env.config import ACTION_TYPES, GOAL_DECISION_TICKS, PRESETS, SENSORS, TICK
@@ -73,7 +75,17 @@ class RunConfig:
     @property
     def step_s(self) -> float:
         """Duration of a step [s]."""
-        return TICK * (GOAL_DECISION_TICKS if self.action_type == "goal" else 1)
+        if self.action_type != "goal":
+            return TICK
+        return TICK * (GOAL_DECISION_TICKS if self.decision_ticks is None else self.decision_ticks)
+
+    @property
+    def decision_ticks(self) -> int | None:
+        """Ticks between decisions: as many as a trained policy was trained with; None for others: the usual ones."""
+        if not is_model(self.policy):
+            return None
+        environment = tomllib.loads(load_model(self.policy)[1]["environment"])
+        return None if self.action_type != "goal" else environment.get("decision_ticks")
 
     @property
     def num_steps(self) -> int:
@@ -86,6 +98,7 @@ class RunConfig:
             world=self.world,
             num_robots=self.robots,
             action_type=self.action_type,
+            decision_ticks=self.decision_ticks,
             num_particles=self.particles,
             max_cycles=self.num_steps,
             preset=self.preset,

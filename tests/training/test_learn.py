@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -153,7 +154,7 @@ def test_rows_tell_of_episodes(whole: tuple[Path, dict[str, Any]]) -> None:
 
     rows = read_checkpoint(whole[0] / CHECKPOINT_FILE)["watch"]["rows"]
     assert [row["steps"] for row in rows] == [16.0, 32.0, 48.0]
-    assert all(row["return"] == pytest.approx(row["reward/map_error"]) for row in rows)
+    assert all(row["return"] == pytest.approx(row["reward/map_error"] + row["reward/coverage"]) for row in rows)
     curves = EventAccumulator(str(whole[0] / "tensorboard"))
     curves.Reload()
     for name in ("return", "map_error", "map_recall", "merges", "reward/map_error"):
@@ -254,3 +255,4 @@ def test_the_commands_train_go_on_evaluate_and_play(tmp_path: Path, monkeypatch:
     result = runner.invoke(app, [*arguments, "3", "--no-video", "--out", str(played)])
     assert result.exit_code == 0, result.output
     assert json.loads((played / "metrics.json").read_text())["config"]["action_type"] == "goal"
+    assert tomllib.loads((played / "environment.toml").read_text())["decision_ticks"] == SMOKE.decision_ticks == 20
