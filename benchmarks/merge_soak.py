@@ -91,7 +91,7 @@ class MergeFate:
         return self.undone_after is None or self.undone_after > WINDOW
 
 
-def make_env(seed: int, cycles: int, forced: bool) -> ExplorationEnv:
+def make_env(seed: int, cycles: int, forced: bool, rejuvenate_every: int | None) -> ExplorationEnv:
     """Return the environment of an episode: the seed decides about everything."""
     rng = np.random.default_rng([seed, 17])
     config = preset_config("standard").replace(
@@ -99,15 +99,17 @@ def make_env(seed: int, cycles: int, forced: bool) -> ExplorationEnv:
         num_robots=int(rng.integers(2, 5)),
         max_cycles=cycles,
         landmarks={"repeated": float(rng.choice(REPEATED))},
-        belief={"attempts": {"enabled": not forced}},
+        belief={"attempts": {"enabled": not forced}, "filter": {"rejuvenate_every": rejuvenate_every}},
         **({} if forced else RADIOS[int(rng.integers(len(RADIOS)))]),
     )
     return ExplorationEnv(config)
 
 
-def play_environment(seed: int, cycles: int, forced: bool, shift: float | None) -> list[MergeFate]:
+def play_environment(
+    seed: int, cycles: int, forced: bool, shift: float | None, rejuvenate_every: int | None
+) -> list[MergeFate]:
     """Run one episode and return what became of its merges."""
-    env = make_env(seed, cycles, forced)
+    env = make_env(seed, cycles, forced, rejuvenate_every)
     rng = np.random.default_rng([seed, 18])
     policies = [make_policy("frontier", env.config.action_type) for _ in env.possible_agents]
     observations, _ = env.reset(seed=seed)
@@ -124,7 +126,9 @@ def play_environment(seed: int, cycles: int, forced: bool, shift: float | None) 
     return fates(env.events, env.true_start_poses, placed, seed, env.config.world, alike, env.episode.tick)
 
 
-def play_aisles(seed: int, cycles: int, forced: bool, shift: float | None) -> list[MergeFate]:
+def play_aisles(
+    seed: int, cycles: int, forced: bool, shift: float | None, rejuvenate_every: int | None
+) -> list[MergeFate]:
     """Let a team live through one stereo run of `cycles` steps and return what became of its merges."""
     rng = np.random.default_rng([seed, 17])
     robots, look_alikes = int(rng.integers(2, 5)), int(rng.integers(1, 4))
@@ -135,7 +139,10 @@ def play_aisles(seed: int, cycles: int, forced: bool, shift: float | None) -> li
     noise = spec.noise
     camera = replace(noise.camera, sigma_px=2 * noise.sigma_px, sigma_disparity_px=2 * noise.sigma_disparity_px)
     attempts = AttemptOptions(enabled=not forced)
-    team = TeamSlam(robots, seed=seed, attempts=attempts, num_particles=50, camera=camera, motion=noise.motion)
+    team = TeamSlam(
+        robots, seed=seed, attempts=attempts, num_particles=50, camera=camera, motion=noise.motion,
+        rejuvenate_every=rejuvenate_every,
+    )  # fmt: skip
     starts = run.true_paths[:, 0]
     broken = not forced and rng.random() < 0.5
     up = np.ones((robots, robots), dtype=np.bool_)
@@ -278,6 +285,7 @@ def main(
     kind: Annotated[str, typer.Option(help="aisles or environment.")] = "aisles",
     forced: Annotated[bool, typer.Option(help="Merge wrongly on purpose.")] = False,
     shift: Annotated[float | None, typer.Option(help="Forced merges are off by these metres and not turned.")] = None,
+    rejuvenate_every: Annotated[int | None, typer.Option(help="Steps of a filter between its rejuvenations.")] = None,
     json_file: Annotated[Path | None, typer.Option("--json", help="Write all figures to this file.")] = None,
 ) -> None:
     """Run the soak and print it."""
@@ -296,7 +304,9 @@ def main(
     for seed in count(first_seed):
         if time.monotonic() - begin > 60.0 * minutes:
             break
-        found = (play_aisles if kind == "aisles" else play_environment)(seed, cycles, forced, shift)
+        found = (play_aisles if kind == "aisles" else play_environment)(
+            seed, cycles, forced, shift, rejuvenate_every
+        )
         merges, played = merges + found, played + 1
         for merge in found:
             fate = (
