@@ -13,6 +13,10 @@ if TYPE_CHECKING:
 Particles = Annotated[int | None, typer.Option(help="Particles per filter.", show_default="100")]
 Estimator = Annotated[str | None, typer.Option(help="fastslam2 or fastslam1.", show_default="fastslam2")]
 Duration = Annotated[float | None, typer.Option(help="Seconds to replay.", show_default="all")]
+RejuvenateEvery = Annotated[
+    int | None,
+    typer.Option(help="Steps after which particles are drawn anew from smoothed paths.", show_default="never"),
+]
 Seed = Annotated[int | None, typer.Option(help="Of all random draws.", show_default="0")]
 Out = Annotated[Path | None, typer.Option(help="New run folder.", show_default="the next free one in runs")]
 Json = Annotated[Path | None, typer.Option(help="Write the metrics to this file too.", show_default=False)]

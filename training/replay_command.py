@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from training.command_options import Config, Duration, Estimator, Json, Out, Seed, finish, gather
+from training.command_options import Config, Duration, Estimator, Json, Out, RejuvenateEvery, Seed, finish, gather
 from training.compiling import prepare
 from training.replay_paths import default_path
 
@@ -42,6 +42,7 @@ def replay_mrclam(
         int | None, typer.Option(help="Particles per filter.", show_default="100 for each robot of a team")
     ] = None,
     estimator: Estimator = None,
+    rejuvenate_every: RejuvenateEvery = None,
     seed: Seed = None,
     out: Out = None,
     json: Json = None,
@@ -63,6 +64,7 @@ def replay_mrclam(
         "alone": alone,
         "particles": particles,
         "estimator": estimator,
+        "rejuvenate_every": rejuvenate_every,
         "seed": seed,
     }
     values = gather(COMMAND, given, config, json, out)

@@ -35,7 +35,9 @@ def to_plain(config: Any) -> dict[str, Any]:
     return {name: value for name, value in asdict(config).items() if name != "seed"}
 
 
-def check_common(particles: int, estimator: str, seed: int, duration: float | None) -> None:
+def check_common(
+    particles: int, estimator: str, seed: int, duration: float | None, rejuvenate_every: int | None
+) -> None:
     """Refuse what no replay can use.
 
     Raises:
@@ -46,6 +48,8 @@ def check_common(particles: int, estimator: str, seed: int, duration: float | No
     check_choice("estimator", estimator, PROPOSALS)
     if duration is not None:
         check_float("duration", duration, "Give seconds, or leave it away.", above=0.0)
+    if rejuvenate_every is not None:
+        check_int("rejuvenate_every", rejuvenate_every, 1, "Give a number, or leave it away for never.")
 
 
 def _refuse_unknown(name: str, values: Any, kind: type[Any]) -> None:

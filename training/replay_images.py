@@ -46,6 +46,8 @@ class ImagesConfig:
         duration: Seconds to replay [s], or None for all.
         particles: Of the filter.
         estimator: Its proposal.
+        rejuvenate_every: Steps of the log after which particles are drawn anew from smoothed paths, as `FilterOptions`
+            has it; None: never.
         seed: Of all random draws.
         descriptor: "usurf", "sift" or "orb".
         max_range: Points farther than this are dropped [m].
@@ -59,6 +61,7 @@ class ImagesConfig:
     duration: float | None = None
     particles: int = 100
     estimator: Literal["fastslam2", "fastslam1"] = "fastslam2"
+    rejuvenate_every: int | None = None
     seed: int = 0
     descriptor: Literal["usurf", "sift", "orb"] = "usurf"
     max_range: float = 40.0
@@ -66,7 +69,7 @@ class ImagesConfig:
     sigma_disparity_px: float = 0.5
 
     def __post_init__(self) -> None:
-        check_common(self.particles, self.estimator, self.seed, self.duration)
+        check_common(self.particles, self.estimator, self.seed, self.duration, self.rejuvenate_every)
         check_choice("descriptor", self.descriptor, DESCRIPTORS)
         check_float("max_range", self.max_range, "Give metres.", above=NEAREST)
         for name in ("sigma_px", "sigma_disparity_px"):
@@ -131,6 +134,7 @@ def replay_images(
         camera=assumed,
         motion=ODOMETRY,
         proposal=config.estimator,
+        rejuvenate_every=config.rejuvenate_every,
         position_gate=PLANAR_GATE,
         descriptor_gate=gate,
         # A street repeats itself: many look-alikes at once would be taken for a lost pose.

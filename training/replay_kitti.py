@@ -35,6 +35,8 @@ class KittiConfig:
         duration: Seconds to replay [s], or None for all.
         particles: Of the filter.
         estimator: Its proposal.
+        rejuvenate_every: Steps of the log after which particles are drawn anew from smoothed paths, as `FilterOptions`
+            has it; None: never.
         seed: Of all random draws.
         sigma_px: Assumed standard deviation of a feature's column [px]: features creep along while they are tracked.
         sigma_disparity_px: Assumed standard deviation of its disparity [px]. The rows of both images, which should
@@ -46,12 +48,13 @@ class KittiConfig:
     duration: float | None = None
     particles: int = 100
     estimator: Literal["fastslam2", "fastslam1"] = "fastslam2"
+    rejuvenate_every: int | None = None
     seed: int = 0
     sigma_px: float = 1.0
     sigma_disparity_px: float = 0.5
 
     def __post_init__(self) -> None:
-        check_common(self.particles, self.estimator, self.seed, self.duration)
+        check_common(self.particles, self.estimator, self.seed, self.duration, self.rejuvenate_every)
         for name in ("sigma_px", "sigma_disparity_px"):
             check_float(name, getattr(self, name), "Give pixels.", above=0.0)
 
@@ -103,6 +106,7 @@ def replay(log: KittiLog, config: KittiConfig, on_step: Callable[[float], None] 
         camera=camera,
         motion=motion_noise(log),
         proposal=config.estimator,
+        rejuvenate_every=config.rejuvenate_every,
         position_gate=PLANAR_GATE,
         dead_zone=DEAD_ZONE,
         recovery_position=RECOVERY_POSITION,

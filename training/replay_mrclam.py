@@ -66,6 +66,8 @@ class ReplayConfig:
         alone: Whether each robot stays by itself; else those whose maps can be aligned become one team.
         particles: Per filter; None: 100 for each robot that may come to share it.
         estimator: Proposal of the filters.
+        rejuvenate_every: Steps of the log after which particles are drawn anew from smoothed paths, as `FilterOptions`
+            has it; None: never.
         dt: Time between steps [s].
         seed: Of all random draws.
         drive: How robots are taken to follow their commands, the same for all.
@@ -81,6 +83,7 @@ class ReplayConfig:
     alone: bool = False
     particles: int | None = None
     estimator: Literal["fastslam2", "fastslam1"] = "fastslam2"
+    rejuvenate_every: int | None = None
     dt: float = 0.25
     seed: int = 0
     drive: Drive = DRIVE
@@ -88,7 +91,8 @@ class ReplayConfig:
     sensor: SightingNoise = field(default_factory=SightingNoise)
 
     def __post_init__(self) -> None:
-        check_common(1 if self.particles is None else self.particles, self.estimator, self.seed, self.duration)
+        particles = 1 if self.particles is None else self.particles
+        check_common(particles, self.estimator, self.seed, self.duration, self.rejuvenate_every)
         check_choice("identities", self.identities, IDENTITIES)
         if not isinstance(self.alone, bool):
             raise bad_argument("alone", "a bool", self.alone, "Say true or false.")
@@ -236,6 +240,7 @@ def _make_team(log: MrclamLog, config: ReplayConfig) -> TeamSlam:
         num_particles=particles,
         motion=config.motion,
         proposal=config.estimator,
+        rejuvenate_every=config.rejuvenate_every,
         **GATES[config.identities],
     )
 

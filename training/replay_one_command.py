@@ -9,7 +9,18 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from training.command_options import Config, Duration, Estimator, Json, Out, Particles, Seed, finish, gather
+from training.command_options import (
+    Config,
+    Duration,
+    Estimator,
+    Json,
+    Out,
+    Particles,
+    RejuvenateEvery,
+    Seed,
+    finish,
+    gather,
+)
 from training.compiling import prepare
 from training.replay_images_command import replay_folder_of_images
 from training.replay_paths import default_path
@@ -32,6 +43,7 @@ def replay_victoria(
     duration: Duration = None,
     particles: Particles = None,
     estimator: Estimator = None,
+    rejuvenate_every: RejuvenateEvery = None,
     seed: Seed = None,
     out: Out = None,
     json: Json = None,
@@ -44,7 +56,8 @@ def replay_victoria(
     from training.run_folder import RunFolder, plain
 
     command = "replay victoria"
-    given = {"path": path, "duration": duration, "particles": particles, "estimator": estimator, "seed": seed}
+    given = {"path": path, "duration": duration, "particles": particles, "estimator": estimator}
+    given |= {"rejuvenate_every": rejuvenate_every, "seed": seed}
     values = gather(command, given, config, json, out)
     if "path" not in values:
         values["path"] = default_path(VICTORIA, "the Victoria Park log")
@@ -89,6 +102,7 @@ def replay_kitti(
     duration: Duration = None,
     particles: Particles = None,
     estimator: Estimator = None,
+    rejuvenate_every: RejuvenateEvery = None,
     seed: Seed = None,
     out: Out = None,
     json: Json = None,
@@ -103,7 +117,8 @@ def replay_kitti(
 
     command = "replay kitti"
     given = {"path": path, "truth": truth, "duration": duration, "particles": particles, "estimator": estimator}
-    values = gather(command, given | {"seed": seed}, config, json, out)
+    given |= {"rejuvenate_every": rejuvenate_every, "seed": seed}
+    values = gather(command, given, config, json, out)
     if "path" not in values:
         values["path"] = default_path(KITTI, "KITTI features")
     if holds_images(values["path"]):

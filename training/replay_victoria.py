@@ -54,6 +54,8 @@ class VictoriaConfig:
         duration: Seconds to replay [s], or None for all.
         particles: Of the filter.
         estimator: Its proposal.
+        rejuvenate_every: Steps of the log after which particles are drawn anew from smoothed paths, as `FilterOptions`
+            has it; None: never.
         seed: Of all random draws.
         motion: Assumed noise of the odometry.
         sensor: Assumed noise of the trees' readings.
@@ -63,12 +65,13 @@ class VictoriaConfig:
     duration: float | None = None
     particles: int = 100
     estimator: Literal["fastslam2", "fastslam1"] = "fastslam2"
+    rejuvenate_every: int | None = None
     seed: int = 0
     motion: OdometryModel = MOTION
     sensor: TreeNoise = field(default_factory=TreeNoise)
 
     def __post_init__(self) -> None:
-        check_common(self.particles, self.estimator, self.seed, self.duration)
+        check_common(self.particles, self.estimator, self.seed, self.duration, self.rejuvenate_every)
 
     @classmethod
     def from_mapping(cls, values: Mapping[str, Any]) -> Self:
@@ -113,6 +116,7 @@ def replay(log: VictoriaLog, config: VictoriaConfig, on_step: Callable[[float], 
         camera=StereoCamera(mount=SENSOR),
         motion=config.motion,
         proposal=config.estimator,
+        rejuvenate_every=config.rejuvenate_every,
         position_gate=PLANAR_GATE,
         dead_zone=DEAD_ZONE,
         dead_radius=DEAD_RADIUS,

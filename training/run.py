@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
-from training.command_options import Config, Json, Out, Particles, Seed, finish, gather
+from training.command_options import Config, Json, Out, Particles, RejuvenateEvery, Seed, finish, gather
 from training.compiling import prepare
 
 if TYPE_CHECKING:  # what computes is imported when the command runs, so that --help answers at once
@@ -35,6 +35,7 @@ def run(
     ] = None,
     max_cycles: Annotated[int | None, typer.Option(help="Steps of the episode.", show_default="180 s worth")] = None,
     particles: Particles = None,
+    rejuvenate_every: RejuvenateEvery = None,
     preset: Annotated[str | None, typer.Option(help="easy, standard or hard noise.", show_default="standard")] = None,
     sensor: Annotated[
         str | None, typer.Option(help="landmark, or stereo: rendered eyes.", show_default="landmark")
@@ -62,6 +63,7 @@ def run(
         "action_type": action_type,
         "max_cycles": max_cycles,
         "particles": particles,
+        "rejuvenate_every": rejuvenate_every,
         "preset": preset,
         "sensor": sensor,
     }

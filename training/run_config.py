@@ -11,7 +11,7 @@ from agents.registry import is_model, make_policy
 from agents.trained import load_model
 from slam_backend.errors import bad_argument, check_choice, check_int
 from vslam_env import vslam_v0
-from vslam_env.config import ACTION_TYPES, GOAL_DECISION_TICKS, PRESETS, SENSORS, TICK
+from vslam_env.config import ACTION_TYPES, GOAL_DECISION_TICKS, PRESETS, SENSORS, TICK, preset_config
 from vslam_env.environment import ExplorationEnv
 from vslam_env.world import WORLD_FAMILIES
 
@@ -30,6 +30,8 @@ class RunConfig:
         action_type: `"continuous"`, `"discrete"` or `"goal"`.
         max_cycles: Steps of the episode; None: as many as `EPISODE_S` takes.
         particles: Per filter.
+        rejuvenate_every: Ticks of 0.1 s after which the particles of a filter are drawn anew from smoothed paths, as
+            `FilterOptions` has it; None: never.
         preset: Of the environment's noise.
         sensor: `"landmark"` or `"stereo"`.
         seed: Of all random draws.
@@ -41,6 +43,7 @@ class RunConfig:
     action_type: str = "continuous"
     max_cycles: int | None = None
     particles: int = 100
+    rejuvenate_every: int | None = None
     preset: str = "standard"
     sensor: str = "landmark"
     seed: int = 0
@@ -51,6 +54,8 @@ class RunConfig:
         check_choice("preset", self.preset, PRESETS)
         check_choice("sensor", self.sensor, SENSORS)
         check_int("particles", self.particles, 1, "Use at least one particle; 100 is a good start.")
+        if self.rejuvenate_every is not None:
+            check_int("rejuvenate_every", self.rejuvenate_every, 1, "Give a number, or leave it away for never.")
         check_int("seed", self.seed, 0, "Use 0 or a positive number.")
         if self.max_cycles is not None:
             check_int("max_cycles", self.max_cycles, 1, "Give a number of steps.")
@@ -94,15 +99,16 @@ class RunConfig:
 
     def make_env(self) -> ExplorationEnv:
         """Build the environment."""
+        assumed = {"num_particles": self.particles, "rejuvenate_every": self.rejuvenate_every}
+        config = preset_config(self.preset, self.sensor).replace(belief={"filter": assumed})
         return vslam_v0.parallel_env(
             world=self.world,
             num_robots=self.robots,
+            sensor=self.sensor,
             action_type=self.action_type,
             decision_ticks=self.decision_ticks,
-            num_particles=self.particles,
             max_cycles=self.num_steps,
-            preset=self.preset,
-            sensor=self.sensor,
+            config=config,
         )
 
     def make_policies(self, env: ExplorationEnv) -> dict[str, Policy]:

@@ -1,0 +1,120 @@
+"""`--rejuvenate-every`: it reaches the filters of each command, and config.toml repeats it."""
+
+import json
+import sys
+import tomllib
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+from small_logs import write_drive, write_log, write_park
+
+from slam_backend import _rejuvenation_step
+from training import cli
+from training.replay_images import ImagesConfig
+from training.run_config import RunConfig
+from vslam_env.config import EnvConfig, preset_config
+
+WRITERS: Mapping[str, Callable[[Path], None]] = {
+    "mrclam": lambda folder: write_log(folder, noise=1.0),
+    "victoria": lambda folder: write_park(folder, skew=0.01),
+    "kitti": lambda folder: write_drive(folder, bias=0.05),
+}
+
+PARTICLES = 20
+
+
+def vslam(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
+    """Run the command line; return its exit status."""
+    monkeypatch.setattr(sys, "argv", ["vslam", *arguments])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    return int(end.value.code or 0)
+
+
+def estimates(folder: Path) -> list[bytes]:
+    """Return the estimated paths of a run folder, as they were written."""
+    return [file.read_bytes() for file in sorted(folder.glob("*estimate.tum"))]
+
+
+@pytest.fixture
+def reasons(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Return the list to which attempts add why they were refused, "" if not; those that warm up are left out."""
+    said: list[str] = []
+    usual = _rejuvenation_step.rejuvenate
+
+    def rejuvenate(*arguments: Any) -> Any:
+        result = usual(*arguments)
+        if arguments[4] == PARTICLES:
+            said.append(result.reason)
+        return result
+
+    monkeypatch.setattr(_rejuvenation_step, "rejuvenate", rejuvenate)
+    return said
+
+
+@pytest.mark.parametrize("command", WRITERS)
+def test_a_replay_is_rejuvenated_and_repeats_itself(
+    command: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, reasons: list[str]
+) -> None:
+    """Most attempts succeed, the estimates change, the option stands in config.toml, which repeats the paths."""
+    log, plain, one, two = (tmp_path / name for name in ("log", "plain", "one", "two"))
+    log.mkdir()
+    WRITERS[command](log)
+    options = ("replay", command, "--path", str(log), "--duration", "8", "--seed", "104")
+    options += ("--particles", str(PARTICLES))
+    assert vslam(monkeypatch, *options, "--out", str(plain)) == 0
+    assert not reasons
+    assert vslam(monkeypatch, *options, "--rejuvenate-every", "8", "--out", str(one)) == 0
+    assert reasons.count("") > 0.5 * len(reasons) > 0.0
+    assert vslam(monkeypatch, "replay", command, "--config", str(one), "--out", str(two)) == 0
+    assert "rejuvenate_every = 8" in (one / "config.toml").read_text()
+    assert "rejuvenate_every" not in (plain / "config.toml").read_text()
+    assert estimates(one) == estimates(two)
+    assert all(with_it != without for with_it, without in zip(estimates(one), estimates(plain), strict=True))
+    first, second = (json.loads((folder / "metrics.json").read_text()) for folder in (one, two))
+    assert first == second
+
+
+@pytest.mark.parametrize("sensor", ["landmark", "stereo"])
+def test_the_filters_of_a_run_are_told(sensor: str) -> None:
+    """The environment's filters get the particles and the interval of the run; all else is that of the preset."""
+    config = RunConfig(world="fig5", particles=17, rejuvenate_every=9, preset="hard", sensor=sensor)
+    chosen = config.make_env().config
+    assert (chosen.belief.filter.num_particles, chosen.belief.filter.rejuvenate_every) == (17, 9)
+    usual = {"filter": {"num_particles": 100, "rejuvenate_every": None}}
+    expected = preset_config("hard", sensor).replace(world="fig5", max_cycles=1800)
+    assert chosen.replace(belief=usual) == expected
+
+
+@pytest.mark.slow
+def test_a_run_is_rejuvenated_and_repeats_itself(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Of three runs of the command, that without differs from that with, and that from its config does not."""
+    plain, one, two = (tmp_path / name for name in ("plain", "one", "two"))
+    options = ("--robots", "2", "--particles", "11", "--max-cycles", "40", "--world", "fig5", "--seed", "104")
+    with_it = (*options, "--rejuvenate-every", "10")
+    for folder, extra in ((plain, options), (one, with_it), (two, ("--config", str(one)))):
+        assert vslam(monkeypatch, "run", *extra, "--no-video", "--out", str(folder)) == 0
+    assert tomllib.loads((one / "config.toml").read_text())["config"]["rejuvenate_every"] == 10
+    assert EnvConfig.from_toml(one / "environment.toml").belief.filter.rejuvenate_every == 10
+    assert estimates(one) == estimates(two)
+    assert estimates(one) != estimates(plain)
+
+
+@pytest.mark.parametrize("command", [("replay", "mrclam"), ("replay", "victoria"), ("replay", "kitti"), ("run",)])
+def test_no_steps_between_are_refused(
+    command: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Every zero steps is no interval: one line, status 2."""
+    path = ("--path", "none") if command[0] == "replay" else ()
+    assert vslam(monkeypatch, *command, *path, "--rejuvenate-every", "0") == 2
+    assert capsys.readouterr().err.startswith("error rejuvenate_every: expected an int >= 1, got 0. Give a number,")
+
+
+def test_a_replay_of_images_takes_it_too() -> None:
+    """A folder of images is replayed by the same command, so its configuration holds the interval as well."""
+    config = ImagesConfig(path="drive", rejuvenate_every=6)
+    assert ImagesConfig.from_mapping(config.to_mapping()) == config
+    with pytest.raises(ValueError, match="rejuvenate_every: expected an int >= 1, got 0"):
+        ImagesConfig(path="drive", rejuvenate_every=0)
