@@ -19,6 +19,7 @@ SHOWN = {
     "merges": "merges",
     "distance": "way [m]",
 }
+WITH_INTERVAL = ("return", "map_error")  # the others have theirs in metrics.json
 
 
 def summarise(rows: Rows) -> list[dict[str, Any]]:
@@ -62,7 +63,8 @@ def print_evaluation(console: Console, lines: Rows, ahead: Rows) -> None:
     for label in (*SHOWN.values(), "seeds"):
         table.add_column(label, justify="right")
     for line in lines:
-        table.add_row(line["policy"], *(_with_interval(line, figure) for figure in SHOWN), str(line["seeds"]))
+        shown = (_with_interval(line, name) if name in WITH_INTERVAL else f"{line[name]:.2f}" for name in SHOWN)
+        table.add_row(line["policy"], *shown, str(line["seeds"]))
     console.print(table)
     for lead in ahead:
         console.print(
