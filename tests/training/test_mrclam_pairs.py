@@ -1,7 +1,6 @@
 """Pairs of real maps: how they are aligned and scored."""
 
 import json
-import os
 import sys
 from pathlib import Path
 from typing import Any
@@ -14,8 +13,6 @@ from slam_backend.readers.mrclam import load_mrclam
 from training import cli
 from training.mrclam_pairs import MrclamPairsConfig, align_log, align_pairs, check_goals, summarise
 from training.replay_mrclam import ReplayConfig, replay
-
-DATA = os.environ.get("VSLAM_DATA")
 
 
 def test_exact_maps_are_aligned_exactly(tmp_path: Path) -> None:
@@ -93,10 +90,9 @@ def test_the_command_leaves_a_table(
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(DATA is None, reason="VSLAM_DATA, the folder of the data sets, is not set")
-def test_real_maps_are_aligned_by_barcodes_and_never_falsely_without() -> None:
+def test_real_maps_are_aligned_by_barcodes_and_never_falsely_without(data_dir: Path) -> None:
     """After 200 s all ten pairs of data set 7 are aligned by barcodes; without them few are, none of them wrongly."""
-    path = Path(str(DATA)) / "mrclam" / "MRCLAM_Dataset7"
+    path = data_dir / "mrclam" / "MRCLAM_Dataset7"
     rows = align_log(MrclamPairsConfig(path=str(path), durations=(200.0,), particles=50, seed=100))
     assert all(goal["met"] for goal in check_goals(rows))
     for line in summarise(rows):
