@@ -132,7 +132,7 @@ def take_in(branch: Branch, step: int, robots: Sequence[int], inputs: Sequence[R
         branch: Whose filter steps; its `known`, `report` and watches move on.
         step: Number of the step; the filter's logs bear it, whenever it is taken in.
         robots: Whose readings.
-        inputs: One for each.
+        inputs: One for each, checked by `check_step`.
     """
     branch.known.update(dict.fromkeys(robots, step))
     for watch in branch.watches:
@@ -143,12 +143,8 @@ def take_in(branch: Branch, step: int, robots: Sequence[int], inputs: Sequence[R
     given = dict(zip(robots, inputs, strict=True))
     told = [given.get(robot, NOTHING) for robot in branch.robots]
     branch.filter._steps = step
-    branch.report = report = branch.filter.step(
-        [reading.odometry for reading in told],
-        [reading.frame for reading in told],
-        [reading.identities for reading in told] if any(r.identities is not None for r in told) else None,
-        [reading.pose for reading in told] if any(r.pose is not None for r in told) else None,
-    )
+    odometry, frames, identities, poses = zip(*told, strict=True)
+    branch.report = report = branch.filter._step_checked(odometry, frames, identities, poses)
     for watch in branch.watches:
         watch.note(branch.robots, report)
     return report

@@ -315,9 +315,20 @@ class FastSlam:
         Raises:
             ValueError: If an argument is ill-formed; the filter is then as before.
         """
-        moves, frames, names, exact = check_step(
-            self.num_robots, self.descriptor_size, self.options.camera, odometry, measurements, identities, poses
+        return self._step_checked(
+            *check_step(
+                self.num_robots, self.descriptor_size, self.options.camera, odometry, measurements, identities, poses
+            )
         )
+
+    def _step_checked(
+        self,
+        moves: Sequence[FloatArray | None],
+        frames: Sequence[Measurements | None],
+        names: Sequence[IntArray | None],
+        exact: Sequence[FloatArray | None],
+    ) -> StepReport:
+        """Do what `step` does with readings that `check_step` returned; none of them is written to."""
         buffers = self._buffers
         buffers.start(sum(0 if frame is None else len(frame) for frame in frames))
         turns, deserted = [], []

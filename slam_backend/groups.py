@@ -36,10 +36,6 @@ class Group:
         """All robots of the group."""
         return self.branches[0].robots
 
-    def branch_of(self, robot: int) -> Branch:
-        """Return the branch that a robot of the group goes by."""
-        return next(branch for branch in self.branches if robot in branch.live)
-
     # ------------------------------------------------------------------ contact lost and found
 
     def regroup(self, networks: IntArray, records: Records) -> None:
@@ -126,6 +122,8 @@ class Group:
 
 
 def _oldest_unknown(branch: Branch, now: int) -> int:
+    if not branch.watches and len(branch.live) == len(branch.robots):
+        return now + 1
     held = [1 + last for robot, last in branch.known.items() if robot not in branch.live]
     return min([now + 1, *held, *(_oldest_of(watch) for watch in branch.watches)])
 

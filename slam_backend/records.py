@@ -46,7 +46,7 @@ class Records:
         """Write down which landmarks a step of a filter created."""
         for robot in robots:
             ids = report.created[branch.robots.index(robot)]
-            if len(ids) and ids.max() >= 0:
+            if len(ids) and max(ids.tolist()) >= 0:
                 self.entries.append(LandmarksCreated(branch.number, robot, step, ids))
 
     def note_replay(self, branch: Branch, replayed: Sequence[ReplayedStep]) -> None:

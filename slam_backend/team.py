@@ -88,6 +88,7 @@ class TeamSlam(TeamKnowledge):
         ]
         super().__init__(groups, Records(count, of_forks))
         self._numbers = set(range(count))
+        self._numbered: list[tuple[int, int]] = []  # what `_dropped` went by
         self._step = 0
         self._epoch = 0
 
@@ -129,6 +130,7 @@ class TeamSlam(TeamKnowledge):
         records.log.record(self._step, inputs)
         for group in self._groups:
             group.regroup(networks, records)
+        self._places = []
         associations: list[IntArray] = [np.empty(0, np.int64)] * self._num_robots
         created = list(associations)
         for group in self._groups:
@@ -206,6 +208,7 @@ class TeamSlam(TeamKnowledge):
         """Put some groups in the place of others."""
         self._groups = [group for group in self._groups if all(group is not other for other in old)] + list(new)
         self._groups.sort(key=lambda group: group.robots)
+        self._places = []
 
     def _doubt(self) -> None:
         """Weigh the evidence about the merges that can still be undone, and undo what contradicts itself."""
@@ -259,6 +262,10 @@ class TeamSlam(TeamKnowledge):
 
     def _dropped(self) -> list[MapDropped]:
         """Return the maps that are gone since this was asked last."""
+        numbered = [(branch.number, len(branch.watches)) for group in self._groups for branch in group.branches]
+        if numbered == self._numbered:
+            return []
+        self._numbered = numbered
         numbers = set[int]().union(*(group.numbers() for group in self._groups))
         gone, self._numbers = sorted(self._numbers - numbers), self._numbers | numbers
         self._numbers -= set(gone)
@@ -307,6 +314,7 @@ class TeamSlam(TeamKnowledge):
         self._events = list(state["events"])
         at_hand = {group.robots: group.trunk.filter for group in self._groups}  # filling is faster than building
         self._groups = [Group.from_state(group, at_hand) for group in state["groups"]]
+        self._places, self._numbered = [], []
         self._numbers = set(state["numbers"])
         self._alignment, self._merging = state["alignment"], state["merging"]
         self._schedule.set_state(state["schedule"])

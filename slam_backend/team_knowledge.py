@@ -26,6 +26,7 @@ class TeamKnowledge:
         self._records = records
         self._num_robots = len(groups)
         self._events: list[MergeEvent] = []
+        self._places: list[tuple[Group, Branch, int]] = []  # of each robot; none while robots change theirs
 
     @property
     def num_robots(self) -> int:
@@ -142,16 +143,21 @@ class TeamKnowledge:
         return inverse(branch.filter.start_pose(index))
 
     def _group_of(self, robot: int) -> Group:
-        if isinstance(robot, (int, np.integer)) and not isinstance(robot, bool):
-            for group in self._groups:
-                if robot in group.robots:
-                    return group
-        raise bad_argument("robot", f"an index from 0 to {self.num_robots - 1}", robot, "Count robots from 0.")
+        return self._place(robot)[0]
 
     def _branch(self, robot: int) -> Branch:
-        return self._group_of(robot).branch_of(robot)
+        return self._place(robot)[1]
 
     def _find(self, robot: int) -> tuple[Branch, int]:
         """Return the branch that the robot goes by, and its place in it."""
-        branch = self._branch(robot)
-        return branch, branch.robots.index(robot)
+        return self._place(robot)[1:]
+
+    def _place(self, robot: int) -> tuple[Group, Branch, int]:
+        """Return the robot's group, the branch that it goes by, and its place in that."""
+        if not self._places:
+            branches = [(group, branch) for group in self._groups for branch in group.branches]
+            places = {r: (group, branch, branch.robots.index(r)) for group, branch in branches for r in branch.live}
+            self._places = [places[r] for r in range(self._num_robots)]
+        if isinstance(robot, (int, np.integer)) and not isinstance(robot, bool) and 0 <= robot < self._num_robots:
+            return self._places[robot]
+        raise bad_argument("robot", f"an index from 0 to {self.num_robots - 1}", robot, "Count robots from 0.")
