@@ -1,13 +1,14 @@
 """The accuracy bench: trials over conditions, methods, particles and seeds, each kept as soon as it is finished."""
 
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
-from slam_backend.errors import bad_argument, check_int
+from slam_backend.errors import check_int
 from training import kept_trials
 from training.accuracy_trials import FILTERS, PEERS, Trial, play
+from training.plain_config import PlainConfig, check_each_once
 from training.run_folder import RunFolder
 
 COMMAND = "bench accuracy"
@@ -15,7 +16,7 @@ TRIALS_FILE = "trials.jsonl"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class AccuracyConfig:
+class AccuracyConfig(PlainConfig):
     """All that decides a bench: each combination of the lists is tried on each seed.
 
     Attributes:
@@ -42,24 +43,8 @@ class AccuracyConfig:
         check_int("seeds", self.seeds, 1, "Run at least one seed.")
         check_int("seed", self.seed, 0, "Use 0 or a positive number.")
         for name in ("presets", "associations", "robots", "lengths", "methods", "particles"):
-            values = tuple(getattr(self, name))
-            if not values or len(set(values)) < len(values):
-                raise bad_argument(name, "at least one value, each once", list(values), "Correct the list.")
-            object.__setattr__(self, name, values)
+            check_each_once(name, getattr(self, name))
         self.trials()  # refuses what no trial can be
-
-    @classmethod
-    def from_mapping(cls, values: Mapping[str, Any]) -> Self:
-        """Build a config from plain values, as `to_mapping` gives them; unknown names are refused."""
-        known = list(cls.__dataclass_fields__)
-        for name in values:
-            if name not in known:
-                raise bad_argument("config", "one of " + ", ".join(known), name, "Correct the name in the file.")
-        return cls(**values)
-
-    def to_mapping(self) -> dict[str, Any]:
-        """Return the plain values that repeat this bench, the first seed apart."""
-        return {name: value for name, value in asdict(self).items() if name != "seed"}
 
     def trials(self) -> list[Trial]:
         """Return all trials, those on the same run in a row."""

@@ -1,12 +1,11 @@
 """`AlignmentBenchConfig`: what `vslam bench alignment` tries."""
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
-from typing import Any, Self
+from dataclasses import dataclass
 
 from slam_backend.alignment import METHODS
-from slam_backend.errors import bad_argument, check_choice, check_int
+from slam_backend.errors import check_choice, check_int
 from training.alignment_trials import Trial, cases
+from training.plain_config import PlainConfig, check_each_once
 
 COMMAND = "bench alignment"
 TRIALS_FILE = "trials.jsonl"
@@ -19,7 +18,7 @@ QUICK = {"seeds": 10, "hard": 45}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class AlignmentBenchConfig:
+class AlignmentBenchConfig(PlainConfig):
     """All that decides the benchmark.
 
     Attributes:
@@ -38,24 +37,9 @@ class AlignmentBenchConfig:
         check_int("seeds", self.seeds, 1, "Try each cell at least once.")
         check_int("hard", self.hard, 0, "Use 0 to leave the hard sets out.")
         check_int("seed", self.seed, 0, "Use 0 or a positive number.")
-        object.__setattr__(self, "methods", tuple(self.methods))
-        if not self.methods or len(set(self.methods)) < len(self.methods):
-            raise bad_argument("methods", "at least one, each once", list(self.methods), "Correct the list.")
+        check_each_once("methods", self.methods)
         for method in self.methods:
             check_choice("methods", method, METHODS)
-
-    @classmethod
-    def from_mapping(cls, values: Mapping[str, Any]) -> Self:
-        """Build a config from plain values, as `to_mapping` gives them; unknown names are refused."""
-        known = list(cls.__dataclass_fields__)
-        for name in values:
-            if name not in known:
-                raise bad_argument("config", "one of " + ", ".join(known), name, "Correct the name in the file.")
-        return cls(**values)
-
-    def to_mapping(self) -> dict[str, Any]:
-        """Return the plain values that repeat this bench, the first seed apart."""
-        return {name: value for name, value in asdict(self).items() if name != "seed"}
 
     def trials(self) -> list[Trial]:
         """Return all trials, those on the same maps in a row."""

@@ -1,9 +1,9 @@
 """`EnvBenchConfig`: what `vslam bench env` times; `run_bench`: its trials, one after the other."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from functools import partial
-from typing import Any, Self
+from typing import Any
 
 from slam_backend.errors import bad_argument, check_int
 from training.env_budget import BudgetRow, measure_budget
@@ -17,6 +17,7 @@ from training.env_timing import (
     time_snapshots,
 )
 from training.machine_rates import describe_machine
+from training.plain_config import PlainConfig, check_each_once
 from vslam_env import vslam_v0
 from vslam_env.config import MAX_ROBOTS, EnvConfig
 
@@ -31,7 +32,7 @@ GOAL_RESET_MS, GOAL_STATE_MS = 20.0, 2.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class EnvBenchConfig:
+class EnvBenchConfig(PlainConfig):
     """All that decides the benchmark. One number at a time differs from the base, the first of each list.
 
     Attributes:
@@ -56,28 +57,13 @@ class EnvBenchConfig:
         check_int("steps", self.steps, 2, "Time a few steps.")
         check_int("seed", self.seed, 0, "Use 0 or a positive number.")
         for name in ("robots", "particles", "worlds", "modes"):
-            if not getattr(self, name):
-                raise bad_argument(name, "at least one", "none", "Name what to time.")
+            check_each_once(name, getattr(self, name))
         for robots in self.robots:
             if not 1 <= check_int("robots", robots, 1, "Use 1 to 8 robots.") <= MAX_ROBOTS:
                 raise bad_argument("robots", f"ints from 1 to {MAX_ROBOTS}", robots, "Use 1 to 8 robots.")
         for mode in self.modes:
             if mode not in MODES:
                 raise bad_argument("modes", "some of " + ", ".join(MODES), mode, "Check the spelling.")
-
-    @classmethod
-    def from_mapping(cls, values: Mapping[str, Any]) -> Self:
-        """Build a config from plain values, as `to_mapping` gives them; unknown names are refused."""
-        known = [field.name for field in fields(cls)]
-        for name in values:
-            if name not in known:
-                raise bad_argument("config", "one of " + ", ".join(known), name, "Correct the name in the file.")
-        chosen: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in values.items()}
-        return cls(**chosen)
-
-    def to_mapping(self) -> dict[str, Any]:
-        """Return the plain values that repeat this benchmark, the seed apart."""
-        return {name: value for name, value in asdict(self).items() if name != "seed"}
 
     def loads(self) -> list["EnvLoad"]:
         """Return what is timed, row by row, the base first."""

@@ -1,16 +1,17 @@
 """`BenchConfig`: what `vslam bench filter` times; `run_bench`: its trials, one after the other."""
 
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
 from itertools import product
-from typing import Any, Self
+from typing import Any
 
-from slam_backend.errors import bad_argument, check_choice, check_int
+from slam_backend.errors import check_choice, check_int
 from slam_backend.filter_options import PROPOSALS
 from training.compile_timing import time_compilation
 from training.filter_load import FilterLoad, Proposal
 from training.filter_trials import PlainRow, Row, time_plain, time_row, time_state
 from training.machine_rates import describe_machine
+from training.plain_config import PlainConfig, check_each_once
 from training.step_timing import Timing
 
 STATE_LOAD = FilterLoad(particles=100, landmarks=300, measurements=15)
@@ -20,7 +21,7 @@ PLAIN_LANDMARKS = 300  # with more of them the plain reference takes minutes to 
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class BenchConfig:
+class BenchConfig(PlainConfig):
     """All that decides the benchmark; rows are all combinations of the numbers given.
 
     Attributes:
@@ -52,25 +53,10 @@ class BenchConfig:
     def __post_init__(self) -> None:
         check_int("steps", self.steps, 1, "Time at least one step.")
         for name in ("particles", "landmarks", "measurements", "robots", "proposals"):
-            if not getattr(self, name):
-                raise bad_argument(name, "at least one", "none", "Name what to time.")
+            check_each_once(name, getattr(self, name))
         for proposal in self.proposals:
             check_choice("proposals", proposal, PROPOSALS)
         self.loads()
-
-    @classmethod
-    def from_mapping(cls, values: Mapping[str, Any]) -> Self:
-        """Build a config from plain values, as `to_mapping` gives them; unknown names are refused."""
-        known = [field.name for field in fields(cls)]
-        for name in values:
-            if name not in known:
-                raise bad_argument("config", "one of " + ", ".join(known), name, "Correct the name in the file.")
-        chosen: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in values.items()}
-        return cls(**chosen)
-
-    def to_mapping(self) -> dict[str, Any]:
-        """Return the plain values that repeat this benchmark, the seed apart."""
-        return {name: value for name, value in asdict(self).items() if name != "seed"}
 
     def loads(self) -> list[FilterLoad]:
         """Return what is timed, row by row."""

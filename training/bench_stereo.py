@@ -1,16 +1,17 @@
 """`vslam bench stereo`: how fast the stereo eye is, and how good, on rendered pairs."""
 
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, fields
-from typing import Any, Self
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 
 from slam_backend.camera import StereoCamera
-from slam_backend.errors import bad_argument, check_choice, check_int
+from slam_backend.errors import check_choice, check_int
 from slam_backend.frontend import DESCRIPTORS, CornerOptions, FrontEndOptions, StereoFrontEnd
 from training.machine_rates import describe_machine
+from training.plain_config import PlainConfig, check_each_once
 from training.step_timing import Timing, time_calls
 from training.stereo_quality import quality_row, retrieval, second_looks
 from training.stereo_scenes import Scene, panel_hall
@@ -22,7 +23,7 @@ WINDOW = 0.6  # [m] of the descriptor window of constant physical size
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class StereoBenchConfig:
+class StereoBenchConfig(PlainConfig):
     """All that decides the benchmark.
 
     Attributes:
@@ -45,8 +46,7 @@ class StereoBenchConfig:
 
     def __post_init__(self) -> None:
         for name in ("sizes", "landmarks", "walls", "descriptors"):
-            if not getattr(self, name):
-                raise bad_argument(name, "at least one", "no entry", "Name what to measure.")
+            check_each_once(name, getattr(self, name))
         for name, least in (("sizes", 64), ("landmarks", 1), ("walls", 4)):
             for value in getattr(self, name):
                 check_int(name, value, least, f"Use at least {least}.")
@@ -55,20 +55,6 @@ class StereoBenchConfig:
         check_int("steps", self.steps, 1, "Time at least one pair.")
         check_int("views", self.views, 1, "Look at least once.")
         check_int("seed", self.seed, 0, "Use 0 or a positive number.")
-
-    @classmethod
-    def from_mapping(cls, values: Mapping[str, Any]) -> Self:
-        """Build a config from plain values, as `to_mapping` gives them; unknown names are refused."""
-        known = [field.name for field in fields(cls)]
-        for name in values:
-            if name not in known:
-                raise bad_argument("config", "one of " + ", ".join(known), name, "Correct the name in the file.")
-        chosen: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in values.items()}
-        return cls(**chosen)
-
-    def to_mapping(self) -> dict[str, Any]:
-        """Return the plain values that repeat this benchmark, the seed apart."""
-        return {name: value for name, value in asdict(self).items() if name != "seed"}
 
 
 def camera_of(width: int) -> StereoCamera:

@@ -1,10 +1,10 @@
 """`TrainBenchConfig`: what `vslam bench train` times; where the time of a training goes, and what workers gain."""
 
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
 from functools import partial
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,6 +17,7 @@ from training.env_timing import StepTimes, time_steps
 from training.learn_config import SPLIT_TRAIN, TrainConfig
 from training.learn_network import GoalPolicy
 from training.machine_rates import describe_machine
+from training.plain_config import PlainConfig
 from training.vec_env import ExplorationVecEnv, make_vec_env
 from vslam_env import vslam_v0
 from vslam_env.config import EnvConfig
@@ -27,7 +28,7 @@ RECORDED = 20  # steps of an environment that are played again and again
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class TrainBenchConfig:
+class TrainBenchConfig(PlainConfig):
     """All that decides the benchmark; the environments are those of `vslam train`'s preset `quick`.
 
     Attributes:
@@ -54,20 +55,6 @@ class TrainBenchConfig:
             if not 0 <= check_int("workers", workers, 0, "Use 0 for none.") <= self.envs:
                 raise bad_argument("workers", f"at most one per environment, {self.envs}", workers, "Use fewer.")
         self.environment()
-
-    @classmethod
-    def from_mapping(cls, values: Mapping[str, Any]) -> Self:
-        """Build a config from plain values, as `to_mapping` gives them; unknown names are refused."""
-        known = [f.name for f in fields(cls)]
-        for name in values:
-            if name not in known:
-                raise bad_argument("config", "one of " + ", ".join(known), name, "Correct the name in the file.")
-        chosen: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in values.items()}
-        return cls(**chosen)
-
-    def to_mapping(self) -> dict[str, Any]:
-        """Return the plain values that repeat this benchmark, the seed apart."""
-        return {name: value for name, value in asdict(self).items() if name != "seed"}
 
     def environment(self) -> EnvConfig:
         """Return the environments' configuration."""

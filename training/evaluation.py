@@ -2,10 +2,10 @@
 
 import tomllib
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from agents.policy import Policy
 from agents.registry import POLICIES, make_policy
 from agents.trained import TrainedGoals, load_model
 from slam_backend.errors import bad_argument, check_choice, check_int
+from training.plain_config import PlainConfig
 from vslam_env import vslam_v0
 from vslam_env.config import EnvConfig
 from vslam_env.environment import ExplorationEnv
@@ -27,7 +28,7 @@ FIGURES = ("return", *LAST)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class EvaluateConfig:
+class EvaluateConfig(PlainConfig):
     """All that decides an evaluation. All policies decide as often as the model was trained to.
 
     Attributes:
@@ -61,21 +62,15 @@ class EvaluateConfig:
             make_policy(name, "goal")  # refuses what cannot choose goals
 
     @classmethod
-    def from_mapping(cls, values: Mapping[str, Any]) -> Self:
-        """Build a config from plain values, as `to_mapping` gives them; unknown names are refused."""
-        known = [f.name for f in fields(cls)]
-        for name in values:
-            if name not in known:
-                raise bad_argument("config", "one of " + ", ".join(known), name, "Correct the name in the file.")
+    def completed(cls, values: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Refuse an evaluation of no model."""
         if "model" not in values:
             raise bad_argument("model", "a model that vslam train wrote", "no model", "Name it, or its run folder.")
-        chosen: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in values.items()}
-        return cls(**chosen)
+        return values
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the plain values that repeat this evaluation from any folder, the seed apart."""
-        told = asdict(self) | {"model": str(Path(self.model).resolve())}
-        return {name: value for name, value in told.items() if name != "seed"}
+        return PlainConfig.to_mapping(self) | {"model": str(Path(self.model).resolve())}
 
     def environment(self) -> EnvConfig:
         """Return the environment; its return is the fall of the map error, whatever the model was paid for.

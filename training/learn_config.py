@@ -1,11 +1,12 @@
 """`TrainConfig`: all that decides a training, its presets, and the environments that it stands for."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 from slam_backend.errors import bad_argument, check_choice, check_float, check_int
+from training.plain_config import PlainConfig
 from vslam_env.config import MAX_ROBOTS, PRESETS, EnvConfig, preset_config
 from vslam_env.world import WORLD_FAMILIES, check_source, is_one_building
 
@@ -13,7 +14,7 @@ SPLIT_TRAIN, SPLIT_TRY = "train", "validation"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class TrainConfig:
+class TrainConfig(PlainConfig):
     """MaskablePPO with one network for all robots and `goal` actions.
 
     A rollout is one episode of every robot. What is left out has the value of the preset `quick`.
@@ -78,20 +79,16 @@ class TrainConfig:
         self.make_env_config(SPLIT_TRAIN)  # what the environment refuses shows here
 
     @classmethod
-    def from_mapping(cls, values: Mapping[str, Any]) -> Self:
-        """Build a config from plain values; what they leave out comes from their preset, unknown names are refused."""
-        known = [f.name for f in fields(cls)]
-        for name in values:
-            if name not in known:
-                raise bad_argument("config", "one of " + ", ".join(known), name, "Correct the name in the file.")
+    def completed(cls, values: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Take what is left out from the preset."""
         preset = check_choice("preset", values.get("preset", "quick"), tuple(TRAIN_PRESETS))
-        return cls(**{**TRAIN_PRESETS[preset], "preset": preset, **values})
+        return {**TRAIN_PRESETS[preset], "preset": preset, **values}
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the plain values that repeat this training from any folder, the seed apart."""
         is_path = self.world not in WORLD_FAMILIES
-        told = asdict(self) | {"world": str(Path(self.world).resolve()) if is_path else self.world}
-        return {name: value for name, value in told.items() if name != "seed"}
+        told = {"world": str(Path(self.world).resolve()) if is_path else self.world}
+        return PlainConfig.to_mapping(self) | told
 
     @property
     def rollout(self) -> int:

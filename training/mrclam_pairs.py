@@ -1,17 +1,18 @@
 """Real maps aligned pairwise: each robot of a MR.CLAM log maps alone from its own start; barcodes seen, then hidden."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
 from slam_backend.alignment import RIVAL_ANGLE, RIVAL_DISTANCE, Alignment, AlignmentOptions, align_maps
-from slam_backend.errors import IntArray, bad_argument, check_float, check_int
+from slam_backend.errors import IntArray, check_float, check_int
 from slam_backend.geometry import between, transform_points, wrap_angle
 from slam_backend.landmark_map import LandmarkMap
 from slam_backend.readers.mrclam import MrclamLog, load_mrclam
+from training.plain_config import PlainConfig, check_each_once
 from training.replay_mrclam import Replay, ReplayConfig, replay
 from training.replay_scores import align_to_truth
 
@@ -26,7 +27,7 @@ BARCODES: dict[str, AlignmentOptions] = {"given": OPTIONS, "hidden": replace(OPT
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class MrclamPairsConfig:
+class MrclamPairsConfig(PlainConfig):
     """All that decides the table.
 
     Attributes:
@@ -42,26 +43,11 @@ class MrclamPairsConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "durations", tuple(self.durations))
         for duration in self.durations:
             check_float("durations", duration, "Give seconds; 0 means all.", at_least=0.0)
-        if not self.durations or len(set(self.durations)) < len(self.durations):
-            raise bad_argument("durations", "at least one, each once", list(self.durations), "Correct the list.")
+        check_each_once("durations", self.durations)
         check_int("particles", self.particles, 1, "Use at least one particle.")
         check_int("seed", self.seed, 0, "Use 0 or a positive number.")
-
-    @classmethod
-    def from_mapping(cls, values: Mapping[str, Any]) -> Self:
-        """Build a config from plain values, as `to_mapping` gives them; unknown names are refused."""
-        known = list(cls.__dataclass_fields__)
-        for name in values:
-            if name not in known:
-                raise bad_argument("config", "one of " + ", ".join(known), name, "Correct the name in the file.")
-        return cls(**values)
-
-    def to_mapping(self) -> dict[str, Any]:
-        """Return the plain values that repeat the table, the seed apart."""
-        return {name: value for name, value in asdict(self).items() if name != "seed"}
 
 
 def align_log(config: MrclamPairsConfig, on_part: Callable[[float], None] = lambda share: None) -> list[dict[str, Any]]:

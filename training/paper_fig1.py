@@ -1,14 +1,13 @@
 """The paper's Fig. 1: clouds of particles along the paths of a few robots, by odometry alone and with what they see."""
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
-from typing import Any, Self
+from dataclasses import dataclass
 
 import numpy as np
 
-from slam_backend.errors import FloatArray, IntArray, bad_argument, check_float, check_int
+from slam_backend.errors import FloatArray, IntArray, check_float, check_int
 from training.batch_problem import BatchProblem
 from training.paper_regimes import FILTER_OPTIONS, REGIMES
+from training.plain_config import PlainConfig
 from training.stereo_office import start_crossings
 from training.stereo_runs import STEP, StereoRun, simulate_run
 
@@ -16,7 +15,7 @@ COMMAND = "paper fig1"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Fig1Config:
+class Fig1Config(PlainConfig):
     """All that decides the figure.
 
     Attributes:
@@ -39,19 +38,6 @@ class Fig1Config:
         check_float("every", self.every, "A cloud can be drawn after each step.", at_least=STEP)
         REGIMES["paper"].spec(self.robots, self.length)  # refuses the rest
         start_crossings(self.robots, np.random.default_rng(0))  # each robot starts at one of its own
-
-    @classmethod
-    def from_mapping(cls, values: Mapping[str, Any]) -> Self:
-        """Build a config from plain values, as `to_mapping` gives them; unknown names are refused."""
-        known = list(cls.__dataclass_fields__)
-        for name in values:
-            if name not in known:
-                raise bad_argument("config", "one of " + ", ".join(known), name, "Correct the name in the file.")
-        return cls(**values)
-
-    def to_mapping(self) -> dict[str, Any]:
-        """Return the plain values that repeat this figure, the seed apart."""
-        return {name: value for name, value in asdict(self).items() if name != "seed"}
 
 
 @dataclass(frozen=True, slots=True, eq=False)

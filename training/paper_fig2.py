@@ -4,14 +4,15 @@ import csv
 import io
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
 from slam_backend.alignment import RIVAL_ANGLE, RIVAL_DISTANCE, align_maps, propose_motion
-from slam_backend.errors import FloatArray, bad_argument, check_float, check_int
+from slam_backend.errors import FloatArray, check_float, check_int
 from slam_backend.geometry import wrap_angle
 from training.paper_pairs import map_alone, simulate_pair, true_motion
+from training.plain_config import PlainConfig
 from training.stereo_runs import STEP
 
 COMMAND = "paper fig2"
@@ -27,7 +28,7 @@ LABELS = {"translation_m": "translation [m]", "rotation_deg": "rotation [°]"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Fig2Config:
+class Fig2Config(PlainConfig):
     """All that decides the figure.
 
     Attributes:
@@ -53,19 +54,6 @@ class Fig2Config:
         check_int("particles", self.particles, 1, "Use at least one particle.")
         check_int("seeds", self.seeds, 1, "Run at least one seed.")
         check_int("seed", self.seed, 0, "Use 0 or a positive number.")
-
-    @classmethod
-    def from_mapping(cls, values: Mapping[str, Any]) -> Self:
-        """Build a config from plain values, as `to_mapping` gives them; unknown names are refused."""
-        known = list(cls.__dataclass_fields__)
-        for name in values:
-            if name not in known:
-                raise bad_argument("config", "one of " + ", ".join(known), name, "Correct the name in the file.")
-        return cls(**values)
-
-    def to_mapping(self) -> dict[str, Any]:
-        """Return the plain values that repeat this figure, the first seed apart."""
-        return {name: value for name, value in asdict(self).items() if name != "seed"}
 
     def trials(self) -> list["Fig2Trial"]:
         """Return one trial for each seed."""

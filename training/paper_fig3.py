@@ -2,9 +2,8 @@
 
 import csv
 import io
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
-from typing import Any, Self
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -15,6 +14,7 @@ from slam_backend.fusion import fuse_maps, move_covariances
 from slam_backend.geometry import transform_points, wrap_angle
 from slam_backend.landmark_map import LandmarkMap
 from training.paper_pairs import Stage, map_alone, simulate_pair, true_motion
+from training.plain_config import PlainConfig
 from training.stereo_runs import STEP
 
 FIG3, FIG4 = "paper fig3", "paper fig4"
@@ -22,7 +22,7 @@ SHOWN = 3  # landmarks of Fig. 4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PairConfig:
+class PairConfig(PlainConfig):
     """All that decides either figure.
 
     Attributes:
@@ -42,19 +42,6 @@ class PairConfig:
         check_int("landmarks", self.landmarks, 1, "An office without landmarks shows nothing.")
         check_int("particles", self.particles, 1, "Use at least one particle.")
         check_int("seed", self.seed, 0, "Use 0 or a positive number.")
-
-    @classmethod
-    def from_mapping(cls, values: Mapping[str, Any]) -> Self:
-        """Build a config from plain values, as `to_mapping` gives them; unknown names are refused."""
-        known = list(cls.__dataclass_fields__)
-        for name in values:
-            if name not in known:
-                raise bad_argument("config", "one of " + ", ".join(known), name, "Correct the name in the file.")
-        return cls(**values)
-
-    def to_mapping(self) -> dict[str, Any]:
-        """Return the plain values that repeat the figure, the seed apart."""
-        return {name: value for name, value in asdict(self).items() if name != "seed"}
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -2,14 +2,13 @@
 
 import csv
 import io
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
-from typing import Any, Self
+from dataclasses import dataclass
 
 import numpy as np
 
 from agents.registry import make_policy
 from slam_backend.errors import BoolArray, FloatArray, bad_argument, check_int
+from training.plain_config import PlainConfig
 from vslam_env import EnvConfig, vslam_v0
 from vslam_env.config import MAX_ROBOTS
 from vslam_env.environment import ExplorationEnv
@@ -21,7 +20,7 @@ STATES = ("hidden", "seen", "measured")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Fig5Config:
+class Fig5Config(PlainConfig):
     """All that decides the figure.
 
     Attributes:
@@ -42,19 +41,6 @@ class Fig5Config:
         check_int("decisions", self.decisions, 1, "Let them move for a second or more.")
         check_int("measurements", self.measurements, 1, "Let each measure a landmark or more.")
         check_int("seed", self.seed, 0, "Use 0 or a positive number.")
-
-    @classmethod
-    def from_mapping(cls, values: Mapping[str, Any]) -> Self:
-        """Build a config from plain values, as `to_mapping` gives them; unknown names are refused."""
-        known = [field.name for field in fields(cls)]
-        for name in values:
-            if name not in known:
-                raise bad_argument("config", "one of " + ", ".join(known), name, "Correct the name in the file.")
-        return cls(**values)
-
-    def to_mapping(self) -> dict[str, Any]:
-        """Return the plain values that repeat this figure, the seed apart."""
-        return {name: value for name, value in asdict(self).items() if name != "seed"}
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,14 +1,14 @@
 """`Fig6Config`: all that decides the paper's Fig. 6; its trials in the order in which they run."""
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
-from typing import Any, Self
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from slam_backend.errors import bad_argument, check_choice, check_int
+from slam_backend.errors import check_choice, check_int
 from training.paper_regimes import FEW, REGIMES
 from training.paper_trials import ErrorTrial, TimeTrial
+from training.plain_config import PlainConfig, check_each_once
 from training.stereo_office import start_crossings
 
 COMMAND = "paper fig6"
@@ -19,7 +19,7 @@ FIXED_COST = 200  # a step costs about as much as that of so many particles, how
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Fig6Config:
+class Fig6Config(PlainConfig):
     """All that decides the figure.
 
     Attributes:
@@ -44,28 +44,12 @@ class Fig6Config:
         check_int("seeds", self.seeds, 1, "Run at least one seed.")
         check_int("seed", self.seed, 0, "Use 0 or a positive number.")
         for name in ("particles", "robots", "regimes"):
-            values = tuple(getattr(self, name))
-            if not values or len(set(values)) < len(values):
-                raise bad_argument(name, "at least one value, each once", list(values), "Correct the list.")
-            object.__setattr__(self, name, values)
+            check_each_once(name, getattr(self, name))
         for regime in self.regimes:
             check_choice("regimes", regime, tuple(REGIMES))
         self.error_trials()  # refuses what no trial can be
         self.time_trials()
         start_crossings(max(self.robots), np.random.default_rng(0))  # each robot starts at one of its own
-
-    @classmethod
-    def from_mapping(cls, values: Mapping[str, Any]) -> Self:
-        """Build a config from plain values, as `to_mapping` gives them; unknown names are refused."""
-        known = list(cls.__dataclass_fields__)
-        for name in values:
-            if name not in known:
-                raise bad_argument("config", "one of " + ", ".join(known), name, "Correct the name in the file.")
-        return cls(**values)
-
-    def to_mapping(self) -> dict[str, Any]:
-        """Return the plain values that repeat this figure, the first seed apart."""
-        return {name: value for name, value in asdict(self).items() if name != "seed"}
 
     def error_trials(self) -> list[ErrorTrial]:
         """Return the trials of the map error, those on the same run in a row, seed by seed."""

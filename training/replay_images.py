@@ -5,9 +5,9 @@ odometry, one to the filter.
 """
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal, Self
+from typing import Any, Literal
 
 import numpy as np
 
@@ -23,7 +23,8 @@ from slam_backend.measurements import Measurements
 from slam_backend.motion import OdometryModel
 from slam_backend.readers.kitti_images import KittiImages
 from slam_backend.trajectory import dead_reckoning
-from training.replay_config import check_common, from_plain, to_plain
+from training.plain_config import PlainConfig
+from training.replay_config import check_common
 from training.replay_one import PLANAR_GATE, OneReplay, PositionScore, score_positions
 
 CORNERS = 2500  # of an image of KITTI's size, spread over it
@@ -37,7 +38,7 @@ ODOMETRY_SIGMA, ODOMETRY_SIGMA_DISPARITY = 0.5, 0.3  # [px] of features within t
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ImagesConfig:
+class ImagesConfig(PlainConfig):
     """All that decides a replay of images.
 
     Attributes:
@@ -74,15 +75,6 @@ class ImagesConfig:
         check_float("max_range", self.max_range, "Give metres.", above=NEAREST)
         for name in ("sigma_px", "sigma_disparity_px"):
             check_float(name, getattr(self, name), "Give pixels.", above=0.0)
-
-    @classmethod
-    def from_mapping(cls, values: Mapping[str, Any]) -> Self:
-        """Build a config from plain values, as `to_mapping` gives them; unknown names are refused."""
-        return from_plain(cls, values, {})
-
-    def to_mapping(self) -> dict[str, Any]:
-        """Return the plain values that repeat this replay, the seed apart."""
-        return to_plain(self)
 
     def camera(self, log: KittiImages, sigma_px: float, sigma_disparity_px: float) -> StereoCamera:
         """Return the drive's camera with these standard deviations [px]."""

@@ -1,8 +1,8 @@
 """The replay of a KITTI drive: tracked stereo features, whose tracks are the landmarks, in the plane."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal, Self
+from typing import Any, Literal
 
 import numpy as np
 
@@ -12,7 +12,8 @@ from slam_backend.filter_options import FilterOptions
 from slam_backend.geometry import between, compose, inverse
 from slam_backend.readers.kitti import KittiLog
 from slam_backend.readers.kitti_steps import make_camera, motion_noise, steps
-from training.replay_config import check_common, from_plain, to_plain
+from training.plain_config import PlainConfig
+from training.replay_config import check_common
 from training.replay_one import PLANAR_GATE, OneReplay, PositionScore, replay_one, score_positions
 
 # A track has its number for a descriptor, so that none is taken for another, and unlike a given identity leaves the
@@ -26,7 +27,7 @@ LOOP_WITHIN = 10.0  # [m] between two poses of one place
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class KittiConfig:
+class KittiConfig(PlainConfig):
     """All that decides a replay of such a drive; the noise of its velocities is read off the log itself.
 
     Attributes:
@@ -57,15 +58,6 @@ class KittiConfig:
         check_common(self.particles, self.estimator, self.seed, self.duration, self.rejuvenate_every)
         for name in ("sigma_px", "sigma_disparity_px"):
             check_float(name, getattr(self, name), "Give pixels.", above=0.0)
-
-    @classmethod
-    def from_mapping(cls, values: Mapping[str, Any]) -> Self:
-        """Build a config from plain values, as `to_mapping` gives them; unknown names are refused."""
-        return from_plain(cls, values, {})
-
-    def to_mapping(self) -> dict[str, Any]:
-        """Return the plain values that repeat this replay, the seed apart."""
-        return to_plain(self)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,9 +1,9 @@
 """The replay of a MR.CLAM log: robots, each with its own filter from its own unknown start, alone or as a team."""
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, Self
+from typing import Any, Literal
 
 import numpy as np
 
@@ -17,7 +17,8 @@ from slam_backend.readers.mrclam import MrclamLog
 from slam_backend.readers.mrclam_steps import Drive, SightingNoise, steps
 from slam_backend.reports import MergeEvent, TeamReport
 from slam_backend.team import TeamSlam
-from training.replay_config import check_common, from_plain, to_plain
+from training.plain_config import PlainConfig
+from training.replay_config import check_common
 from training.replay_one import PLANAR_GATE
 from vslam_env.errors_of_maps import ClaimLedger
 
@@ -54,7 +55,7 @@ MAX_SIGMA_HEADING = 0.05
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ReplayConfig:
+class ReplayConfig(PlainConfig):
     """All that decides a replay.
 
     Attributes:
@@ -97,18 +98,6 @@ class ReplayConfig:
         if not isinstance(self.alone, bool):
             raise bad_argument("alone", "a bool", self.alone, "Say true or false.")
         check_float("dt", self.dt, "Give seconds between steps.", above=0.0)
-
-    @classmethod
-    def from_mapping(cls, values: Mapping[str, Any]) -> Self:
-        """Build a config from plain values, as `to_mapping` gives them; unknown names are refused."""
-        chosen = dict(values)
-        if chosen.get("robots") is not None:
-            chosen["robots"] = tuple(chosen["robots"])
-        return from_plain(cls, chosen, {"drive": Drive, "motion": OdometryModel, "sensor": SightingNoise})
-
-    def to_mapping(self) -> dict[str, Any]:
-        """Return the plain values that repeat this replay, the seed apart."""
-        return to_plain(self)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

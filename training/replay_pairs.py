@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -15,7 +15,7 @@ from slam_backend.frontend.odometry import CameraMotion, camera_motion
 from slam_backend.readers.calibration import Rectifier, load_euroc_calibration
 from slam_backend.readers.kitti_images import read_grey
 from slam_backend.rigid import rotation_angle
-from training.replay_config import from_plain, to_plain
+from training.plain_config import PlainConfig
 
 CORNERS = 1500
 SIGMA_PX, SIGMA_DISPARITY_PX = 0.5, 0.3
@@ -23,7 +23,7 @@ ITERATIONS = 2000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PairsConfig:
+class PairsConfig(PlainConfig):
     """All that decides the alignment of two pairs.
 
     Attributes:
@@ -43,15 +43,6 @@ class PairsConfig:
         check_int("seed", self.seed, 0, "Use 0 or a positive number.")
         check_choice("descriptor", self.descriptor, DESCRIPTORS)
         check_float("max_range", self.max_range, "Give metres.", above=0.0)
-
-    @classmethod
-    def from_mapping(cls, values: Mapping[str, Any]) -> Self:
-        """Build a config from plain values, as `to_mapping` gives them; unknown names are refused."""
-        return from_plain(cls, values, {})
-
-    def to_mapping(self) -> dict[str, Any]:
-        """Return the plain values that repeat this, the seed apart."""
-        return to_plain(self)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

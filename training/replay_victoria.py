@@ -1,8 +1,8 @@
 """The replay of a log of Victoria Park: trees without names, matched by where they stand, and GPS as the truth."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Literal, Self
+from typing import Any, Literal
 
 import numpy as np
 
@@ -17,7 +17,8 @@ from slam_backend.motion import OdometryModel
 from slam_backend.readers.victoria import VictoriaLog
 from slam_backend.readers.victoria_steps import SENSOR, TreeNoise, steps
 from slam_backend.trajectory import Trajectory
-from training.replay_config import check_common, from_plain, to_plain
+from training.plain_config import PlainConfig
+from training.replay_config import check_common
 from training.replay_one import PLANAR_GATE, OneReplay, PositionScore, replay_one, score_positions
 
 # Against the motion that fits the trees of two scans best, a second apart, the odometry turns 4 % and 0.0014 rad/m too
@@ -46,7 +47,7 @@ KNOWN_START = 30.0  # [m] of the path that show where it starts: a GPS fix has n
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class VictoriaConfig:
+class VictoriaConfig(PlainConfig):
     """All that decides a replay of such a log.
 
     Attributes:
@@ -72,15 +73,6 @@ class VictoriaConfig:
 
     def __post_init__(self) -> None:
         check_common(self.particles, self.estimator, self.seed, self.duration, self.rejuvenate_every)
-
-    @classmethod
-    def from_mapping(cls, values: Mapping[str, Any]) -> Self:
-        """Build a config from plain values, as `to_mapping` gives them; unknown names are refused."""
-        return from_plain(cls, values, {"motion": OdometryModel, "sensor": TreeNoise})
-
-    def to_mapping(self) -> dict[str, Any]:
-        """Return the plain values that repeat this replay, the seed apart."""
-        return to_plain(self)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,15 +1,15 @@
 """`RunConfig`: all that decides a run, and the environment and policies that it stands for."""
 
 import tomllib
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 from agents.policy import Policy
 from agents.registry import is_model, make_policy
 from agents.trained import load_model
-from slam_backend.errors import bad_argument, check_choice, check_int
+from slam_backend.errors import check_choice, check_int
+from training.plain_config import PlainConfig
 from vslam_env import vslam_v0
 from vslam_env.config import ACTION_TYPES, GOAL_DECISION_TICKS, PRESETS, SENSORS, TICK, preset_config
 from vslam_env.environment import ExplorationEnv
@@ -20,7 +20,7 @@ EPISODE_S = 180.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RunConfig:
+class RunConfig(PlainConfig):
     """A run, as its command line says it.
 
     Attributes:
@@ -60,22 +60,13 @@ class RunConfig:
         if self.max_cycles is not None:
             check_int("max_cycles", self.max_cycles, 1, "Give a number of steps.")
 
-    @classmethod
-    def from_mapping(cls, values: Mapping[str, Any]) -> Self:
-        """Build a config from plain values, as `to_mapping` gives them; unknown names are refused."""
-        known = [field.name for field in fields(cls)]
-        for name in values:
-            if name not in known:
-                raise bad_argument("config", "one of " + ", ".join(known), name, "Correct the name in the file.")
-        return cls(**values)
-
     def to_mapping(self) -> dict[str, Any]:
         """Return the plain values that repeat this run from any folder, the seed apart."""
         is_path = self.world not in WORLD_FAMILIES
         told = {"world": str(Path(self.world).resolve()) if is_path else self.world, "max_cycles": self.num_steps}
         if is_model(self.policy):
             told["policy"] = str(Path(self.policy).resolve())
-        return {name: value for name, value in (asdict(self) | told).items() if name != "seed"}
+        return PlainConfig.to_mapping(self) | told
 
     @property
     def step_s(self) -> float:

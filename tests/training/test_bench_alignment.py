@@ -161,9 +161,9 @@ def test_every_method_meets_the_same_trials() -> None:
     [
         ({"seeds": 0}, "seeds: expected an int >= 1, got 0"),
         ({"hard": -1}, "hard: expected an int >= 0, got -1"),
-        ({"methods": ()}, "methods: expected at least one, each once"),
+        ({"methods": ()}, "methods: expected at least one value, each once"),
         ({"methods": ("magic",)}, "methods: expected one of 'ransac'"),
-        ({"speed": 1}, "config: expected one of methods, seeds, hard, seed, got 'speed'"),
+        ({"speed": 1}, "config: expected names among methods, seeds, hard, seed, got 'speed'"),
     ],
 )
 def test_bad_configs_are_refused(changed: dict[str, Any], message: str) -> None:

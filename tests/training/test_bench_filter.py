@@ -98,7 +98,7 @@ def test_bad_input_is_one_line_and_status_2(
 
 def test_unknown_names_in_a_config_are_refused() -> None:
     """A misspelt key of a config file is named."""
-    with pytest.raises(ValueError, match=r"config: expected one of particles, .*, got 'partikel'"):
+    with pytest.raises(ValueError, match=r"config: expected names among particles, .*, got 'partikel'"):
         BenchConfig.from_mapping({"partikel": [1]})
 
 

@@ -109,11 +109,11 @@ def test_points_of_a_view_are_named(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"sizes": ()}, "sizes: expected at least one, got no entry"),
+        ({"sizes": ()}, "sizes: expected at least one value, each once, got \\[\\]"),
         ({"walls": (3,)}, "walls: expected an int >= 4, got 3"),
         ({"descriptors": ("surf",)}, "descriptors: expected one of 'usurf'"),
         ({"steps": 0}, "steps: expected an int >= 1"),
-        ({"speed": 1}, "config: expected one of sizes"),
+        ({"speed": 1}, "config: expected names among sizes"),
     ],
 )
 def test_impossible_benches_are_refused(change: dict[str, Any], message: str) -> None:

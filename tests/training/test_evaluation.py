@@ -87,7 +87,7 @@ def test_splits_are_those_of_many_worlds(tmp_path: Path) -> None:
     ("values", "says"),
     [
         ({}, "model: expected a model that vslam train wrote, got no model"),
-        ({"model": "m", "mood": 1}, "config: expected one of model, .* got 'mood'"),
+        ({"model": "m", "mood": 1}, "config: expected names among model, .* got 'mood'"),
         ({"model": "m", "seeds": 1}, "seeds: expected an int >= 2, got 1"),
         ({"model": "m", "split": "train"}, "split: expected one of 'validation', 'test', got 'train'"),
         ({"model": "m", "policies": ["best"]}, "policies: expected one of 'frontier'"),

@@ -197,7 +197,7 @@ def test_a_missing_gpu_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     ("values", "says"),
     [
-        ({"speed": 3}, "config: expected one of preset, world, .* got 'speed'"),
+        ({"speed": 3}, "config: expected names among preset, world, .* got 'speed'"),
         ({"preset": "fast"}, "preset: expected one of 'quick', 'smoke', got 'fast'"),
         ({"robots": 9}, "robots: expected an int from 1 to 8, got 9"),
         ({"batch": 1}, "batch: expected an int >= 2, got 1"),

@@ -59,10 +59,10 @@ def test_sums_count_what_is_false_and_goals_what_is_missed() -> None:
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
-        ({"durations": ()}, "durations: expected at least one, each once"),
+        ({"durations": ()}, "durations: expected at least one value, each once"),
         ({"durations": (-1.0,)}, "durations: expected a finite number >= 0"),
         ({"particles": 0}, "particles: expected an int >= 1"),
-        ({"speed": 1}, "config: expected one of path, durations"),
+        ({"speed": 1}, "config: expected names among path, durations"),
     ],
 )
 def test_bad_configs_are_refused(changed: dict[str, Any], message: str) -> None:

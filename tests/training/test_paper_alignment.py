@@ -172,10 +172,10 @@ def test_the_commands_write_pictures_and_tables(
         (Fig2Config, {"every": 0.1}, "every: expected a finite number >= 0.25"),
         (Fig2Config, {"length": 2.0}, "length: expected a finite number >= 5"),
         (Fig2Config, {"seeds": 0}, "seeds: expected an int >= 1"),
-        (Fig2Config, {"speed": 0}, "config: expected one of length, every, landmarks"),
+        (Fig2Config, {"speed": 0}, "config: expected names among length, every, landmarks"),
         (PairConfig, {"particles": 0}, "particles: expected an int >= 1"),
         (PairConfig, {"seed": -1}, "seed: expected an int >= 0"),
-        (PairConfig, {"speed": 0}, "config: expected one of length, landmarks"),
+        (PairConfig, {"speed": 0}, "config: expected names among length, landmarks"),
     ],
 )
 def test_bad_configs_are_refused(kind: Any, changed: dict[str, Any], message: str) -> None:

@@ -317,7 +317,7 @@ def test_bad_input_is_one_line_and_status_2(
 
 def test_a_config_file_with_an_unknown_name_is_refused() -> None:
     """A misspelt key is named rather than ignored."""
-    with pytest.raises(ValueError, match=r"config: expected one of world, .*, got 'colour'"):
+    with pytest.raises(ValueError, match=r"config: expected names among world, .*, got 'colour'"):
         RunConfig.from_mapping({"colour": "blue"})
 
 
