@@ -1,6 +1,9 @@
 """The few ways in which this project compiles a kernel: serial, cached on disk, without the interpreter lock."""
 
 from collections.abc import Callable
+from functools import lru_cache
+from hashlib import sha256
+from pathlib import Path
 from typing import Any, ParamSpec, TypeVar, cast
 
 import numba
@@ -11,13 +14,15 @@ from numba.extending import intrinsic
 P = ParamSpec("P")
 T = TypeVar("T")
 
+KERNELS = "_kernels"  # a folder whose modules hold kernels that call each other
+
 
 def jit(function: Callable[P, T]) -> Callable[P, T]:
     """Compile `function` with numba and keep its signature for the type checker.
 
     numba's disk cache notices edits of the file that holds `function`, not of other files whose kernels it calls:
-    kernels that call each other therefore live in one module. `parallel=True` is left out on purpose, because it
-    breaks forked workers.
+    kernels that call each other therefore live in one module, or in one folder named `_kernels`, of which an edit of
+    any file is noticed. `parallel=True` is left out on purpose, because it breaks forked workers.
     """
     return _compiled(function)
 
@@ -51,9 +56,23 @@ def any_order(function: Callable[P, T]) -> Callable[P, T]:
 def _compiled(function: Callable[P, T], **options: Any) -> Callable[P, T]:
     """Compile without the interpreter lock and with the cache on disk, if there is a place for it."""
     try:
-        return cast(Callable[P, T], numba.njit(cache=True, nogil=True, **options)(function))
+        kernel = numba.njit(cache=True, nogil=True, **options)(function)
     except RuntimeError:  # neither the package's folder nor the user's can be written: each process compiles anew
         return cast(Callable[P, T], numba.njit(nogil=True, **options)(function))
+    folder = Path(function.__code__.co_filename).parent
+    if folder.name == KERNELS and not numba.config.DISABLE_JIT:
+        file = kernel._cache._cache_file
+        file._source_stamp = (file._source_stamp, _contents(folder))
+    return cast(Callable[P, T], kernel)
+
+
+@lru_cache
+def _contents(folder: Path) -> bytes:
+    """Return a digest of all modules of a folder."""
+    digest = sha256()
+    for file in sorted(folder.glob("*.py")):
+        digest.update(file.read_bytes())
+    return digest.digest()
 
 
 def _float_bits(typing_context: Any, x: Any) -> Any:

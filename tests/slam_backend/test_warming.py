@@ -1,6 +1,7 @@
 import subprocess
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numba
@@ -61,6 +62,8 @@ team = TeamSlam(2, num_particles=7, attempts=AttemptOptions(every=1))
 for size in (1, 3, 9, 30, 30, 30):
     team.step([None, None], [Measurements(points[:size], looks[:size])] * 2)
 assert len(team.groups) == 1
+for robot in range(2):
+    team.standpoint(robot), team.outline(robot)
 map_error(team.map(0).means, rng.permutation(len(team.map(0))), np.asfortranarray(points))
 for late in sorted(versions() - before):
     print(*late)
@@ -113,6 +116,24 @@ def test_kernels_work_where_no_cache_can_be_written(monkeypatch: pytest.MonkeyPa
 
     for compiled in (_jit.jit(double), _jit.inlined(double), _jit.lanes(double), _jit.lanes_inlined(double)):
         assert compiled(4.0) == 8.0
+
+
+def test_an_edit_of_a_kernel_is_noticed_by_kernels_of_its_folder_that_call_it(tmp_path: Path) -> None:
+    """What is compiled into another module's kernel does not linger in the cache."""
+    folder = tmp_path / "_kernels"
+    folder.mkdir()
+    (folder / "caller.py").write_text(
+        "from slam_backend._jit import jit\n\nfrom _kernels.callee import answer\n\n\n"
+        "@jit\ndef ask(x):\n    return answer(x)\n"
+    )
+    answers = []
+    for number in (1.0, 2.0):
+        (folder / "callee.py").write_text(
+            f"from slam_backend._jit import inlined\n\n\n@inlined\ndef answer(x):\n    return x + {number}\n"
+        )
+        code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); from _kernels.caller import ask; print(ask(0.0))"
+        answers.append(float(subprocess.run([sys.executable, "-c", code], capture_output=True, check=True).stdout))
+    assert answers == [1.0, 2.0]
 
 
 def test_a_watch_hears_of_our_kernels_only() -> None:

@@ -1,0 +1,36 @@
+"""The compiled inner loops of the filter: one robot's frame, for all particles.
+
+Particles are taken in blocks of `LANES`, and every loop over the lanes of a block is plain arithmetic on rows of one
+flat workspace, which the compiler turns into vector instructions; decisions become masks. A row is addressed as
+`work[ROW + i]`, lane i, with ROW a multiple of LANES known at compile time.
+
+Landmarks lie in `values[row, block, c, lane]` (flattened) with c = (x, y, z, Sxx, Sxy, Sxz, Syy, Syz, Szz) in the map
+frame, and `counts[row, particle]` says how often the particle saw it (0: it does not hold it). Resampling does not move
+them: see `_particle_maps.py`, which says what `row_of`, `map_of` and `maps` are. Everything is expressed in the
+map frame, where the derivative of a measured point with respect to the landmark is the identity (the robot only yaws).
+
+The measurement model (Eqs. 5-7). A landmark mu lies at e = mu - p from the camera centre p. A point v measured in the
+camera, turned into map axes, gives the innovation r = k (R v - e) with k = Z_predicted / Z_measured. This is the EKF in
+(u, v, disparity): the innovation and its covariance are those of the image coordinates, mapped to metres at the
+predicted point, and the density of the image coordinates is that of r times Z_predicted^4 (times a constant of the
+camera). Where the caller gives covariances, k = 1 and there is no such factor.
+
+The pose. x = x0 + C xi with xi ~ N(0, I) before the frame: nothing is inverted, so a motion without noise needs no
+special case. With A = (dr/dx) C and S = Sigma + R, a match adds J = A^T S^-1 A to the information of xi and
+g = A^T S^-1 r to the gradient. A gate takes S + A P A^T, with P the covariance of xi.
+"""
+
+from slam_backend._kernels.candidates import extent, to_robot_axes
+from slam_backend._kernels.fastslam1 import update_fastslam1
+from slam_backend._kernels.fastslam2 import update_fastslam2
+from slam_backend._kernels.landmark_updates import YOUNG
+from slam_backend._kernels.layout import CANDIDATE_ROWS, FAR, LANES, MIN_DEPTH, WORK_ROWS
+from slam_backend._kernels.motion import move_blind
+from slam_backend._kernels.places import carry_odds, refresh
+from slam_backend._kernels.resampling import resample
+from slam_backend._kernels.weights import mixture, summarise, weigh
+
+__all__ = [
+    "CANDIDATE_ROWS", "FAR", "LANES", "MIN_DEPTH", "WORK_ROWS", "YOUNG", "carry_odds", "extent", "mixture",
+    "move_blind", "refresh", "resample", "summarise", "to_robot_axes", "update_fastslam1", "update_fastslam2", "weigh",
+]  # fmt: skip

@@ -1,0 +1,166 @@
+"""The landmarks' own EKFs at a known pose, for all lanes of a block (Eqs. 5-10; Algorithm 1, l. 30-37)."""
+
+import numpy as np
+
+from slam_backend._jit import lanes, lanes_inlined
+from slam_backend._kernels.innovations import innovate
+from slam_backend._kernels.lane_math import inverted, quadratic_form
+from slam_backend._kernels.layout import (
+    COS,
+    DEPTH,
+    LANES,
+    MIN_DEPTH,
+    N00,
+    N01,
+    N02,
+    N11,
+    N12,
+    N22,
+    Q_D,
+    R0,
+    R1,
+    R2,
+    SIN,
+    TILE,
+    X,
+    Y,
+)
+from slam_backend._kernels.likelihoods import count_likelihood
+from slam_backend.errors import FloatArray, Int32Array
+
+YOUNG = 4  # a landmark seen up to so many times is updated by the iterated EKF: its depth is still vague
+
+
+@lanes_inlined
+def _updated(
+    work: FloatArray, tile: FloatArray, i: int, i00: float, i01: float, i02: float, i11: float, i12: float, i22: float,
+    match: bool,
+) -> None:
+    """Update a landmark where `match`, S^-1 given (Eqs. 8-10)."""
+    p00, p01, p02 = tile[3 * LANES + i], tile[4 * LANES + i], tile[5 * LANES + i]
+    p11, p12, p22 = tile[6 * LANES + i], tile[7 * LANES + i], tile[8 * LANES + i]
+    n00, n01, n02 = work[N00 + i], work[N01 + i], work[N02 + i]
+    n11, n12, n22 = work[N11 + i], work[N12 + i], work[N22 + i]
+    rx, ry, rz = work[R0 + i], work[R1 + i], work[R2 + i]
+    k00, k01, k02 = p00 * i00 + p01 * i01 + p02 * i02, p00 * i01 + p01 * i11 + p02 * i12, (
+        p00 * i02 + p01 * i12 + p02 * i22
+    )  # Eq. 8
+    k10, k11, k12 = p01 * i00 + p11 * i01 + p12 * i02, p01 * i01 + p11 * i11 + p12 * i12, (
+        p01 * i02 + p11 * i12 + p12 * i22
+    )
+    k20, k21, k22 = p02 * i00 + p12 * i01 + p22 * i02, p02 * i01 + p12 * i11 + p22 * i12, (
+        p02 * i02 + p12 * i12 + p22 * i22
+    )
+    tile[i] += k00 * rx + k01 * ry + k02 * rz if match else 0.0  # Eq. 9
+    tile[LANES + i] += k10 * rx + k11 * ry + k12 * rz if match else 0.0
+    tile[2 * LANES + i] += k20 * rx + k21 * ry + k22 * rz if match else 0.0
+    # Eq. 10, (I - K) Sigma, written as K R: no difference of nearly equal numbers, and made symmetric.
+    q01 = 0.5 * (k00 * n01 + k01 * n11 + k02 * n12 + k10 * n00 + k11 * n01 + k12 * n02)
+    q02 = 0.5 * (k00 * n02 + k01 * n12 + k02 * n22 + k20 * n00 + k21 * n01 + k22 * n02)
+    q12 = 0.5 * (k10 * n02 + k11 * n12 + k12 * n22 + k20 * n01 + k21 * n11 + k22 * n12)
+    tile[3 * LANES + i] = k00 * n00 + k01 * n01 + k02 * n02 if match else p00
+    tile[4 * LANES + i] = q01 if match else p01
+    tile[5 * LANES + i] = q02 if match else p02
+    tile[6 * LANES + i] = k10 * n01 + k11 * n11 + k12 * n12 if match else p11
+    tile[7 * LANES + i] = q12 if match else p12
+    tile[8 * LANES + i] = k20 * n02 + k21 * n12 + k22 * n22 if match else p22
+
+
+@lanes_inlined
+def _inverse_of_sum(
+    work: FloatArray, tile: FloatArray, i: int
+) -> tuple[float, float, float, float, float, float, float]:
+    """Return S^-1 and |S|, S = Sigma + R (Eq. 7)."""
+    return inverted(
+        tile[3 * LANES + i] + work[N00 + i], tile[4 * LANES + i] + work[N01 + i], tile[5 * LANES + i] + work[N02 + i],
+        tile[6 * LANES + i] + work[N11 + i], tile[7 * LANES + i] + work[N12 + i], tile[8 * LANES + i] + work[N22 + i],
+    )
+
+
+@lanes
+def update(work: FloatArray, tile: FloatArray, mask: FloatArray) -> None:
+    """At a known pose: update the landmark where `mask` is 1 and it lies ahead of the camera (Eqs. 5-10)."""
+    for i in range(LANES):
+        i00, i01, i02, i11, i12, i22, _ = _inverse_of_sum(work, tile, i)
+        match = mask[i] > 0.0 and work[DEPTH + i] >= MIN_DEPTH
+        _updated(work, tile, i, i00, i01, i02, i11, i12, i22, match)
+
+
+@lanes
+def gate_and_update(
+    work: FloatArray, tile: FloatArray, record: FloatArray, chosen: FloatArray, seen: Int32Array, q: float,
+    admit: FloatArray, gate: float,
+) -> None:
+    """At a known pose: where admitted and inside the gate, weigh and update the landmark (Eqs. 5-11).
+
+    Args:
+        chosen: (LANES,) becomes q where the lane matched.
+        seen: (LANES,) is counted up there.
+        admit: (LANES,) 1 where the lane may match.
+        record: Row Q_D is written.
+    """
+    for i in range(LANES):
+        i00, i01, i02, i11, i12, i22, det = _inverse_of_sum(work, tile, i)
+        distance = quadratic_form(i00, i01, i02, i11, i12, i22, work[R0 + i], work[R1 + i], work[R2 + i])
+        depth = work[DEPTH + i]
+        match = admit[i] > 0.0 and distance <= gate and depth >= MIN_DEPTH
+        _updated(work, tile, i, i00, i01, i02, i11, i12, i22, match)
+        count_likelihood(work, i, match, distance, det, depth)
+        record[Q_D + i] = distance
+        chosen[i] = q if match else chosen[i]
+        seen[i] += np.int32(1) if match else np.int32(0)
+
+
+@lanes
+def find_young(seen: Int32Array, mask: FloatArray, young: FloatArray) -> int:
+    """Write 1 where a matched landmark was seen a few times only; return how many those are."""
+    count = 0
+    for i in range(len(seen)):
+        on = mask[i] > 0.0 and seen[i] <= YOUNG
+        young[i] = 1.0 if on else 0.0
+        count += 1 if on else 0
+    return count
+
+
+@lanes
+def relinearise(work: FloatArray, tile: FloatArray, before: FloatArray) -> None:
+    """Refer the innovation, taken at the means in `tile`, to those in `before`, which come back (iterated EKF)."""
+    for i in range(LANES):
+        work[R0 + i] += tile[i] - before[i]
+        work[R1 + i] += tile[LANES + i] - before[LANES + i]
+        work[R2 + i] += tile[2 * LANES + i] - before[2 * LANES + i]
+    for j in range(TILE):
+        tile[j] = before[j]
+
+
+@lanes
+def count_matches(seen: Int32Array, mask: FloatArray) -> None:
+    for i in range(len(seen)):
+        seen[i] += np.int32(1) if mask[i] > 0.0 else np.int32(0)
+
+
+@lanes
+def new_landmark(
+    work: FloatArray, tile: FloatArray, points: FloatArray, noises: FloatArray, n: int, given: bool, camera: FloatArray,
+    mask: FloatArray, seen: Int32Array,
+) -> None:
+    """Write mean and covariance of a landmark first seen from a known pose (Algorithm 1, l. 30-31 corrected).
+
+    All lanes of the block are written; `seen` becomes 1 where `mask` is, and 0 elsewhere: those do not hold it.
+    """
+    ahead, left, up = camera[4] + points[n, 0], camera[5] + points[n, 1], camera[6] + points[n, 2]
+    for i in range(LANES):
+        c, s = work[COS + i], work[SIN + i]
+        tile[i] = work[X + i] + c * ahead - s * left
+        tile[LANES + i] = work[Y + i] + s * ahead + c * left
+        tile[2 * LANES + i] = up
+    innovate(work, tile, points, noises, n, given, camera)
+    for i in range(LANES):  # l. 31 *: G^-1 R G^-T
+        tile[3 * LANES + i] = work[N00 + i]
+        tile[4 * LANES + i] = work[N01 + i]
+        tile[5 * LANES + i] = work[N02 + i]
+        tile[6 * LANES + i] = work[N11 + i]
+        tile[7 * LANES + i] = work[N12 + i]
+        tile[8 * LANES + i] = work[N22 + i]
+    for i in range(len(seen)):
+        seen[i] = np.int32(1) if mask[i] > 0.0 else np.int32(0)

@@ -1,0 +1,38 @@
+"""Where things lie in the workspace, and constants that kernels share."""
+
+import math
+
+import numpy as np
+
+LANES = 64
+REJECTED = -1
+MIN_DEPTH = 0.05  # [m]; nothing is predicted nearer to the camera plane than this
+FARTHEST = float(np.finfo(np.float64).max)  # the largest squared distance that is not infinite
+FAR = np.float32(1e18)  # no descriptor comes near a free slot's
+LOG_2PI = math.log(2.0 * math.pi)
+LN2 = math.log(2.0)
+
+# Rows of the workspace.
+X, Y, T, COS, SIN = (LANES * k for k in range(5))  # the pose at which innovations are taken
+X0, Y0, T0 = (LANES * k for k in range(5, 8))  # the predicted pose
+C00, C10, C11, C20, C21, C22 = (LANES * k for k in range(8, 14))  # factor C of its covariance, with C01 below
+XI0, XI1, XI2 = (LANES * k for k in range(14, 17))
+SPREAD00, SPREAD01, SPREAD02, SPREAD11, SPREAD12, SPREAD22 = (LANES * k for k in range(17, 23))  # covariance of xi
+R0, R1, R2 = (LANES * k for k in range(23, 26))  # innovation
+N00, N01, N02, N11, N12, N22, DEPTH = (LANES * k for k in range(26, 33))  # sensor noise in map axes, predicted depth
+J00, J01, J02, J11, J12, J22, G0, G1, G2 = (LANES * k for k in range(33, 42))  # sums over matches
+SUM_D, MATCHED, DET, DET_EXP, DEPTHS, DEPTHS_EXP = (LANES * k for k in range(42, 48))  # of the likelihood
+CLUTTER = LANES * 48  # log-likelihood of the measurements that are not matched
+BEST, SECOND, CHOSEN, DEAD, LOG_BEST = (LANES * k for k in range(49, 54))  # of one measurement
+LOST, SURE, CONTRADICT, WIDE = (LANES * k for k in range(54, 58))
+TAKEN, C01 = LANES * 58, LANES * 59
+KEPT00, KEPT10, KEPT11, KEPT20, KEPT21, KEPT22, KEPT01, KEPT_WIDE = (LANES * k for k in range(60, 68))  # of C
+WORK_ROWS = 68
+
+# Rows of one candidate's record.
+QJ00, QJ01, QJ02, QJ11, QJ12, QJ22, QG0, QG1, QG2 = (LANES * k for k in range(9))
+Q_SQUARE, Q_DET, Q_DET_POSE, Q_DEPTH, Q_METRES2, Q_D, Q_FIRST_D, Q_HELD = (LANES * k for k in range(9, 17))
+CANDIDATE_ROWS = 17
+
+TILE = 9 * LANES
+SHIFT = LANES.bit_length() - 1  # particle m is lane m & (LANES - 1) of block m >> SHIFT

@@ -1,0 +1,118 @@
+"""Particles become copies of their ancestors, their landmarks lazily."""
+
+import numpy as np
+
+from slam_backend._jit import jit
+from slam_backend._kernels.layout import FAR
+from slam_backend.errors import Float32Array, FloatArray, Int32Array, IntArray
+
+
+@jit
+def settle(ancestors: IntArray, count: int) -> tuple[IntArray, IntArray]:
+    """Arrange resampled particles so that most stay in place.
+
+    A particle with at least one copy keeps its place; surplus copies fill the places of the dead, in ascending order.
+
+    Args:
+        ancestors: (count,) index of each new particle's parent, ascending.
+        count: M.
+
+    Returns:
+        The places that change and, for each, the particle that is copied into it.
+    """
+    copies = np.zeros(count, dtype=np.int64)
+    for i in range(count):
+        copies[ancestors[i]] += 1
+    targets = np.empty(count, dtype=np.int64)
+    sources = np.empty(count, dtype=np.int64)
+    moves, place = 0, 0
+    for parent in range(count):
+        for _ in range(copies[parent] - 1):
+            while copies[place] > 0:
+                place += 1
+            targets[moves] = place
+            sources[moves] = parent
+            moves += 1
+            place += 1
+    return targets[:moves], sources[:moves]
+
+
+@jit
+def resample(
+    ancestors: IntArray, poses: FloatArray, starts: FloatArray, means: FloatArray, covariances: FloatArray,
+    path_log_weights: FloatArray, maps: Int32Array, users: IntArray, map_of: IntArray, ids: IntArray,
+    row_of: IntArray, counts: Int32Array, heads: Float32Array, free_rows: IntArray, free_slots: IntArray,
+    tops: IntArray,
+) -> int:
+    """Let particles become copies of their ancestors, their landmarks lazily, and free what no survivor holds.
+
+    Landmarks that were up to date get one new ancestor map; the others' maps are composed with it.
+
+    Args:
+        ancestors: (M,) index of each new particle's parent, ascending; they are settled first.
+        poses, starts, means, covariances: (K, c, P); columns are copied.
+        path_log_weights: (M,), likewise.
+        maps and the following: The store, see `ParticleMaps`. At least one map is free.
+
+    Returns:
+        How many maps are still free.
+    """
+    count = len(ancestors)
+    places = settle(ancestors, count)
+    targets, sources = places[0].astype(np.uint32), places[1].astype(np.uint32)  # unsigned: none counts from the end
+    moves = len(targets)
+    for i in range(moves):
+        path_log_weights[targets[i]] = path_log_weights[sources[i]]
+    for robot in range(poses.shape[0]):
+        for c in range(3):
+            for i in range(moves):
+                target, source = targets[i], sources[i]
+                poses[robot, c, target] = poses[robot, c, source]
+                starts[robot, c, target] = starts[robot, c, source]
+                means[robot, c, target] = means[robot, c, source]
+        for c in range(6):
+            for i in range(moves):
+                covariances[robot, c, targets[i]] = covariances[robot, c, sources[i]]
+    fresh, free = 0, 0
+    for e in range(1, len(users)):
+        if users[e] > 0:
+            own = maps[e]
+            for i in range(moves):
+                own[targets[i]] = own[sources[i]]
+        else:
+            fresh = e
+            free += 1
+    used = False
+    for slot in range(len(ids)):
+        if ids[slot] < 0:
+            continue
+        if moves > 0 and map_of[slot] == 0:
+            if not used:
+                used = True
+                free -= 1
+                own = maps[fresh]
+                for m in range(len(own)):
+                    own[m] = m
+                for i in range(moves):
+                    own[targets[i]] = sources[i]
+            map_of[slot] = fresh
+            users[fresh] += 1
+        e = map_of[slot]
+        row = row_of[slot]
+        alive = False
+        for m in range(count):
+            if counts[row, maps[e, m] if e > 0 else m] > 0:
+                alive = True
+                break
+        if not alive:
+            if e > 0:
+                users[e] -= 1
+                map_of[slot] = 0
+            ids[slot] = -1
+            for k in range(heads.shape[0]):
+                heads[k, slot] = FAR
+            free_rows[tops[0]] = row
+            free_slots[tops[1]] = slot
+            tops[0] += 1
+            tops[1] += 1
+    return free
