@@ -60,7 +60,7 @@ def _compiled(function: Callable[P, T], **options: Any) -> Callable[P, T]:
     except RuntimeError:  # neither the package's folder nor the user's can be written: each process compiles anew
         return cast(Callable[P, T], numba.njit(nogil=True, **options)(function))
     folder = Path(function.__code__.co_filename).parent
-    if folder.name == KERNELS and not numba.config.DISABLE_JIT:
+    if folder.name == KERNELS and hasattr(kernel, "_cache"):  # it has none where NUMBA_DISABLE_JIT is set
         file = kernel._cache._cache_file
         file._source_stamp = (file._source_stamp, _contents(folder))
     return cast(Callable[P, T], kernel)
