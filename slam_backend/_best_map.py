@@ -8,6 +8,7 @@ from slam_backend._jit import jit
 from slam_backend._kernels import LANES
 from slam_backend._particle_maps import ParticleMaps
 from slam_backend.errors import FloatArray, IntArray
+from slam_backend.landmark_map import MapOutline
 
 
 @jit
@@ -52,6 +53,43 @@ def _gather(
                 entry += 1
         times[i], names[i] = counts[row, place], ids[slot]
     return means, covariances, times, names
+
+
+@jit
+def _outline(
+    ids: Any, row_of: Any, map_of: Any, maps: Any, values: Any, counts: Any, m: int, min_count: int, lanes: int,
+    means: Any, variances: Any, times: Any, names: Any,
+) -> tuple[int, bool]:  # fmt: skip
+    """Write what particle m holds with at least so many measurements; return how many, and whether ids ascend."""
+    n, last, ascending, padded = 0, -1, True, counts.shape[1]
+    for slot in range(len(ids)):
+        if ids[slot] >= 0:
+            row, place = row_of[slot], maps[map_of[slot], m] if map_of[slot] > 0 else m
+            if counts[row, place] >= min_count:
+                at = row * 9 * padded + place // lanes * 9 * lanes + place % lanes
+                for axis in range(3):
+                    means[n, axis] = values[at + axis * lanes]
+                variances[n] = values[at + 3 * lanes] + values[at + 6 * lanes] + values[at + 8 * lanes]
+                times[n], names[n] = counts[row, place], ids[slot]
+                ascending &= ids[slot] > last
+                last = ids[slot]
+                n += 1
+    return n, ascending
+
+
+def best_outline(maps: ParticleMaps, m: int, min_count: int) -> MapOutline:
+    """Return the outline of `best_map`: the same landmarks in the same order. Fresh arrays."""
+    room = len(maps.ids)
+    means, variances = np.empty((room, 3)), np.empty(room)
+    times, names = np.empty(room, np.int64), np.empty(room, np.int64)
+    n, ascending = _outline(
+        maps.ids, maps.row_of, maps.map_of, maps.maps, maps.values, maps.counts, m, min_count, LANES,
+        means, variances, times, names,
+    )  # fmt: skip
+    if ascending:
+        return MapOutline(means[:n], variances[:n], times[:n], names[:n])
+    order = np.argsort(names[:n])
+    return MapOutline(means[order], variances[order], times[order], names[order])
 
 
 def best_map(maps: ParticleMaps, m: int, min_count: int) -> tuple[FloatArray, FloatArray, Any, IntArray, IntArray]:

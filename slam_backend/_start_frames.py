@@ -8,6 +8,23 @@ import numpy as np
 from slam_backend._jit import jit
 from slam_backend.errors import FloatArray
 
+AT_ORIGIN, KNOWN, SPREAD = 0, 1, 2  # what starts of particles can be
+
+
+@jit
+def start_kind(starts: Any, count: int, best: int, start: Any) -> int:
+    """Tell whether the starts (3, P) of `count` particles are all the origin, all the same, or differ.
+
+    The start of particle `best` is written to `start` (3,).
+    """
+    at_origin = same = True
+    for axis in range(3):
+        start[axis] = starts[axis, best]
+        for m in range(count):
+            at_origin &= starts[axis, m] == 0.0
+            same &= starts[axis, m] == starts[axis, 0]
+    return AT_ORIGIN if at_origin else KNOWN if same else SPREAD
+
 
 @jit
 def seen_from_starts(starts: Any, means: Any, covariances: Any, count: int) -> tuple[FloatArray, FloatArray]:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from slam_backend import _kernels
-from slam_backend._best_map import best_map
+from slam_backend._best_map import best_map, best_outline
 from slam_backend._existence_step import ExistenceStep
 from slam_backend._frame_buffers import FrameBuffers, Turn
 from slam_backend._particle_maps import ParticleMaps, aligned
@@ -27,7 +27,7 @@ from slam_backend.errors import FloatArray, IntArray, bad_argument, check_array,
 from slam_backend.existence import ExistenceModel
 from slam_backend.filter_options import FilterOptions
 from slam_backend.geometry import between, compose, rotate_covariances, wrap_angle
-from slam_backend.landmark_map import LandmarkMap
+from slam_backend.landmark_map import LandmarkMap, MapOutline
 from slam_backend.measurements import Measurements
 from slam_backend.motion import OdometryModel
 from slam_backend.reports import PoseEstimate, RejuvenationReport, StepReport
@@ -226,15 +226,19 @@ class FastSlam:
         Each particle's pose is seen from where the robot started in that particle, so that what the filter does not
         know of the start, after a merge, does not blur it.
         """
-        starts = self._starts[self._check_robot(robot), :, : self.num_particles]
-        if not starts.any():  # the map frame is its own start frame
-            return self._estimates[robot]
-        if (starts == starts[:, :1]).all():
-            estimate = self._estimates[robot]
-            pose = between(starts[:, 0], estimate.mean)
-            return PoseEstimate(pose, rotate_covariances(-starts[2, 0], estimate.covariance))
+        return self._seen_from_start(self._check_robot(robot))[0]
+
+    def _seen_from_start(self, robot: int) -> tuple[PoseEstimate, FloatArray]:
+        """Return what `pose_from_start` and `start_pose` return."""
+        start, estimate = np.empty(3), self._estimates[robot]
+        kind = start_kind(self._starts[robot], self.num_particles, self.best_particle, start)
+        if kind == AT_ORIGIN:  # the map frame is its own start frame
+            return estimate, start
+        if kind == KNOWN:
+            turned = rotate_covariances(-start[2], estimate.covariance)
+            return PoseEstimate(between(start, estimate.mean), turned), start
         seen = seen_from_starts(self._starts[robot], self._means[robot], self._covariances[robot], self.num_particles)
-        return _mixture(*seen, self.weights)
+        return _mixture(*seen, self.weights), start
 
     def particles_from_start(self, robot: int = 0) -> FloatArray:
         """Return a robot's poses (M, 3), each seen from where it started in that particle."""
@@ -271,6 +275,10 @@ class FastSlam:
         return LandmarkMap._trusted(
             means, covariances, self._maps.descriptors[slots], counts.astype(np.int64), self._maps.ids[slots]
         )
+
+    def outline(self, min_count: int = 1) -> MapOutline:
+        """Return the outline of `map(min_count=min_count)`, much faster."""
+        return best_outline(self._maps, self.best_particle, max(min_count, 1))
 
     def existence(self) -> tuple[IntArray, FloatArray]:
         """Return the ids (n,) of the landmarks of `map()`, ascending, and the probability (n,) that each exists.

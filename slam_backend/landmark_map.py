@@ -4,7 +4,7 @@ import zipfile
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,6 +17,22 @@ FORMAT_VERSION = 1
 # What numpy and zipfile raise on files that are truncated, damaged or of another kind.
 UNREADABLE = (OSError, ValueError, KeyError, EOFError, TypeError, RuntimeError, zipfile.BadZipFile, zlib.error)
 FIELDS = ("means", "covariances", "descriptors", "counts", "ids")
+
+
+class MapOutline(NamedTuple):
+    """What can be asked of a map at every step, for it costs microseconds: no descriptors, no whole covariances.
+
+    Attributes:
+        means: (N, 3) float64 [m].
+        variances: (N,) float64 [m^2]. Traces of the covariances.
+        counts: (N,) int64.
+        ids: (N,) int64.
+    """
+
+    means: FloatArray
+    variances: FloatArray
+    counts: IntArray
+    ids: IntArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,6 +102,12 @@ class LandmarkMap:
 
     def __len__(self) -> int:
         return len(self.means)
+
+    @property
+    def outline(self) -> MapOutline:
+        """Its places, spreads, counts and names, in the map's order."""
+        spread = self.covariances
+        return MapOutline(self.means, spread[:, 0, 0] + spread[:, 1, 1] + spread[:, 2, 2], self.counts, self.ids)
 
     @classmethod
     def empty(cls, descriptor_size: int = 64) -> Self:

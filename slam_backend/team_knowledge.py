@@ -1,6 +1,6 @@
 """What a team of filters knows: groups, poses, maps, diagnostics. `TeamSlam` adds what changes them."""
 
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -8,9 +8,29 @@ from slam_backend.branches import Branch
 from slam_backend.errors import FloatArray, IntArray, bad_argument
 from slam_backend.geometry import inverse
 from slam_backend.groups import Group
-from slam_backend.landmark_map import LandmarkMap
+from slam_backend.landmark_map import LandmarkMap, MapOutline
 from slam_backend.records import Records
 from slam_backend.reports import MergeEvent, PoseEstimate
+
+
+class Standpoint(NamedTuple):
+    """What a robot goes by, as the methods of `TeamKnowledge` tell it one by one.
+
+    Attributes:
+        members: See `members`.
+        mates: See `mates`.
+        number: Of its map, see `maps`.
+        pose: In the map frame.
+        own_pose: In its own start frame.
+        start_from_group: (3,) [m, m, rad]. See `start_from_group`.
+    """
+
+    members: tuple[int, ...]
+    mates: tuple[int, ...]
+    number: int
+    pose: PoseEstimate
+    own_pose: PoseEstimate
+    start_from_group: FloatArray
 
 
 class TeamKnowledge:
@@ -141,6 +161,21 @@ class TeamKnowledge:
         """
         branch, index = self._find(robot)
         return inverse(branch.filter.start_pose(index))
+
+    def outline(self, robot: int, min_count: int = 1) -> MapOutline:
+        """Return the outline of `map(robot, min_count=min_count)`, much faster."""
+        return self._find(robot)[0].filter.outline(min_count)
+
+    def num_particles(self, robot: int) -> int:
+        """Return how many particles the robot's filter has."""
+        return self._find(robot)[0].filter.num_particles
+
+    def standpoint(self, robot: int) -> Standpoint:
+        """Return where a robot stands, all at once."""
+        branch, index = self._find(robot)
+        own_pose, start = branch.filter._seen_from_start(index)
+        pose = branch.filter.pose(index)
+        return Standpoint(branch.robots, branch.live, branch.number, pose, own_pose, inverse(start))
 
     def _group_of(self, robot: int) -> Group:
         return self._place(robot)[0]

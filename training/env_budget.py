@@ -44,7 +44,7 @@ PHASES = (
     Phase("landmark sensor", 40, ((LandmarkSensor, "measure"),)),
     Phase("scans", 20, ((Scan, "measure"),)),
     Phase("grid painting", 20, ((SharedGrids, "paint"), (SharedGrids, "follow"), (SharedGrids, "meet"))),
-    Phase("filters", 135, ((FastSlam, "step"),)),
+    Phase("filters", 135, ((FastSlam, "_step_checked"),)),
     Phase("team, alignment", 40, ((TeamSlam, "step"),)),
     Phase("errors", 15, ((Episode, "map_scores"), (Episode, "pose_errors"), (Episode, "standing"))),
     Phase("local grids", 20, ((observation, "local_grid"),)),

@@ -11,7 +11,7 @@ from slam_backend.alignment import Alignment
 from slam_backend.errors import FloatArray, IntArray, bad_argument
 from slam_backend.filter_options import FilterOptions
 from slam_backend.geometry import compose, rotate_covariances
-from slam_backend.landmark_map import LandmarkMap
+from slam_backend.landmark_map import LandmarkMap, MapOutline
 from slam_backend.reports import MergeEvent, Renaming, TeamReport
 from slam_backend.team import TeamSlam
 from vslam_env.navigation import CandidateSlots
@@ -61,6 +61,7 @@ class TeamBelief:
         self._confirm_after = config.confirm_after
         self._beliefs: dict[int, Belief] = {}  # of this tick, made when asked for
         self._maps: dict[int, LandmarkMap] = {}  # of this tick, by the number of the map
+        self._outlines: dict[int, MapOutline] = {}  # likewise
         self._look_up_poses()
 
     @property
@@ -152,6 +153,13 @@ class TeamBelief:
             self._maps[number] = self._team.map(robot, min_count=self._confirm_after)
         return self._maps[number]
 
+    def outline(self, robot: int) -> MapOutline:
+        """Return the outline of `group_map`, much faster."""
+        number = self._numbers[robot]
+        if number not in self._outlines:
+            self._outlines[number] = self._team.outline(robot, self._confirm_after)
+        return self._outlines[number]
+
     def start_from_group(self, robot: int) -> FloatArray:
         """Return (3,) the motion from the group's map frame to the robot's own start frame. A copy."""
         return np.array(self._starts[robot])
@@ -178,9 +186,9 @@ class TeamBelief:
             group_size=1 + len(mates),
             pose=own.mean,
             covariance=own.covariance,
-            ess=self._team.ess(robot) / len(self._team.particles(robot)[1]),
+            ess=self._team.ess(robot) / self._team.num_particles(robot),
             start_from_group=start,
-            group_map=self.group_map(robot),
+            outline=self.outline(robot),
             cells=self._grids[robot].cells,
             features=slots.features(own.mean, poses[:, :2]),
             valid=slots.valid,
@@ -213,16 +221,18 @@ class TeamBelief:
 
     def _look_up_poses(self) -> None:
         """Take note of the groups and poses after a step or a merge, and forget what was derived from those before."""
-        robots, team = range(self.num_robots), self._team
-        self._groups, self._numbers = team.groups, team.maps
-        self._members = [team.members(robot) for robot in robots]
-        self._mates = [team.mates(robot) for robot in robots]
-        self._starts = np.array([team.start_from_group(robot) for robot in robots])
-        self._means = np.array([team.pose(robot).mean for robot in robots])
-        self._estimates = [team.pose_from_start(robot) for robot in robots]
-        self._poses = np.array([estimate.mean for estimate in self._estimates])
+        self._groups = self._team.groups
+        points = [self._team.standpoint(robot) for robot in range(self.num_robots)]
+        self._members = [point.members for point in points]
+        self._mates = [point.mates for point in points]
+        self._numbers = [point.number for point in points]
+        self._starts = np.array([point.start_from_group for point in points])
+        self._means = np.array([point.pose.mean for point in points])
+        self._estimates = [point.own_pose for point in points]
+        self._poses = np.array([point.own_pose.mean for point in points])
         self._beliefs.clear()
         self._maps.clear()
+        self._outlines.clear()
 
     def _teammates(self, robot: int) -> list[Teammate]:
         """Return the other robots that a robot knows of; one out of contact is where it was when contact was lost."""

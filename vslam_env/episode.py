@@ -118,7 +118,7 @@ class Episode:
         scores = []
         for robot, start in enumerate(self.true_starts):
             placed = world_from_group(start, self.belief.start_from_group(robot))
-            scores.append(self.ledger.score(robot, self.belief.group_map(robot), placed))
+            scores.append(self.ledger.score(robot, self.belief.outline(robot), placed))
         return scores
 
     def believed_poses(self) -> FloatArray:

@@ -10,7 +10,7 @@ import numpy as np
 from slam_backend._jit import jit
 from slam_backend.errors import FloatArray, IntArray, check_float
 from slam_backend.geometry import compose
-from slam_backend.landmark_map import LandmarkMap
+from slam_backend.landmark_map import LandmarkMap, MapOutline
 from slam_backend.reports import LandmarksCreated, MapCopied, MapDropped, Renaming, TeamReport
 
 FALSE, UNCOUNTED = -1, -2
@@ -132,12 +132,12 @@ class ClaimLedger:
         """Return the claims (n,) int64 of landmarks of a robot's map: index of the true one, -1 false, -2 no matter."""
         return self._claims[self._map_of[robot]][ids]
 
-    def score(self, robot: int, group_map: LandmarkMap, world_from_group: FloatArray) -> MapScores:
+    def score(self, robot: int, group_map: LandmarkMap | MapOutline, world_from_group: FloatArray) -> MapScores:
         """Score a robot's map.
 
         Args:
             robot: Its index.
-            group_map: Its map, in its map frame.
+            group_map: Its map, or the outline of it, in its map frame.
             world_from_group: (3,) [m, m, rad]. Through the robot's own start frame and its true start pose.
         """
         claims = self.claims(robot, group_map.ids)

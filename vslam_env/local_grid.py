@@ -51,5 +51,5 @@ def local_grid(glimpse: Glimpse) -> NDArray[np.uint8]:
         (3, 48, 48) uint8, robot frame, cells of 0.2 m that are 0 or 255. Channels free, occupied, landmarks. Rows go
         from 4.8 m ahead to 4.8 m behind, columns from 4.8 m to the left to 4.8 m to the right. A fresh array.
     """
-    grid: NDArray[np.uint8] = _paint(glimpse.cells, glimpse.pose, glimpse.start_from_group, glimpse.group_map.means)
+    grid: NDArray[np.uint8] = _paint(glimpse.cells, glimpse.pose, glimpse.start_from_group, glimpse.outline.means)
     return grid

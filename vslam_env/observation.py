@@ -56,12 +56,11 @@ def observe_glimpse(glimpse: Glimpse, scan: FloatArray, goal_actions: bool) -> O
     """Return what `observe` returns, from the part of the belief that it shows."""
     numbers, candidates = np.empty(12, np.float32), np.empty((NUM_SLOTS, 5), np.float32)
     teammates, present = np.zeros((MOST_TEAMMATES, 5), np.float32), np.zeros(MOST_TEAMMATES, np.int8)
-    landmarks = glimpse.group_map
     _fill(
         glimpse.pose,
         glimpse.covariance,
-        landmarks.covariances,
-        landmarks.counts,
+        glimpse.outline.variances,
+        glimpse.outline.counts,
         glimpse.ess,
         glimpse.group_size,
         glimpse.features,
@@ -147,7 +146,7 @@ def _clip(value: float, low: float, high: float) -> Any:
 def _fill(
     pose: Any,
     covariance: Any,
-    landmark_covariances: Any,
+    variances: Any,
     counts: Any,
     ess: float,
     group_size: int,
@@ -166,7 +165,7 @@ def _fill(
     Args:
         pose: As in `Glimpse`, like all up to `mate_sigmas`.
         covariance: The same.
-        landmark_covariances: (N, 3, 3) float64 [m].
+        variances: (N,) float64 [m^2]. Traces of the landmarks' covariances.
         counts: (N,) int64.
         ess: The same.
         group_size: The same.
@@ -185,8 +184,7 @@ def _fill(
         numbers[3 + i] = _clip(math.sqrt(covariance[i, i]), 0.0, POSE_LIMIT[i])
     mean = largest = seen = 0.0
     for k in range(len(counts)):
-        trace = landmark_covariances[k, 0, 0] + landmark_covariances[k, 1, 1] + landmark_covariances[k, 2, 2]
-        sigma = math.sqrt(trace / 3.0)
+        sigma = math.sqrt(variances[k] / 3.0)
         mean += sigma / len(counts)
         largest = max(largest, sigma)
         seen += counts[k] / len(counts)

@@ -13,7 +13,7 @@ from slam_backend.attempts import AttemptOptions
 from slam_backend.camera import StereoCamera
 from slam_backend.errors import BoolArray, FloatArray, IntArray, check_int
 from slam_backend.filter_options import FilterOptions
-from slam_backend.landmark_map import LandmarkMap
+from slam_backend.landmark_map import LandmarkMap, MapOutline
 from slam_backend.merge_options import MergeOptions
 from vslam_env.navigation import SeenGrid
 
@@ -172,7 +172,7 @@ class Glimpse:
         covariance: (3, 3) float64 [m, m, rad].
         ess: Effective sample size, as a share of M.
         start_from_group: (3,) float64 [m, m, rad]. Moves the group's map frame to the own start frame.
-        group_map: The confirmed landmarks in the group's frame.
+        outline: Of the confirmed landmarks in the group's frame.
         cells: (300, 300) uint8. Of the seen grid.
         features: (16, 5) float32 [m], robot frame. Of the candidates.
         valid: (16,) bool. Which candidates there are.
@@ -187,7 +187,7 @@ class Glimpse:
     covariance: FloatArray
     ess: float
     start_from_group: FloatArray
-    group_map: LandmarkMap
+    outline: MapOutline
     cells: NDArray[np.uint8]
     features: NDArray[np.float32]
     valid: BoolArray
@@ -206,7 +206,7 @@ class Glimpse:
             covariance=belief.covariance,
             ess=belief.ess,
             start_from_group=belief.start_from_group,
-            group_map=belief.group_map,
+            outline=belief.group_map.outline,
             cells=belief.grid.cells,
             features=belief.candidates.features,
             valid=belief.candidates.valid,

@@ -42,6 +42,15 @@ def test_the_gather_agrees_with_fancy_indexing() -> None:
             np.testing.assert_array_equal(ids, maps.ids[slots[held]])
 
 
+def test_an_outline_is_that_of_the_map() -> None:
+    """It has the map's landmarks in the map's order, with the same bits, whatever the least count."""
+    slam = _filter_after_some_steps()
+    for least in (1, 3, 9):
+        for got, expected in zip(slam.outline(least), slam.map(min_count=least).outline, strict=True):
+            np.testing.assert_array_equal(got, expected)
+    assert len(FastSlam(num_particles=3).outline().ids) == 0
+
+
 def test_a_least_count_leaves_out_what_was_seen_less() -> None:
     """`map(min_count=n)` is the subset of `map()` that was measured n times; an empty filter has an empty map."""
     slam = _filter_after_some_steps()

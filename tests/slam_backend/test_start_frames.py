@@ -1,6 +1,6 @@
 import numpy as np
 
-from slam_backend._start_frames import seen_from_starts
+from slam_backend._start_frames import AT_ORIGIN, KNOWN, SPREAD, seen_from_starts, start_kind
 from slam_backend.filter import UNPACK, FastSlam
 from slam_backend.geometry import between, compose, rotation, wrap_angle
 from slam_backend.measurements import Measurements
@@ -25,6 +25,18 @@ def test_known_starts() -> None:
         assert np.allclose(compose(STARTS[robot], own.mean), pose.mean)
         assert np.isclose(np.trace(own.covariance), np.trace(pose.covariance))
         assert np.allclose(compose(STARTS[robot], slam.particles_from_start(robot)), slam.particles(robot)[0])
+
+
+def test_starts_are_told_apart() -> None:
+    """All at the origin, all at one place, or spread: surplus lanes do not count, and the asked one is returned."""
+    starts, best = np.zeros((3, 8)), np.empty(3)
+    starts[:, 5:] = 9.0
+    assert start_kind(starts, 5, 2, best) == AT_ORIGIN
+    starts[1, :5] = 4.0
+    assert start_kind(starts, 5, 2, best) == KNOWN
+    starts[2, 4] = 1e-9
+    assert start_kind(starts, 5, 4, best) == SPREAD
+    assert best.tolist() == [0.0, 4.0, 1e-9]
 
 
 def test_unknown_starts_do_not_blur_the_pose() -> None:
