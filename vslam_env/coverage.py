@@ -9,25 +9,46 @@ from numpy.typing import NDArray
 from slam_backend._jit import jit
 from slam_backend.errors import FloatArray
 from slam_backend.geometry import inverse, transform_points
-from vslam_env.navigation import FREE, GRID_SIZE, cell_of
+from vslam_env.navigation import FREE, GRID_SIZE, SeenGrid, cell_of
 
 
 @jit
-def _mark_seen(cells: Any, places: Any, floor: Any, seen: Any) -> int:
-    """Mark floor cells `floor` (n,) whose place (n,) in a flat grid is free; return how many were not marked before.
+def _recount(changes: Any, cells: Any, places: Any, floor: Any, seen: Any, seers: Any) -> int:
+    """Bring up to date what one robot sees of the floor.
 
-    Places ascend, so that a grid is read from its beginning to its end.
+    Args:
+        changes: (1 + k,) int32, as `SeenGrid.take_changes` returns them.
+        cells: (300 * 300,) uint8. Of the robot's grid.
+        places: (n,) int32, ascending. Places of floor cells in the grid.
+        floor: (n,) int32. These floor cells.
+        seen: (n,) bool. Whether the robot saw them; changed.
+        seers: (N,) int64. How many robots see each floor cell; changed.
+
+    Returns:
+        How many more floor cells are seen by some robot than before.
     """
-    count = 0
-    for i in range(len(places)):
-        if cells[places[i]] == FREE and not seen[floor[i]]:
-            seen[floor[i]] = True
-            count += 1
-    return count
+    more = 0
+    for k in range(max(changes[0], 1)):
+        if changes[0] < 0:
+            first, last = 0, len(places)
+        elif changes[0] == 0:
+            first, last = 0, 0
+        else:
+            first, last = np.searchsorted(places, changes[1 + k]), np.searchsorted(places, changes[1 + k], "right")
+        for i in range(first, last):
+            now = cells[places[i]] == FREE
+            if now != seen[i]:
+                seen[i] = now
+                seers[floor[i]] += 1 if now else -1
+                if now:
+                    more += seers[floor[i]] == 1
+                else:
+                    more -= seers[floor[i]] == 0
+    return more
 
 
 class CoverageMeter:
-    """Share of the free floor inside the union of the robots' grids, each laid at its true start pose.
+    """Where the cells of the free floor lie in each robot's grid, laid at its true start pose; it never changes.
 
     Args:
         free_area_cells: (n, 2) float64 [m], world frame. Centres of the cells of the free floor.
@@ -35,18 +56,37 @@ class CoverageMeter:
     """
 
     def __init__(self, free_area_cells: FloatArray, true_starts: FloatArray) -> None:
-        self._places = [
+        self.places = tuple(
             _flat_cells(transform_points(inverse(start), free_area_cells)) for start in np.asarray(true_starts)
-        ]
-        self._count = len(free_area_cells)
+        )
+        self.count = len(free_area_cells)
 
-    def share(self, grids: Sequence[NDArray[np.uint8]]) -> float:
-        """Return the coverage in [0, 1] from the cells (300, 300) of each robot's grid."""
-        seen = np.zeros(self._count, np.bool_)
-        count = 0
-        for cells, places in zip(grids, self._places, strict=True):
-            count += _mark_seen(cells.ravel(), *places, seen)
-        return count / max(self._count, 1)
+
+class Coverage:
+    """Share of the free floor inside the union of the robots' grids.
+
+    It goes by what has changed in the grids since it was asked last, so it is asked about the same ones throughout.
+
+    Args:
+        meter: Of the world and the robots' starts.
+    """
+
+    def __init__(self, meter: CoverageMeter) -> None:
+        self._meter = meter
+        self._seen = [np.zeros(len(floor), np.bool_) for _, floor in meter.places]
+        self._seers = np.zeros(meter.count, np.int64)
+        self._covered = 0
+        self._began = False
+
+    def share(self, grids: Sequence[SeenGrid]) -> float:
+        """Return the coverage in [0, 1] of the robots' grids, whose changes are taken."""
+        for grid, (places, floor), seen in zip(grids, self._meter.places, self._seen, strict=True):
+            changes = grid.take_changes()
+            if not self._began:
+                changes[0] = -1
+            self._covered += _recount(changes, grid.cells.ravel(), places, floor, seen, self._seers)
+        self._began = True
+        return self._covered / max(self._meter.count, 1)
 
 
 def _flat_cells(points: FloatArray) -> tuple[NDArray[np.int32], NDArray[np.int32]]:

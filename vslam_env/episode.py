@@ -13,6 +13,7 @@ from slam_backend.geometry import between, compose
 from vslam_env.belief import Body, TeamBelief
 from vslam_env.communication import contacts
 from vslam_env.config import TICK, EnvConfig
+from vslam_env.coverage import Coverage
 from vslam_env.errors_of_maps import MapScores, world_from_group
 from vslam_env.oracle import true_alignment
 from vslam_env.pose_errors import pose_errors
@@ -90,6 +91,7 @@ class Episode:
         self.world, self.true_starts, self.belief_seed = setting.world, setting.true_starts, setting.belief_seed
         self._simulator = Simulator(setting.world, setting.true_starts, self._config.robot_radius, TICK)
         self.ledger = setting.new_ledger(self._config.map_error_cutoff)
+        self._coverage = Coverage(setting.coverage)
         for name, state in setting.stream_states.items():
             self._streams[name].bit_generator.state = state
 
@@ -137,7 +139,7 @@ class Episode:
             placed_recalls=np.array([score.placed for score in scores]),
             pose_errors=pose_errors[:, 0],
             pose_sigmas=self.belief.position_sigmas,
-            coverage=self.setting.coverage.share([self.belief.cells(r) for r in range(len(scores))]),
+            coverage=self._coverage.share(self.belief.grids),
             collisions=self._collisions.copy(),
             distances=self._distances.copy(),
             bytes_sent=self.belief.bytes_sent,

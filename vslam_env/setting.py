@@ -33,7 +33,7 @@ class Setting:
         stream_states: Where the random streams (odometry, sensor, scan, radio) stand before the first frame, by name.
         sensor: The cameras.
         scan: The range finders.
-        coverage: What measures how much of the floor has been seen.
+        coverage: Where the free floor lies in the robots' grids.
         countable: (N',) bool. Landmarks that some robot could ever see: only they count.
     """
 

@@ -66,6 +66,11 @@ class SharedGrids:
         self._kept: list[Kept] = []
         self._strokes: list[Stroke] = []
 
+    @property
+    def all(self) -> list[SeenGrid]:
+        """All grids, in the order of robots."""
+        return self._grids
+
     def __getitem__(self, robot: int) -> SeenGrid:
         return self._grids[robot]
 
@@ -95,8 +100,9 @@ class SharedGrids:
                 self._undo(entry)
             elif isinstance(entry, MapDropped):
                 self._kept = [kept for kept in self._kept if entry.number not in kept.maps[:2]]
-        oldest = min((kept.tick for kept in self._kept), default=None)
-        self._strokes = [stroke for stroke in self._strokes if oldest is not None and stroke.tick >= oldest]
+        if self._strokes:
+            oldest = min((kept.tick for kept in self._kept), default=None)
+            self._strokes = [stroke for stroke in self._strokes if oldest is not None and stroke.tick >= oldest]
 
     def _undo(self, undone: MergeUndone) -> None:
         """Restore the grids from before a merge and paint again what the robots of each side have scanned since."""
@@ -119,6 +125,8 @@ class SharedGrids:
             mates: Per robot those that go by the same filter now, itself included.
             starts: (K, 3) [m, m, rad]. The motion from the map frame to each robot's start frame.
         """
+        if self._mates == mates:
+            return
         for now in sorted(set(mates)):
             before = sorted({tuple(mate for mate in self._mates[robot] if mate in now) for robot in now})
             if len(before) > 1:
@@ -149,11 +157,10 @@ class SharedGrids:
                 self._strokes.append(stroke)
 
     def _apply(self, stroke: Stroke) -> None:
-        grid, body = self._grids[stroke.owner], self._body
-        grid.paint_scan(stroke.pose, stroke.scan, body.ray_angles, body.scan_range)
-        grid.clear_disc(stroke.pose, body.radius)
-        if stroke.bump:
-            grid.bump(stroke.pose, body.radius)
+        body = self._body
+        self._grids[stroke.owner].paint_reading(
+            stroke.pose, stroke.scan, body.ray_angles, body.scan_range, body.radius, stroke.bump
+        )
 
     def get_state(self) -> dict[str, Any]:
         """Return all that decides how the grids go on; what is never written to is shared."""

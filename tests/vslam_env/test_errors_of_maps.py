@@ -6,7 +6,7 @@ from slam_backend.geometry import inverse, transform_points
 from slam_backend.landmark_map import LandmarkMap
 from slam_backend.metrics import gospa, map_error, map_rmse
 from slam_backend.reports import LandmarksCreated, Renaming, TeamReport
-from vslam_env.coverage import CoverageMeter
+from vslam_env.coverage import Coverage, CoverageMeter
 from vslam_env.errors_of_maps import ClaimLedger
 from vslam_env.navigation import FREE, SeenGrid, cell_of
 
@@ -138,31 +138,51 @@ def test_coverage_of_known_floor() -> None:
     """Coverage is the share of floor cells that are free in some robot's grid, laid at its true start pose."""
     centres = np.array([[x, y] for x in (1.0, 2.0, 3.0) for y in (1.0, 2.0)])
     starts = np.array([[1.0, 1.0, 0.0], [3.0, 2.0, np.pi / 2]])
-    meter = CoverageMeter(centres, starts)
+    coverage = Coverage(CoverageMeter(centres, starts))
     grids = [SeenGrid(), SeenGrid()]
-    assert meter.share([grid.cells for grid in grids]) == 0.0
+    assert coverage.share(grids) == 0.0
     grids[0].clear_disc(STAY)
-    assert np.isclose(meter.share([grid.cells for grid in grids]), 1 / 6)
+    assert np.isclose(coverage.share(grids), 1 / 6)
     grids[1].clear_disc(STAY)
     grids[1].clear_disc([0.0, 1.0, 0.0])  # one metre to the left of a robot that looks up: (2, 2)
     row, col = cell_of([0.0, 1.0])
     assert grids[1].cells[row, col] == FREE
-    assert np.isclose(meter.share([grid.cells for grid in grids]), 3 / 6)
+    assert np.isclose(coverage.share(grids), 3 / 6)
 
 
-def test_coverage_is_a_union() -> None:
-    """Floor counts once however many robots have seen it, as a plain look-up of each cell in each grid says."""
-    rng = np.random.default_rng(6)
-    centres = rng.uniform(-35.0, 35.0, (500, 2))  # some lie outside a robot's grid
-    starts = rng.uniform(-3.0, 3.0, (3, 3))
-    grids = [SeenGrid() for _ in starts]
-    for grid in grids:
-        for _ in range(60):
-            grid.clear_disc([*rng.uniform(-30.0, 30.0, 2), 0.0], 2.0)
+def _plain_share(centres: np.ndarray, starts: np.ndarray, grids: list[SeenGrid]) -> float:
+    """Return the coverage by looking up each place in each grid."""
     seen = np.zeros(len(centres), np.bool_)
     for start, grid in zip(starts, grids, strict=True):
         cells = cell_of(transform_points(inverse(start), centres))
         inside = ((cells >= 0) & (cells < 300)).all(axis=1)
         seen[inside] |= grid.cells[tuple(cells[inside].T)] == FREE
-    assert 0.05 < seen.mean() < 0.9
-    assert np.isclose(CoverageMeter(centres, starts).share([grid.cells for grid in grids]), seen.mean())
+    return float(seen.mean())
+
+
+def test_coverage_is_a_union() -> None:
+    """Floor counts once however many robots see it, whatever happens to their grids, as a plain look-up says."""
+    rng = np.random.default_rng(6)
+    centres = rng.uniform(-35.0, 35.0, (2000, 2))  # some lie outside a robot's grid
+    starts = rng.uniform(-3.0, 3.0, (3, 3))
+    grids = [SeenGrid() for _ in starts]
+    meter = CoverageMeter(centres, starts)
+    coverage, shares = Coverage(meter), []
+    kept = grids[1].get_state()
+    angles = np.linspace(-0.6, 0.6, 32)
+    for turn in range(40):
+        for grid in grids:
+            pose = rng.uniform(-25.0, 25.0, 3)
+            if turn % 2:
+                grid.clear_disc(pose, 2.0)
+            else:
+                grid.paint_reading(pose, rng.uniform(2.0, 9.0, 32), angles, 8.0, 0.2, bool(turn % 4))
+        if turn % 7 == 3:
+            grids[0].absorb(grids[2], rng.uniform(-1.0, 1.0, 3))
+        if turn in (20, 30):
+            grids[1].set_state(kept)
+        shares.append(coverage.share(grids))
+        assert shares[-1] == _plain_share(centres, starts, grids)
+    assert shares[-1] > 0.1
+    assert min(np.diff(shares)) < 0.0  # walls were seen where floor had been, and a grid was restored
+    assert Coverage(meter).share(grids) == shares[-1]

@@ -25,17 +25,40 @@ STRAIGHT_GAP = 0.8  # [m] joined if a third hit lies on their line; doors are 1.
 STRAIGHT_TOLERANCE = 0.1  # [m]
 NOTHING, JUMP, SPARSE, SOLID = 0, 1, 2, 3  # what two neighbouring rays see
 
-READINGS_FINE, BAD_RANGES, BAD_ANGLES = 0, 1, 2
+READINGS_FINE, BAD_RANGES, BAD_ANGLES, BAD_POSE = 0, 1, 2, 3
+
+MOST_CHANGES = 4096  # that a grid keeps for whoever counts its free cells; a scan makes a hundred at most
 
 
 @jit
-def _add(evidence: Any, cells: Any, row: int, col: int, change: int) -> None:
+def _judge(cells: Any, changes: Any, row: int, col: int, verdict: int) -> None:
+    """Set a cell's verdict, and note it if it changed.
+
+    Args:
+        cells: (300, 300) uint8.
+        changes: (1 + n,) int32. How many changed, -1 if that is not known any more; then which, as places in the flat
+            grid.
+        row: Of the cell.
+        col: Of the cell.
+        verdict: The new one.
+    """
+    if cells[row, col] != verdict:
+        cells[row, col] = verdict
+        if 0 <= changes[0] < len(changes) - 1:
+            changes[0] += 1
+            changes[changes[0]] = row * GRID_SIZE + col
+        else:
+            changes[0] = -1
+
+
+@jit
+def _add(evidence: Any, cells: Any, changes: Any, row: int, col: int, change: int) -> None:
     """Change one cell's evidence within its bounds; 0 is kept for cells that were never touched."""
     value = min(max(evidence[row, col] + change, MOST_FREE), MOST_OCCUPIED)
     if value == 0:
         value = -1
     evidence[row, col] = value
-    cells[row, col] = OCCUPIED if value > 0 else FREE
+    _judge(cells, changes, row, col, OCCUPIED if value > 0 else FREE)
 
 
 @jit
@@ -97,6 +120,7 @@ def _on_a_line_beside(kinds: Any, lines: Any, k: int, u: float, v: float) -> boo
 def paint_scan(
     evidence: Any,
     cells: Any,
+    changes: Any,
     x: float,
     y: float,
     theta: float,
@@ -159,23 +183,23 @@ def paint_scan(
             if kinds[k] in (SOLID, SPARSE):
                 before = lines[k, 0] * u + lines[k, 1] * v + lines[k, 2]
                 if before > WALL_HALF_THICKNESS:
-                    _add(evidence, cells, row, col, -1)
+                    _add(evidence, cells, changes, row, col, -1)
                 elif before > -WALL_HALF_THICKNESS and kinds[k] == SOLID:
-                    _add(evidence, cells, row, col, HIT)
+                    _add(evidence, cells, changes, row, col, HIT)
             elif u * u + v * v < free_below[k] ** 2:
                 if kinds[k] == NOTHING or not _on_a_line_beside(kinds, lines, k, u, v):
-                    _add(evidence, cells, row, col, -1)
+                    _add(evidence, cells, changes, row, col, -1)
             else:
                 for ray in range(k, k + 2):
                     off_x, off_y = abs(u - hits[ray, 0]), abs(v - hits[ray, 1])
                     if is_hit[ray] and max(off_x, off_y) <= 0.5 * CELL:
-                        _add(evidence, cells, row, col, HIT)
+                        _add(evidence, cells, changes, row, col, HIT)
                         break
     return READINGS_FINE
 
 
 @jit
-def paint_disc(evidence: Any, cells: Any, x: float, y: float, radius: float) -> None:
+def paint_disc(evidence: Any, cells: Any, changes: Any, x: float, y: float, radius: float) -> None:
     """Free what a robot covers: unknown cells centred in its disc, and occupied ones that lie wholly inside."""
     first_row, last_row = _cell_range(y - radius, y + radius)
     first_col, last_col = _cell_range(x - radius, x + radius)
@@ -187,7 +211,42 @@ def paint_disc(evidence: Any, cells: Any, x: float, y: float, radius: float) -> 
             inside = distance <= max(radius - 0.5 * CELL, 0.0)
             if inside or (evidence[row, col] == 0 and distance <= radius):
                 evidence[row, col] = min(evidence[row, col], -1)
-                cells[row, col] = FREE
+                _judge(cells, changes, row, col, FREE)
+
+
+@jit
+def paint_bump(evidence: Any, cells: Any, changes: Any, x: float, y: float, theta: float, radius: float) -> None:
+    """Mark the cell just ahead of a robot's rim as occupied, no firmer than two hits."""
+    ahead = radius + 0.5 * CELL
+    row = math.floor((y + ahead * math.sin(theta) + HALF_WIDTH) / CELL)
+    col = math.floor((x + ahead * math.cos(theta) + HALF_WIDTH) / CELL)
+    if 0 <= row < GRID_SIZE and 0 <= col < GRID_SIZE:
+        evidence[row, col] = max(evidence[row, col], 2 * HIT)
+        _judge(cells, changes, row, col, OCCUPIED)
+
+
+@jit
+def paint_reading(
+    evidence: Any,
+    cells: Any,
+    changes: Any,
+    pose: FloatArray,
+    ranges: FloatArray,
+    angles: FloatArray,
+    max_range: float,
+    radius: float,
+    bump: bool,
+) -> int:
+    """Write what a robot at `pose` (3,) reads in a tick: its scan, the floor that it covers, and a bump."""
+    x, y, theta = pose[0], pose[1], pose[2]
+    if not math.isfinite(x + y + theta):
+        return BAD_POSE
+    fault = paint_scan(evidence, cells, changes, x, y, theta, ranges, angles, max_range)
+    if fault == READINGS_FINE:
+        paint_disc(evidence, cells, changes, x, y, radius)
+        if bump:
+            paint_bump(evidence, cells, changes, x, y, theta, radius)
+    return fault
 
 
 @jit
@@ -210,7 +269,7 @@ def _bounds_in_frame(other: Any, x: float, y: float, c: float, s: float) -> tupl
 
 
 @jit
-def paint_grid(evidence: Any, cells: Any, other: Any, x: float, y: float, theta: float) -> None:
+def paint_grid(evidence: Any, cells: Any, changes: Any, other: Any, x: float, y: float, theta: float) -> None:
     """Add another grid's evidence, seen from pose (x, y, theta) of its frame in this one.
 
     Each cell takes the other's value at its centre, or the firmest wall among four points around it: without these,
@@ -235,4 +294,4 @@ def paint_grid(evidence: Any, cells: Any, other: Any, x: float, y: float, theta:
                     if point == 0 or value > max(found, 0):
                         found = value
             if found != 0:
-                _add(evidence, cells, row, col, found)
+                _add(evidence, cells, changes, row, col, found)

@@ -1,6 +1,5 @@
 """`SeenGrid`: what one robot has seen of the floor, in its own start frame."""
 
-import math
 from typing import Any
 
 import numpy as np
@@ -60,13 +59,14 @@ class SeenGrid:
             `FREE` or `OCCUPIED`. It shares memory with the grid and follows its changes.
     """
 
-    __slots__ = ("_cells", "_evidence", "_read_only", "cells")
+    __slots__ = ("_cells", "_changes", "_evidence", "_read_only", "cells")
 
     def __init__(self) -> None:
         self._adopt(np.zeros((GRID_SIZE, GRID_SIZE), np.int8), np.full((GRID_SIZE, GRID_SIZE), UNKNOWN, np.uint8))
 
     def _adopt(self, evidence: NDArray[np.int8], cells: NDArray[np.uint8], read_only: bool = False) -> None:
         self._evidence, self._cells, self._read_only = evidence, cells, read_only
+        self._changes = np.full(1 + _painting.MOST_CHANGES, -1, np.int32)
         self.cells = cells.view()
         self.cells.flags.writeable = False
 
@@ -94,13 +94,25 @@ class SeenGrid:
                 f"shape {ranges.shape} with angles {angles.shape}",
                 "Give one range per ray.",
             )
-        fault = _painting.paint_scan(self._evidence, self._cells, x, y, theta, ranges, angles, float(max_range))
-        if fault == _painting.BAD_RANGES:
-            raise bad_argument("ranges", "distances >= 0 [m]", ranges, "Use max_range where a ray saw nothing.")
-        if fault == _painting.BAD_ANGLES:
-            raise bad_argument(
-                "angles", "ascending angles spanning less than pi [rad]", angles, "Order the rays from right to left."
-            )
+        grid = self._evidence, self._cells, self._changes
+        fault = _painting.paint_scan(*grid, x, y, theta, ranges, angles, float(max_range))
+        if fault != _painting.READINGS_FINE:
+            raise _refusal(fault, x, ranges, angles)
+
+    def paint_reading(
+        self, pose: FloatArray, ranges: FloatArray, angles: FloatArray, max_range: float, radius: float, bump: bool
+    ) -> None:
+        """Do what `paint_scan`, `clear_disc` and, if it bumped, `bump` do in turn; of arrays of float64, all at once.
+
+        Raises:
+            ValueError: If the pose is not finite, or ranges or angles are not as `paint_scan` describes them.
+            RuntimeError: If the grid is a read-only view.
+        """
+        self._refuse_if_read_only()
+        grid = self._evidence, self._cells, self._changes
+        fault = _painting.paint_reading(*grid, pose, ranges, angles, max_range, radius, bump)
+        if fault != _painting.READINGS_FINE:
+            raise _refusal(fault, pose, ranges, angles)
 
     def clear_disc(self, pose: ArrayLike, radius: float = 0.2) -> None:
         """Mark as free what the body of a robot covers.
@@ -112,7 +124,7 @@ class SeenGrid:
         self._refuse_if_read_only()
         x, y, _ = pose_floats(pose)
         radius = check_float("radius", radius, "Give the robot's radius in metres.", above=0.0)
-        _painting.paint_disc(self._evidence, self._cells, x, y, radius)
+        _painting.paint_disc(self._evidence, self._cells, self._changes, x, y, radius)
 
     def bump(self, pose: ArrayLike, radius: float = 0.2) -> None:
         """Mark the cell just ahead of a robot's rim as occupied: it bumped into something there.
@@ -125,12 +137,7 @@ class SeenGrid:
         """
         self._refuse_if_read_only()
         x, y, theta = pose_floats(pose)
-        ahead = radius + 0.5 * CELL
-        row = math.floor((y + ahead * math.sin(theta) + HALF_WIDTH) / CELL)
-        col = math.floor((x + ahead * math.cos(theta) + HALF_WIDTH) / CELL)
-        if 0 <= row < GRID_SIZE and 0 <= col < GRID_SIZE:
-            self._evidence[row, col] = max(self._evidence[row, col], 2 * _painting.HIT)
-            self._cells[row, col] = OCCUPIED
+        _painting.paint_bump(self._evidence, self._cells, self._changes, x, y, theta, radius)
 
     def absorb(self, other: "SeenGrid", self_from_other: ArrayLike) -> None:
         """Add the evidence of another robot's grid.
@@ -141,7 +148,19 @@ class SeenGrid:
         """
         self._refuse_if_read_only()
         x, y, theta = pose_floats(self_from_other, "self_from_other")
-        _painting.paint_grid(self._evidence, self._cells, other._evidence.copy(), x, y, theta)
+        _painting.paint_grid(self._evidence, self._cells, self._changes, other._evidence.copy(), x, y, theta)
+
+    def take_changes(self) -> NDArray[np.int32]:
+        """Return the changes since this was asked last, for the one who keeps count of the cells; then none are left.
+
+        Returns:
+            (1 + n,) int32. How many there were, then that many places in the flat grid of cells whose verdicts changed
+            (some may stand there twice). -1 if all may have changed, as when this is asked for the first time.
+        """
+        self._refuse_if_read_only()
+        changes = self._changes[: 1 + max(0, int(self._changes[0]))].copy()
+        self._changes[0] = 0
+        return changes
 
     def copy(self) -> "SeenGrid":
         """Return an independent grid, which can be written to, with the same content."""
@@ -168,7 +187,18 @@ class SeenGrid:
             evidence = check_array("evidence", evidence, shape, "Use what get_state returned.", dtype=np.int8)
         self._evidence[:] = evidence
         np.take(_VERDICTS, evidence.view(np.uint8), out=self._cells, mode="wrap")
+        self._changes[0] = -1
 
     def _refuse_if_read_only(self) -> None:
         if self._read_only:
             raise RuntimeError("SeenGrid: this is a read-only view. Make a copy() to write to.")
+
+
+def _refusal(fault: int, pose: Any, ranges: FloatArray, angles: FloatArray) -> ValueError:
+    """Return the error that says what is wrong with readings."""
+    if fault == _painting.BAD_POSE:
+        return bad_argument("pose", "finite numbers", pose, "Give (x, y, theta) in metres and radians.")
+    if fault == _painting.BAD_RANGES:
+        return bad_argument("ranges", "distances >= 0 [m]", ranges, "Use max_range where a ray saw nothing.")
+    expected = "ascending angles spanning less than pi [rad]"
+    return bad_argument("angles", expected, angles, "Order the rays from right to left.")
