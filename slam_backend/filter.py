@@ -19,7 +19,7 @@ from slam_backend._existence_step import ExistenceStep
 from slam_backend._frame_buffers import FrameBuffers, Turn
 from slam_backend._particle_maps import ParticleMaps, aligned
 from slam_backend._rejuvenation_step import RejuvenationStep, write_maps
-from slam_backend._start_frames import seen_from_starts
+from slam_backend._start_frames import AT_ORIGIN, KNOWN, seen_from_starts, start_kind
 from slam_backend._step_input import check_step
 from slam_backend.adaptation import AdaptiveParticles, next_num_particles
 from slam_backend.camera import StereoCamera
