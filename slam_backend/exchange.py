@@ -5,7 +5,8 @@ Counted are numbers of 8 bytes, and of 4 in descriptors, as these are sent:
 - Robots that go by one filter: each broadcasts, once, at every step its pose (24), each landmark that it measured (id,
   mean, covariance: 80) and the descriptors of those that it created. A robot that nobody hears sends nothing.
 - Two groups that try to align their maps: the first robot of each sends the landmarks that are new to the other side
-  or were measured again since it sent them last (80 each), with the descriptors of the new ones.
+  or were measured again since it sent them last (80 each), with the descriptors of the new ones. When their maps
+  were straightened and are aligned once more, it sends all landmarks again (80 each).
 - A robot that returns to its filter: for each buffered step its odometry (24) and its measurements (24 each, 48 more
   with a covariance, and their descriptors). When all is taken in, the first robot of those that kept the filter sends
   the landmarks that are new or were measured again since they lost contact (80 each), with descriptors of those new
@@ -96,6 +97,11 @@ class ExchangeLedger:
             changed = sum(1 for name, count in counts.items() if known.get(name, count) != count)
             self.bytes_sent[sender] += (new + changed) * LANDMARK_BYTES + new * 4 * landmarks.descriptors.shape[1]
             known.update(counts)
+
+    def record_straightened(self, robot_a: int, robot_b: int, map_a: LandmarkMap, map_b: LandmarkMap) -> None:
+        """Count the maps once more, after both were straightened: all landmarks have moved, none looks otherwise."""
+        for sender, landmarks in ((robot_a, map_a), (robot_b, map_b)):
+            self.bytes_sent[sender] += len(landmarks) * LANDMARK_BYTES
 
     def get_state(self) -> dict[str, Any]:
         """Return a copy of the counts."""

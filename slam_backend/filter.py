@@ -367,6 +367,19 @@ class FastSlam:
             return replace(report, rejuvenation=self._rejuvenate(self._rejuvenation))
         return report
 
+    def rejuvenate(self) -> RejuvenationReport:
+        """Draw the particles anew from the posterior of whole paths now, whether or not `rejuvenate_every` is set.
+
+        Where it is not, all steps so far are smoothed from the log, and nothing is kept for the next time.
+
+        Returns:
+            What came of it; where there is a reason the particles are as before.
+        """
+        smoother = self._rejuvenation
+        if smoother is None:
+            smoother = RejuvenationStep(replace(self.options, rejuvenate_every=1), self.num_robots)
+        return self._rejuvenate(smoother)
+
     def _rejuvenate(self, smoother: RejuvenationStep) -> RejuvenationReport:
         """Draw the particles anew from the posterior of whole paths, if it can be found."""
         m = self.num_particles

@@ -6,12 +6,26 @@ from slam_backend.alignment import Alignment, AlignmentOptions
 from slam_backend.branches import Branch, fork, replay
 from slam_backend.fusion import check_inliers
 from slam_backend.groups import Group
+from slam_backend.landmark_map import LandmarkMap
 from slam_backend.merge_options import MergeOptions
 from slam_backend.merging import merge_filters
 from slam_backend.mixture_merging import merge_mixtures
 from slam_backend.records import Records
 from slam_backend.reports import MergeUndone, Renaming
 from slam_backend.watching import Side, Watch, begin_watch
+
+
+def straightened(group_a: Group, group_b: Group) -> tuple[LandmarkMap, LandmarkMap] | None:
+    """Draw the particles of both joint filters anew from their smoothed paths.
+
+    Where a smoother finds nothing better the filter stays as it is.
+
+    Returns:
+        Their maps with mixture covariances as they are now; None if neither filter has changed.
+    """
+    filters = group_a.trunk.filter, group_b.trunk.filter
+    reports = [slam.rejuvenate() for slam in filters]
+    return None if all(report.reason for report in reports) else (filters[0].map("mixture"), filters[1].map("mixture"))
 
 
 def merge_groups(

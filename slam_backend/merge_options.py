@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from slam_backend.errors import check_choice, check_float, check_int
+from slam_backend.errors import bad_argument, check_choice, check_float, check_int
 
 METHODS = ("particles", "mixture")
 
@@ -17,6 +17,9 @@ class MergeOptions:
             correlation of maps and paths survives. `"mixture"`: both maps' mixture covariances are fused into one map
             that all particles share (Sec. 3.2, see ERRATA).
         merged_particles: Of the joint filter; None: as many as the larger of the two.
+        straighten: Before a merge both sides' particles are drawn anew from the posterior of whole paths
+            (`FastSlam.rejuvenate`), and their maps have to align once more. False: maps are taken as the filters bent
+            them.
         watch_steps: A merge is watched for so many steps in which robots of both sides are in contact, and can be
             undone so long; then its snapshot is freed. 0: merges are final.
         watch_every: In so many steps the evidence is weighed once.
@@ -27,6 +30,7 @@ class MergeOptions:
 
     method: Literal["particles", "mixture"] = "particles"
     merged_particles: int | None = None
+    straighten: bool = True
     watch_steps: int = 200
     watch_every: int = 20
     barred_steps: int = 200
@@ -36,6 +40,8 @@ class MergeOptions:
         check_choice("merging.method", self.method, METHODS)
         if self.merged_particles is not None:
             check_int("merging.merged_particles", self.merged_particles, 1, "Use None for the larger of the two.")
+        if not isinstance(self.straighten, bool):
+            raise bad_argument("merging.straighten", "True or False", self.straighten, "Give a bool.")
         check_int("merging.watch_steps", self.watch_steps, 0, "Use 0 to make merges final.")
         check_int("merging.watch_every", self.watch_every, 1, "Weigh the evidence at every step or less often.")
         check_int("merging.barred_steps", self.barred_steps, 0, "Use 0 to let them try at once.")

@@ -24,7 +24,7 @@ from slam_backend.contacts import check_contacts, reach
 from slam_backend.errors import IntArray, bad_argument, check_int, check_seed
 from slam_backend.filter import FastSlam
 from slam_backend.filter_options import FilterOptions
-from slam_backend.group_changes import contradicted, merge_groups, undone
+from slam_backend.group_changes import contradicted, merge_groups, straightened, undone
 from slam_backend.groups import Group
 from slam_backend.input_log import RobotInput
 from slam_backend.landmark_map import LandmarkMap
@@ -256,6 +256,9 @@ class TeamSlam(TeamKnowledge):
         alignment = align_maps(maps[a.robots], maps[b.robots], rng=self._rng, options=self._alignment)
         speakers = a.trunk.live[0], b.trunk.live[0]
         self._records.exchange.record_maps(*speakers, maps[a.robots], maps[b.robots])
+        if alignment.success and self._merging.straighten and (straight := straightened(a, b)) is not None:
+            alignment = align_maps(*straight, rng=self._rng, options=self._alignment)
+            self._records.exchange.record_straightened(*speakers, *straight)
         self._events.append(MergeEvent(self._step, "attempt", a.robots, b.robots, alignment))
         self._schedule.record(chosen, self._step, alignment.success)
         return (self.merge(*speakers, alignment),) if alignment.success else ()

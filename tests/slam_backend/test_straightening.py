@@ -1,0 +1,137 @@
+"""Before a merge both maps are straightened by the smoother, and have to align once more."""
+
+import numpy as np
+import pytest
+from merged_pair import NEVER
+from same_bits import assert_same
+from simulated_team import SimulatedTeam
+
+from slam_backend.alignment import AlignmentOptions, align_maps
+from slam_backend.attempts import AttemptOptions
+from slam_backend.branches import restored_filter
+from slam_backend.exchange import LANDMARK_BYTES
+from slam_backend.filter import FastSlam
+from slam_backend.geometry import between
+from slam_backend.landmark_map import LandmarkMap
+from slam_backend.merge_options import MergeOptions
+from slam_backend.smoothing.options import SmoothingOptions
+from slam_backend.team import TeamSlam
+
+STEPS = 80
+AT_LAST = AttemptOptions(every=STEPS)  # the only attempt comes with the last step
+AS_IT_IS = MergeOptions(straighten=False)
+
+
+def driven(seed: int, attempts: AttemptOptions, **options: object) -> tuple[SimulatedTeam, TeamSlam]:
+    """Return two robots with few particles, whose maps are bent, after `STEPS` steps."""
+    simulation = SimulatedTeam(num_robots=2, seed=seed)
+    team = simulation.build(attempts=attempts, num_particles=8, **options)
+    simulation.run(team, STEPS)
+    return simulation, team
+
+
+def both_maps(team: TeamSlam) -> tuple[LandmarkMap, LandmarkMap]:
+    """Return the maps that an attempt compares."""
+    return team.map(0, "mixture"), team.map(1, "mixture")
+
+
+def straightened(slam: FastSlam) -> FastSlam:
+    """Return a copy that is straightened."""
+    copied = restored_filter(slam.get_state())
+    assert copied.rejuvenate().reason == ""
+    return copied
+
+
+def test_a_filter_that_never_rejuvenates_can_be_told_to() -> None:
+    """Told at the step at which another one is due by itself, it finds the same map but for where it begins to seek."""
+    maps = []
+    for every in (None, STEPS):
+        options = {"rejuvenate_every": every, "smoothing": SmoothingOptions(closure_after=0)}
+        slam = driven(111, NEVER, **options)[1]._find(0)[0].filter
+        if every is None:
+            before = slam.map().means
+            assert slam.rejuvenate().reason == ""
+            assert slam._rejuvenation is None
+            assert np.abs(slam.map().means - before[np.isin(np.arange(len(before)), slam.map().ids)]).max() > 0.01
+        maps.append(slam.map())
+    common = np.intersect1d(maps[0].ids, maps[1].ids)
+    assert len(common) > 0.9 * len(maps[1])
+    rows = [found.means[np.isin(found.ids, common)] for found in maps]
+    assert np.median(np.abs(rows[0] - rows[1])) < 0.01
+
+
+def test_a_merge_is_that_of_straightened_maps() -> None:
+    """What is merged, and by which motion, is what both filters are after they were told to rejuvenate."""
+    _, alone = driven(112, NEVER)
+    _, team = driven(112, AT_LAST)
+    sides = [straightened(alone._find(robot)[0].filter) for robot in range(2)]
+    rng = alone._rng
+    assert align_maps(*both_maps(alone), rng=rng).success
+    found = align_maps(sides[0].map("mixture"), sides[1].map("mixture"), rng=rng)
+    assert [event.kind for event in team.events] == ["attempt", "merge"]
+    assert_same(team.events[1].alignment, found)
+    watch = team._find(0)[0].watches[0]
+    for side, of_side, before in zip(watch.sides, sides, watch.before, strict=True):
+        assert_same(side.trunk["filter"]["_poses"], of_side.get_state()["_poses"])
+        assert len(before) == len(of_side.map())
+
+
+@pytest.mark.slow
+def test_straight_maps_are_merged_more_truly() -> None:
+    """Over twelve pairs of bent maps the motions by which they are merged are off by less than 0.8 of the distance."""
+    errors = []
+    for merging in (AS_IT_IS, MergeOptions()):
+        found = []
+        for seed in range(120, 132):
+            simulation, team = driven(seed, AT_LAST, merging=merging)
+            off = team.events[-1].alignment.transform - simulation.true_motion(0, 1)
+            found.append(np.hypot(*off[:2]))
+        errors.append(np.array(found))
+    both = np.isfinite(errors[0]) & np.isfinite(errors[1])
+    assert np.count_nonzero(both) >= 10
+    assert np.sqrt(np.mean(errors[1][both] ** 2)) < 0.8 * np.sqrt(np.mean(errors[0][both] ** 2))
+
+
+def test_maps_that_no_longer_fit_are_not_merged() -> None:
+    """Where only the bent maps are believed the attempt is refused, with the reason of the second alignment."""
+    sigmas = []
+    for merging in (AS_IT_IS, MergeOptions()):
+        covariance = driven(113, AT_LAST, merging=merging)[1].events[-1].alignment.covariance
+        sigmas.append(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1]))
+    assert sigmas[0] < sigmas[1]
+    strict = AlignmentOptions(max_sigma_position=float(np.mean(sigmas)))
+    _, team = driven(113, AT_LAST, alignment=strict)
+    assert [(event.kind, event.alignment.reason) for event in team.events] == [("attempt", "too uncertain")]
+    assert team.groups == ((0,), (1,))
+    assert not team._schedule.may_try(((0,), (1,)), STEPS)
+
+
+def test_what_cannot_be_bent_is_merged_as_it_is() -> None:
+    """Poses that are given as exact leave nothing to smooth: the merge is that without `straighten`, bit for bit."""
+    states = []
+    for merging in (AS_IT_IS, MergeOptions()):
+        simulation = SimulatedTeam(num_robots=2, seed=114)
+        team = simulation.build(attempts=AT_LAST, num_particles=3, merging=merging)
+        for _ in range(STEPS):
+            odometry, frames = simulation.read()
+            poses = [between(start, pose) for start, pose in zip(simulation.starts, simulation.poses, strict=True)]
+            team.step(odometry, frames, poses=poses)
+        assert len(team.groups) == 1
+        states.append(team.get_state() | {"merging": None})
+    assert_same(states[0], states[1])
+
+
+def test_straightened_maps_are_sent_once_more() -> None:
+    """Both speakers send all their landmarks again, without descriptors."""
+    sent = []
+    for merging in (AS_IT_IS, MergeOptions()):
+        _, team = driven(112, AT_LAST, merging=merging)
+        sent.append(team.bytes_sent)
+    again = [len(before) * LANDMARK_BYTES for before in team._find(0)[0].watches[0].before]
+    assert (sent[1] - sent[0]).tolist() == again
+
+
+def test_whether_to_straighten_is_a_bool() -> None:
+    """A number is refused."""
+    with pytest.raises(ValueError, match=r"merging\.straighten: expected True or False, got 1\. Give a bool"):
+        MergeOptions(straighten=1)  # type: ignore[arg-type]
