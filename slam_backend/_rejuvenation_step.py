@@ -1,6 +1,7 @@
 """What a filter does to be rejuvenated: when it is due, what the smoother is told, what is kept until the next time."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -8,13 +9,24 @@ import numpy as np
 from slam_backend._particle_maps import ParticleMaps
 from slam_backend.errors import FloatArray, IntArray
 from slam_backend.filter_options import FilterOptions
+from slam_backend.geometry import compose, inverse
+from slam_backend.log_arrays import LogArrays
 from slam_backend.reports import PoseEstimate
 from slam_backend.run_log import RobotLog
-from slam_backend.smoothing.graph import PathGraph
+from slam_backend.smoothing.coarsening import coarsened
+from slam_backend.smoothing.graph import PathGraph, first_rows, mean_pose
+from slam_backend.smoothing.joining import joined
+from slam_backend.smoothing.options import SmoothingOptions
 from slam_backend.smoothing.rejuvenation import Looks, Particles, Rejuvenation, rejuvenate
+from slam_backend.smoothing.slices import Draft, Smoother
 
+DIAGONAL = [3, 6, 8]  # of a landmark's covariance, in the rows of a tile
 CLOSURE = 3  # landmarks not seen for long that are matched in one step: a loop is closed
 SOONEST = 5  # after a fifth of the usual time at the earliest
+LEAST_ROWS = 8  # of each log in a slice, so that no more of them come while it is worked through
+PATIENCE = 2  # descents that fail in a row, where all is done at once, before something is given up
+NOTHING_TO_DO = ("no pose to seek", "odometry without noise", "poses that were given as exact")
+SCHEDULE = ("_asked", "_waited", "_read", "_closed", "_held", "_failures", "_exact", "_last_closing", "_count")
 
 
 class RejuvenationStep:
@@ -29,10 +41,15 @@ class RejuvenationStep:
         assert options.rejuvenate_every is not None
         self._options = options
         self._every = options.rejuvenate_every
-        self._graph: PathGraph | None = None
+        self._graph: PathGraph | None = None  # at its mode
+        self._draft: Draft | None = None  # the same and a little more, on its way there
+        self._asked = False  # for new particles now, whatever has been read since
         self._waited = 0  # steps since the last time
         self._read = 0  # measurements since then
         self._closed = False
+        self._held = False  # no slices until it is due: there is nothing to smooth
+        self._failures = 0  # descents in a row
+        self._exact = False  # a pose was given as exact: there never will be
         self._last_closing = 0  # step in which landmarks not seen for long were matched
         self._last_seen: dict[int, int] = {}  # landmark -> step of the filter's own count
         self._count = 0
@@ -40,20 +57,20 @@ class RejuvenationStep:
 
     # ------------------------------------------------------------------ in each step
 
-    def note(self, robot: int, step: int, estimate: PoseEstimate) -> None:
-        """Remember where a robot that read something was thought to be."""
-        self._guesses[robot][step] = estimate.mean
+    def note(self, robot: int, step: int, estimate: PoseEstimate, exact: bool) -> None:
+        """Remember where a robot that read something was thought to be, or that it was told so."""
+        if exact:
+            self._exact = True
+            for guesses in self._guesses:
+                guesses.clear()
+        if not self._exact:
+            self._guesses[robot][step] = estimate.mean
 
-    def hasten(self) -> None:
-        """Be due at the next step, as after a merge."""
-        self._waited = self._every  # without a graph yet, any reading is enough
-
-    def due(self, associations: Sequence[IntArray]) -> bool:
-        """Count a step, in which each robot saw these landmarks (n_i,), and tell whether it is time."""
+    def count(self, associations: Sequence[IntArray]) -> None:
+        """Count a step, in which each robot saw these landmarks (n_i,)."""
         self._count += 1
         self._waited += 1
-        smoothing = self._options.smoothing
-        after, long_ago = smoothing.closure_after, 0
+        after, long_ago = self._options.smoothing.closure_after, 0
         for ids in associations:
             for name in ids.tolist():
                 if name >= 0:
@@ -63,17 +80,28 @@ class RejuvenationStep:
         if after > 0 and long_ago >= CLOSURE:
             self._closed |= 2 * (self._count - self._last_closing) > after  # else it is the same one that goes on
             self._last_closing = self._count
+
+    def hasten(self) -> None:
+        """Be due now, as before a merge."""
+        self._asked = True
+
+    @property
+    def due(self) -> bool:
+        """Whether it is time for new particles."""
+        if self._asked:
+            return True
+        smoothing = self._options.smoothing
         haste = SOONEST if self._closed else 1
         sightings = 0 if self._graph is None else self._graph.num_sightings - smoothing.free_sightings
         return haste * self._waited >= self._every and haste * smoothing.effort * self._read >= sightings
 
-    # ------------------------------------------------------------------ when it is due
+    # ------------------------------------------------------------------ where there is time for it
 
     def run(
         self, logs: Sequence[RobotLog], starts: FloatArray, maps: ParticleMaps, camera: FloatArray,
         rng: np.random.Generator,
-    ) -> Rejuvenation:  # fmt: skip
-        """Smooth, and draw new particles.
+    ) -> Rejuvenation | None:  # fmt: skip
+        """Do what is to be done now: all that is due, or a slice of it; None if there is nothing to tell of it.
 
         Args:
             logs: Per robot.
@@ -82,35 +110,145 @@ class RejuvenationStep:
             camera: (7,) as kernels take it.
             rng: Source of the draws.
         """
+        due, options = self.due, self._options
+        whole = options.smoothing.slice_keys is None
+        if not due and (whole or self._held or self._exact):
+            return None
         graph = PathGraph.at_uncertain_starts(starts) if self._graph is None else self._graph
-        new = [log.arrays(int(latest) + 1) for log, latest in zip(logs, graph.latest, strict=True)]
-        options = self._options
+        if self._exact:
+            self._rest()
+            return _told(graph, "poses that were given as exact")
+        smoother = Smoother(options.motion, camera, options.smoothing, rng)
+        if whole:
+            return self._whole(graph, _since(logs, graph), smoother, maps.num_particles, self._looks(maps))
+        self._graph, self._held = graph, False
+        if (draft := self._draft) is not None:
+            return self._after(draft.graph, smoother.descend(draft), _since(logs, graph, draft.graph), smoother)
+        share = max(LEAST_ROWS, (options.smoothing.slice_keys or 0) // len(logs))
+        waiting = max(log.num_since(int(step) + 1) for log, step in zip(logs, graph.latest, strict=True))
+        if waiting > 2 * share or not due:
+            if waiting < share:
+                return None
+            taken = [first_rows(log, share) for log in _since(logs, graph)]
+            return self._after(graph, smoother.take_in(graph, taken, self._guesses), taken, smoother)
+        last = _since(logs, graph)
+        outcome = smoother.draw(graph, last, self._guesses, maps.num_particles, self._looks(maps))
+        if isinstance(outcome, Rejuvenation):
+            self._rest()
+            self._keep(outcome.graph)
+            return outcome
+        return self._after(graph, outcome, last, smoother)
+
+    def _looks(self, maps: ParticleMaps) -> Looks:
+        """Return the appearance of landmarks that no caller has named."""
         slots = maps.used_slots()
         slots = slots[maps.identities[slots] < 0]
+        return Looks(maps.ids[slots], maps.descriptors[slots], self._options.descriptor_gate)
+
+    def join(
+        self, a: "RejuvenationStep", b: "RejuvenationStep", starts: Sequence[FloatArray],
+        renamed: IntArray, camera: FloatArray,
+    ) -> None:  # fmt: skip
+        """Go on as the smoothers of two groups did that are one now, and be due at the next step.
+
+        Args:
+            a, b: Theirs; they stay as they are.
+            starts: Three arrays (K, 3, M): where the robots of a, of b, and of both, a's first, started; in a's frame,
+                in b's, in a's.
+            renamed: (n, 2) rows (name in b, name in the joint map).
+            camera: (7,) as kernels take it.
+        """
+        own, other = (
+            PathGraph.at_uncertain_starts(where) if step._graph is None else step._graph
+            for step, where in zip((a, b), starts[:2], strict=True)
+        )
+        robots, options = len(starts[2]), self._options.smoothing
+        if options.slice_keys is not None and own.num_keys + other.num_keys > options.max_keys:
+            own, other = (_thinned(graph, robots, camera, options) for graph in (own, other))
+        robot = int(np.flatnonzero(other.previous[other.heads] < 0)[0])  # one that defines b's frame
+        motion = compose(mean_pose(starts[2][len(starts[0]) + robot]), inverse(other.poses[other.heads[robot]]))
+        self._graph = joined(own, other, motion, renamed)
+        self._draft = None if options.slice_keys is None else Draft(graph=self._graph)
+        moved = [{step: compose(motion, guess) for step, guess in guesses.items()} for guesses in b._guesses]
+        self._guesses = [dict(guesses) for guesses in a._guesses] + moved
+        self._read, self._exact = a._read + b._read, a._exact or b._exact
+        self._waited = self._every
+
+    # ------------------------------------------------------------------ what came of it
+
+    def _whole(
+        self, graph: PathGraph, logs: Sequence[LogArrays], smoother: Smoother, num_particles: int, looks: Looks
+    ) -> Rejuvenation:
+        """Do all at once."""
         result = rejuvenate(
-            graph, new, options.motion, camera, maps.num_particles, rng, options.smoothing, self._guesses,
-            Looks(maps.ids[slots], maps.descriptors[slots], options.descriptor_gate),
+            graph, logs, smoother.motion, smoother.camera, num_particles, smoother.rng, smoother.options,
+            self._guesses, looks,
         )  # fmt: skip
-        self._graph = result.graph
-        for guesses, latest in zip(self._guesses, result.graph.latest, strict=True):
+        self._rest()
+        if np.isfinite(result.ess):
+            self._keep(result.graph)
+        elif result.reason not in NOTHING_TO_DO:
+            self._failures += 1
+            if self._failures == PATIENCE:
+                return self._lost(graph, graph, logs, smoother, result.reason)
+        return result
+
+    def _after(
+        self, tried: PathGraph, outcome: PathGraph | Draft | str, logs: Sequence[LogArrays], smoother: Smoother
+    ) -> Rejuvenation | None:
+        """Take note of what a slice came to."""
+        assert self._graph is not None
+        self._draft = None
+        if isinstance(outcome, PathGraph):
+            self._keep(outcome)
+        elif isinstance(outcome, Draft):
+            self._draft = outcome
+        elif outcome not in NOTHING_TO_DO:
+            return self._lost(self._graph, tried, logs, smoother, outcome)
+        elif self.due:
+            self._rest()
+            return _told(self._graph, outcome)
+        else:
+            self._held = True
+        return None
+
+    def _lost(
+        self, graph: PathGraph, tried: PathGraph, logs: Sequence[LogArrays], smoother: Smoother, reason: str
+    ) -> Rejuvenation:
+        """Do not try for ever what does not come to an end: leave out what was measured since, or begin anew."""
+        if any(map(len, logs)):
+            self._keep(smoother.without_measurements(graph, logs))
+            return _told(tried, f"{reason}; what was measured since the last time is left out")
+        self._graph = None
+        return _told(tried, f"{reason}; it begins anew from the logs")
+
+    def _keep(self, graph: PathGraph) -> None:
+        """Go on from a graph at its mode."""
+        self._graph, self._failures = graph, 0
+        for guesses, latest in zip(self._guesses, graph.latest, strict=True):
             for step in [step for step in guesses if step <= latest]:
                 del guesses[step]
-        self._waited, self._read, self._closed = 0, 0, False
-        return result
+
+    def _rest(self) -> None:
+        """Wait anew."""
+        self._asked, self._waited, self._read, self._closed = False, 0, 0, False
 
     def reorder(self, order: IntArray) -> None:
         """Renumber the robots: robot i becomes the one that was `order[i]`."""
         self._graph = None if self._graph is None else self._graph.reordered(order)
+        if self._draft is not None:
+            self._draft = replace(self._draft, graph=self._draft.graph.reordered(order))
         self._guesses = [self._guesses[robot] for robot in order]
 
     # ------------------------------------------------------------------ snapshots
 
     def get_state(self) -> dict[str, Any]:
         """Return all that decides how it goes on; the graph's arrays, which cannot be written, are shared."""
-        graph = self._graph
+        draft = self._draft
         return {
-            "graph": None if graph is None else {name: getattr(graph, name) for name in graph.__dataclass_fields__},
-            "schedule": (self._waited, self._read, self._closed, self._last_closing, self._count),
+            "graph": None if self._graph is None else self._graph.to_mapping(),
+            "draft": None if draft is None else (draft.graph.to_mapping(), draft.damping, draft.steps),
+            "schedule": {name: getattr(self, name) for name in SCHEDULE},
             "last_seen": dict(self._last_seen),
             "guesses": tuple(dict(guesses) for guesses in self._guesses),
         }
@@ -118,16 +256,48 @@ class RejuvenationStep:
     def set_state(self, state: Mapping[str, Any]) -> None:
         """Go on exactly as the one that gave `state`."""
         self._graph = None if state["graph"] is None else PathGraph(**state["graph"])
-        self._waited, self._read, self._closed, self._last_closing, self._count = state["schedule"]
+        self._draft = None
+        if state["draft"] is not None:
+            graph, damping, steps = state["draft"]
+            self._draft = Draft(graph=PathGraph(**graph), damping=damping, steps=steps)
+        for name, value in state["schedule"].items():
+            setattr(self, name, value)
         self._last_seen = dict(state["last_seen"])
         self._guesses = [dict(guesses) for guesses in state["guesses"]]
 
 
-def write_maps(maps: ParticleMaps, best: int, particles: Particles) -> None:
+def _since(logs: Sequence[RobotLog], graph: PathGraph, until: PathGraph | None = None) -> list[LogArrays]:
+    """Return what the logs hold after a graph's last steps, up to another's."""
+    new = [log.arrays(int(latest) + 1) for log, latest in zip(logs, graph.latest, strict=True)]
+    if until is None:
+        return new
+    ends = [np.searchsorted(log.steps, last, side="right") for log, last in zip(new, until.latest, strict=True)]
+    return [first_rows(log, int(end)) for log, end in zip(new, ends, strict=True)]
+
+
+def _told(graph: PathGraph, reason: str) -> Rejuvenation:
+    return Rejuvenation(graph, reason, float("nan"), 0, None)
+
+
+def _thinned(graph: PathGraph, robots: int, camera: FloatArray, options: SmoothingOptions) -> PathGraph:
+    """Return a graph with no more than its share of all robots' keys."""
+    share = len(graph.tips) / robots
+    keys, fresh = max(2, int(share * options.max_keys)), max(1, int(share * options.fresh_keys))
+    return coarsened(graph, camera, replace(options, max_keys=keys, fresh_keys=fresh))
+
+
+def write_maps(maps: ParticleMaps, best: int, particles: Particles, walk: float) -> None:
     """Give all particles the landmarks of their paths: those that the most probable one held and a sighting supports.
 
     What only others held was a mistake, as far as is known: the log's association is that of the most probable. Names,
     descriptors and odds stay; where a landmark's odds differ between particles, all get the mean of those that held it.
+    To the smoother landmarks stand still; that they may move until they are seen the next time is added here.
+
+    Args:
+        maps: Of the filter, changed.
+        best: Its most probable particle.
+        particles: The new ones.
+        walk: Variance [m^2] along each axis, see `FilterOptions.landmark_walk`.
     """
     slots = maps.used_slots()
     slots = slots[(maps.of_particle(best, slots)[1] > 0) & np.isin(maps.ids[slots], particles.ids)]
@@ -140,7 +310,9 @@ def write_maps(maps: ParticleMaps, best: int, particles: Particles) -> None:
         mean = (odds * held).sum(axis=1) / np.maximum(held.sum(axis=1), 1)
         odds = np.repeat(mean[:, None], m, axis=1)
     counts = np.repeat(particles.counts[rows][:, None], m, axis=1)
+    tiles = particles.tiles[rows]
+    tiles[:, :, DIAGONAL] += walk
     maps.load_tiles(
-        particles.tiles[rows], counts, maps.descriptors[slots], maps.ids[slots], maps.identities[slots],
+        tiles, counts, maps.descriptors[slots], maps.ids[slots], maps.identities[slots],
         maps.next_id, odds,
     )  # fmt: skip

@@ -18,6 +18,7 @@ from slam_backend.reports import StepReport
 from slam_backend.watching import Watch
 
 MOST_REPLAYED = 20  # buffered steps that a filter takes in per tick
+TURNS = 4  # filters smooth in turn: that of a robot only in every fourth step
 
 
 @dataclass(slots=True, eq=False)
@@ -142,6 +143,8 @@ def take_in(branch: Branch, step: int, robots: Sequence[int], inputs: Sequence[R
         return branch.report
     given = dict(zip(robots, inputs, strict=True))
     told = [given.get(robot, NOTHING) for robot in branch.robots]
+    smoothing = branch.robots if branch.split_from is None else branch.live
+    branch.filter.may_smooth = step % TURNS in {robot % TURNS for robot in smoothing}
     branch.filter._steps = step
     odometry, frames, identities, poses = zip(*told, strict=True)
     branch.report = report = branch.filter._step_checked(odometry, frames, identities, poses)

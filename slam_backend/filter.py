@@ -132,6 +132,7 @@ class FastSlam:
         k = check_int("num_robots", num_robots, 1, "Use at least one robot.")
         m = options.num_particles if num_particles is None else num_particles
         self.options = options
+        self.may_smooth = True  # in the next step; filters of a team take turns
         self._rng = np.random.default_rng(check_seed(seed))
         existence = options.existence
         self._existence = None if existence is None else ExistenceStep(existence, options.camera)
@@ -358,13 +359,15 @@ class FastSlam:
                     ids if len(turn.keep) == turn.size else ids[turn.keep], turn.noises if turn.given else None,
                 )  # fmt: skip
                 if self._rejuvenation is not None:
-                    self._rejuvenation.note(robot, self._steps - 1, self._estimates[robot])
+                    self._rejuvenation.note(robot, self._steps - 1, self._estimates[robot], exact[robot] is not None)
         for slots in deserted:
             self._maps.release(slots)
         if report.resampled:
             self._resample()
-        if self._rejuvenation is not None and self._rejuvenation.due(report.associations):
-            return replace(report, rejuvenation=self._rejuvenate(self._rejuvenation))
+        if self._rejuvenation is not None:
+            self._rejuvenation.count(report.associations)
+            if self.may_smooth:
+                return replace(report, rejuvenation=self._rejuvenate(self._rejuvenation))
         return report
 
     def rejuvenate(self) -> RejuvenationReport:
@@ -378,12 +381,17 @@ class FastSlam:
         smoother = self._rejuvenation
         if smoother is None:
             smoother = RejuvenationStep(replace(self.options, rejuvenate_every=1), self.num_robots)
-        return self._rejuvenate(smoother)
+        smoother.hasten()
+        while (report := self._rejuvenate(smoother)) is None:
+            pass
+        return report
 
-    def _rejuvenate(self, smoother: RejuvenationStep) -> RejuvenationReport:
-        """Draw the particles anew from the posterior of whole paths, if it can be found."""
+    def _rejuvenate(self, smoother: RejuvenationStep) -> RejuvenationReport | None:
+        """Draw the particles anew from the posterior of whole paths, if it is time and that can be found."""
         m = self.num_particles
         result = smoother.run(self._logs, self._starts[:, :, :m], self._maps, self._camera, self._rng)
+        if result is None:
+            return None
         if (new := result.particles) is not None:
             write_maps(self._maps, self.best_particle, new)
             self._poses[:, :, :m], self._starts[:, :, :m] = new.poses, new.starts

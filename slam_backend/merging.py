@@ -151,8 +151,9 @@ def finish(joint: FastSlam, a: FastSlam, b: FastSlam, renamed: IntArray) -> None
     joint._steps = max(a._steps, b._steps)
     joint._estimates = [joint._mixture(robot) for robot in range(joint.num_robots)]
     joint._logs = [log.copy() for log in a._logs] + [log.renamed(renamed[:, 0], renamed[:, 1]) for log in b._logs]
-    if joint._rejuvenation is not None:
-        joint._rejuvenation.hasten()
+    if joint._rejuvenation is not None and a._rejuvenation is not None and b._rejuvenation is not None:
+        starts = [slam._starts[:, :, : slam.num_particles] for slam in (a, b, joint)]
+        joint._rejuvenation.join(a._rejuvenation, b._rejuvenation, starts, renamed, joint._camera)
 
 
 class _Dense(NamedTuple):

@@ -184,6 +184,15 @@ class RobotLog:
             first -= 1
         return join([*self._chunks[first:], self._unfinished()]).since(since)
 
+    def num_since(self, since: int) -> int:
+        """Return how many steps there are with an index of at least `since`; cost O(number of chunks with such)."""
+        count = self._num_rows - int(np.searchsorted(self._steps[: self._num_rows], since))
+        for chunk in reversed(self._chunks):
+            if chunk.steps[-1] < since:
+                break
+            count += len(chunk) - int(np.searchsorted(chunk.steps, since))
+        return count
+
     def __iter__(self) -> Iterator[LogStep]:
         """Return the steps in order, as the log stands when the loop begins."""
         for chunk in [*self._chunks, self._unfinished()]:

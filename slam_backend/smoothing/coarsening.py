@@ -21,15 +21,11 @@ CONTRADICTION = 2.0  # times the kernel's squared distance: measurements farther
 OF_POINTS = ("points", "point_noises", "given", "point_frames", "point_landmarks")
 
 
-def coarsened(
-    graph: PathGraph, mode: Mode, spreads: FloatArray, camera: FloatArray, options: SmoothingOptions
-) -> PathGraph:
-    """Return the graph at its mode, with old keys condensed and at most `max_keys` of them, if the fresh ones allow.
+def coarsened(graph: PathGraph, camera: FloatArray, options: SmoothingOptions) -> PathGraph:
+    """Return the graph with old keys condensed and at most `max_keys` of them, if the fresh ones allow.
 
     Args:
-        graph: As it was solved.
-        mode: Of it.
-        spreads: (k,) [m^2] how far the motion from the key before scatters.
+        graph: At its mode, with what paths drawn there say of its spreads; see `at_mode`.
         camera: As in `find_mode`.
         options: How many keys, and how many of them fresh, of all robots together.
     """
@@ -37,22 +33,24 @@ def coarsened(
     fresh = np.zeros(graph.num_keys, dtype=np.bool_)
     for robot in range(len(graph.tips)):
         fresh[np.flatnonzero(graph.robots == robot)[-share:]] = True
-    at_mode = replace(graph, poses=mode.poses, landmarks=mode.landmarks)
-    condensed = _condensed(at_mode, mode, fresh, camera, options)
-    condensed = _without_blind(condensed, fresh)
-    representatives, slack = _representatives(condensed, spreads, fresh, options.max_keys)
+    condensed = _without_blind(_condensed(graph, fresh, camera, options), fresh)
+    representatives, slack = _representatives(condensed, graph.spreads, fresh, options.max_keys)
     return compacted(_joined(replace(condensed, slack=slack), representatives))
 
 
-def _condensed(
-    graph: PathGraph, mode: Mode, fresh: BoolArray, camera: FloatArray, options: SmoothingOptions
-) -> PathGraph:
+def at_mode(graph: PathGraph, mode: Mode, spreads: FloatArray | None = None) -> PathGraph:
+    """Return the graph with the poses and landmarks of the mode, and the spreads (k,) [m^2] of paths drawn there."""
+    graph = replace(graph, poses=mode.poses, landmarks=mode.landmarks)
+    return graph if spreads is None else replace(graph, spreads=spreads)
+
+
+def _condensed(graph: PathGraph, fresh: BoolArray, camera: FloatArray, options: SmoothingOptions) -> PathGraph:
     """Freeze what was measured from keys that are no longer fresh, but for what the smoothed path contradicts."""
     old = ~fresh[graph.frame_keys[graph.point_frames]]
-    if options.kernel and (lost := old & (mode.sightings.squares > CONTRADICTION * options.kernel)).any():
+    seen = _linearised(graph, camera, options)
+    if options.kernel and (lost := old & (seen.squares > CONTRADICTION * options.kernel)).any():
         graph = replace(graph, **{name: getattr(graph, name)[~lost] for name in OF_POINTS})
-    seen = Sightings.of(graph)
-    seen.linearise(graph, mode.poses, mode.landmarks, camera, options.noise_scale, options.kernel)
+        seen = _linearised(graph, camera, options)
     frozen = seen.frozen | ~fresh[seen.keys]
     keep = fresh[graph.frame_keys[graph.point_frames]]
     return replace(
@@ -65,6 +63,12 @@ def _condensed(
         slopes=seen.slopes[frozen],
         counts=seen.counts[frozen],
     )
+
+
+def _linearised(graph: PathGraph, camera: FloatArray, options: SmoothingOptions) -> Sightings:
+    seen = Sightings.of(graph)
+    seen.linearise(graph, graph.poses, graph.landmarks, camera, options.noise_scale, options.kernel)
+    return seen
 
 
 def _without_blind(graph: PathGraph, fresh: BoolArray) -> PathGraph:
@@ -139,6 +143,7 @@ def _joined(graph: PathGraph, representative: IntArray) -> PathGraph:
         previous=np.where(graph.previous >= 0, number[root[before]], NONE)[kept],
         motions=compose(offsets[before], graph.motions)[kept],
         noises=(turn @ graph.noises @ turn.transpose(0, 2, 1))[kept],
+        spreads=graph.spreads[kept],
         slack=graph.slack[kept],
         frame_keys=number[root[graph.frame_keys]],
         frozen_keys=number[sightings[0]],

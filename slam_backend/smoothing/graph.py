@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from slam_backend.motion import OdometryModel
 
 NONE = -1
 VAGUE = (1e4, 1e4, 10.0)  # variances [m^2, m^2, rad^2] of a start of which nothing is known
+LEVER = 3.0  # [m]; where an error of the heading between two keys is felt
 RIGID = 1e-4  # [m, rad]; starts that scatter less against each other do not move
 
 
@@ -38,6 +39,8 @@ class PathGraph:
             that is not known hangs on the origin, or on another robot's start.
         motions: (k, 3) float64 [m, m, rad]. Odometry from the previous key, in its frame.
         noises: (k, 3, 3) float64. Its covariance, likewise.
+        spreads: (k,) float64 [m^2]. How far the motion from the previous key scattered when paths were last drawn, or
+            as far as odometry says before that; see `LEVER`.
         slack: (k,) float64 [m^2]. How much those poses may move against each other that stand rigidly to the key.
         frame_keys, frame_offsets: (f,) int64, (f, 3) float64. Key of each frame, and the frame's pose seen from it.
         points, point_noises, given: (n, 3), (n, 6), (n,) raw measurements, robot axes from the camera centre; their
@@ -59,6 +62,7 @@ class PathGraph:
     previous: IntArray = field(default_factory=_no_index)
     motions: FloatArray = field(default_factory=lambda: _empty(0, 3))
     noises: FloatArray = field(default_factory=lambda: _empty(0, 3, 3))
+    spreads: FloatArray = field(default_factory=lambda: _empty(0))
     slack: FloatArray = field(default_factory=lambda: _empty(0))
     frame_keys: IntArray = field(default_factory=_no_index)
     frame_offsets: FloatArray = field(default_factory=lambda: _empty(0, 3))
@@ -101,7 +105,7 @@ class PathGraph:
         loose = [i for i in range(k) if (starts[i] != starts[i, :, :1]).any()]
         poses, previous, motions, noises = list(starts[:, :, 0]), [NONE] * k, [np.zeros(3)] * k, [np.zeros((3, 3))] * k
         for place, i in enumerate(loose):
-            poses[i] = np.array([starts[i, 0].mean(), starts[i, 1].mean(), circular_mean(starts[i, 2])])
+            poses[i] = mean_pose(starts[i])
             previous[i], motions[i], noises[i] = k, poses[i], np.diag(VAGUE)
             for other in loose[:place]:
                 apart = between(starts[other].T, starts[i].T)
@@ -116,6 +120,7 @@ class PathGraph:
             previous=np.array([*previous, *[NONE] * extra], dtype=np.int64),
             motions=np.array([*motions, *np.zeros((extra, 3))]),
             noises=np.array([*noises, *np.zeros((extra, 3, 3))]),
+            spreads=np.zeros(k + extra),
             slack=np.zeros(k + extra),
             heads=np.arange(k),
             tips=np.arange(k),
@@ -126,9 +131,7 @@ class PathGraph:
         """Return the graph in which robot i is the one that was `order[i]`; (K,) a permutation."""
         robots = self.robots.copy()
         robots[self.robots >= 0] = np.argsort(order)[self.robots[self.robots >= 0]]
-        return replace(
-            self, robots=robots, heads=self.heads[order], tips=self.tips[order], latest=self.latest[order]
-        )
+        return replace(self, robots=robots, heads=self.heads[order], tips=self.tips[order], latest=self.latest[order])
 
     def known_as(self, ids: IntArray) -> IntArray:
         """Return the names by which landmarks go."""
@@ -136,6 +139,10 @@ class PathGraph:
         for old, new in self.aliases:  # in the order in which they were found
             result[result == old] = new
         return result
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return all arrays by name; they cannot be written."""
+        return {name: getattr(self, name) for name in self.__dataclass_fields__}
 
     @property
     def linked(self) -> BoolArray:
@@ -216,6 +223,7 @@ def extended(
         previous=np.concatenate(previous),
         motions=np.concatenate([graph.motions, *(part.motions for part in parts)]),
         noises=np.concatenate([graph.noises, *(part.noises for part in parts)]),
+        spreads=np.concatenate([graph.spreads, *(scatter(part.noises) for part in parts)]),
         slack=np.concatenate([graph.slack, *(np.zeros(len(part.poses)) for part in parts)]),
         frame_keys=frame_keys_now,
         frame_offsets=np.concatenate([graph.frame_offsets, np.zeros((len(frame_keys_now) - len(graph.frame_keys), 3))]),
@@ -229,6 +237,11 @@ def extended(
         tips=tips,
         latest=np.array([log.steps[-1] if len(log) else graph.latest[i] for i, log in enumerate(logs)], dtype=np.int64),
     )  # fmt: skip
+
+
+def scatter(noises: FloatArray) -> FloatArray:
+    """Return the mean squares (n,) [m^2] by which motions of covariances (n, 3, 3) scatter, headings at `LEVER`."""
+    return np.asarray(noises[:, 0, 0] + noises[:, 1, 1] + LEVER**2 * noises[:, 2, 2])
 
 
 def _given(log: LogArrays, part: _Part) -> BoolArray:
@@ -299,9 +312,10 @@ def chained(
     return compose(chain, move), joint
 
 
-def circular_mean(angles: FloatArray) -> float:
-    """Return the mean direction of angles (n,) [rad] in (-pi, pi]."""
-    return float(np.arctan2(np.sin(angles).mean(), np.cos(angles).mean()))
+def mean_pose(poses: FloatArray) -> FloatArray:
+    """Return the mean (3,) of poses (3, n) [m, m, rad], headings by their mean direction."""
+    x, y, headings = poses
+    return np.array([x.mean(), y.mean(), np.arctan2(np.sin(headings).mean(), np.cos(headings).mean())])
 
 
 def _turned(poses: FloatArray) -> FloatArray:

@@ -26,6 +26,9 @@ class SmoothingOptions:
         least_ess: Share of M that the effective sample size of the importance weights must reach.
         more_draws: Where M paths do not reach it, but so many times M may, so many are drawn and M of them chosen by
             their weights; 1: never.
+        slice_keys: So many new keys, of all robots together but at least eight of each, are taken in as soon as they
+            wait, and no step does more than one slice of the work, see `slices`; None: all of it is done in the step in
+            which it is due.
         max_iterations: Of Gauss and Newton.
         tolerance: The descent ends when the cost is expected to fall by less than this (half a squared distance).
     """
@@ -39,6 +42,7 @@ class SmoothingOptions:
     free_sightings: int = 3000
     least_ess: float = 0.3
     more_draws: int = 8
+    slice_keys: int | None = None
     max_iterations: int = 15
     tolerance: float = 0.01
 
@@ -46,6 +50,8 @@ class SmoothingOptions:
         check_int("max_keys", self.max_keys, 2, "Two poses are the least that can be smoothed.")
         check_int("fresh_keys", self.fresh_keys, 1, "The newest pose is always fresh.")
         check_int("more_draws", self.more_draws, 1, "Use 1 to draw no more than M.")
+        if self.slice_keys is not None:
+            check_int("slice_keys", self.slice_keys, 1, "Use 30, or None for all at once.")
         check_int("max_iterations", self.max_iterations, 1, "Ten are enough as a rule.")
         check_float("effort", self.effort, "Use 4; more is dearer.", above=0.0)
         check_int("free_sightings", self.free_sightings, 0, "Use 0 to count them all.")

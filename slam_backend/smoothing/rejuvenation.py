@@ -12,11 +12,11 @@ from slam_backend.geometry import wrap_angle
 from slam_backend.log_arrays import EXACT, LogArrays
 from slam_backend.motion import OdometryModel
 from slam_backend.resampling import effective_sample_size, systematic
-from slam_backend.smoothing.coarsening import coarsened, compacted
+from slam_backend.smoothing.coarsening import at_mode, coarsened, compacted
 from slam_backend.smoothing.duplicates import find_duplicates, without_duplicates
 from slam_backend.smoothing.graph import PathGraph, extended, first_rows
 from slam_backend.smoothing.options import SmoothingOptions
-from slam_backend.smoothing.sampling import Draws, draw_paths
+from slam_backend.smoothing.sampling import Draws, draw_paths, scouted
 from slam_backend.smoothing.solving import Mode, find_mode
 
 SCOUTS = 32  # paths drawn to see what is rigid, while a long log is taken in
@@ -119,11 +119,33 @@ def rejuvenate(
         mode = find_mode(grown, camera, options)
         if mode.reason:
             return Rejuvenation(graph, mode.reason, float("nan"), mode.iterations, None)
-        draws = draw_paths(grown, mode, num_particles if last else SCOUTS, rng)
-        graph = coarsened(grown, mode, draws.spreads, camera, options)
         if last:
-            break
+            return drawn(grown, mode, camera, num_particles, rng, options, looks)
+        graph = settled(grown, mode, camera, options, rng)
         rest = [log.since(int(graph.latest[i]) + 1) for i, log in enumerate(rest)]
+
+
+def settled(
+    graph: PathGraph, mode: Mode, camera: FloatArray, options: SmoothingOptions, rng: np.random.Generator
+) -> PathGraph:
+    """Return the graph at its mode; if it has too many keys some are joined, the most rigid of a few paths drawn."""
+    if graph.num_keys <= options.max_keys:
+        return at_mode(graph, mode)
+    return coarsened(at_mode(graph, mode, scouted(graph, mode, SCOUTS, rng)), camera, options)
+
+
+def drawn(
+    grown: PathGraph,
+    mode: Mode,
+    camera: FloatArray,
+    num_particles: int,
+    rng: np.random.Generator,
+    options: SmoothingOptions,
+    looks: Looks | None = None,
+) -> Rejuvenation:
+    """Draw particles about the mode of a graph; arguments are those of `rejuvenate`."""
+    draws = draw_paths(grown, mode, num_particles, rng)
+    graph = coarsened(at_mode(grown, mode, draws.spreads), camera, options)
     weights, ess = _weighed(draws)
     chosen = draws
     needed = options.least_ess * num_particles

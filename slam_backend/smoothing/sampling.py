@@ -9,10 +9,8 @@ from slam_backend.errors import FloatArray, IntArray
 from slam_backend.geometry import between
 from slam_backend.smoothing import _kernels
 from slam_backend.smoothing._kernels import LANES, POSE_ROWS, WORK_ROWS
-from slam_backend.smoothing.graph import PathGraph
+from slam_backend.smoothing.graph import LEVER, PathGraph
 from slam_backend.smoothing.solving import Mode
-
-LEVER = 3.0  # [m]; where an error of the heading between two keys is felt
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,18 +54,28 @@ def draw_paths(graph: PathGraph, mode: Mode, num_particles: int, rng: np.random.
         num_particles: M >= 1.
         rng: Source of the draws.
     """
-    m = num_particles
-    normals = rng.standard_normal((m, len(mode.factor))).T  # columns lie in a row, as LAPACK wants them
+    poses, log_proposals = _poses(mode, num_particles, rng)
+    rows = lane_rows(poses)
+    tiles, log_likelihood = replay(mode, rows, num_particles)
+    log_odometry, spreads = weigh_odometry(graph, mode, rows, num_particles)
+    log_weights = log_likelihood + log_odometry - log_proposals
+    return Draws(poses, tiles, log_weights, spreads)
+
+
+def scouted(graph: PathGraph, mode: Mode, num_paths: int, rng: np.random.Generator) -> FloatArray:
+    """Return how far the motions between keys scatter (k,) [m^2], from paths that are drawn but not replayed."""
+    return weigh_odometry(graph, mode, lane_rows(_poses(mode, num_paths, rng)[0]), num_paths)[1]
+
+
+def _poses(mode: Mode, num_paths: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    """Return paths (k, 3, M) from the Gaussian about the mode, which is the first of them, and their log q (M,)."""
+    normals = rng.standard_normal((num_paths, len(mode.factor))).T  # columns lie in a row, as LAPACK wants them
     normals[:, 0] = 0.0
     log_proposals = -0.5 * np.einsum("nm,nm->m", normals, normals)
     spread = lapack.dtrtrs(mode.factor, normals, lower=0, overwrite_b=1)[0]
-    poses = np.repeat(mode.poses[:, :, None], m, axis=2)
-    poses[mode.columns >= 0] += spread.reshape(-1, 3, m)
-    rows = lane_rows(poses)
-    tiles, log_likelihood = replay(mode, rows, m)
-    log_odometry, spreads = weigh_odometry(graph, mode, rows, m)
-    log_weights = log_likelihood + log_odometry - log_proposals
-    return Draws(poses, tiles, log_weights, spreads)
+    poses = np.repeat(mode.poses[:, :, None], num_paths, axis=2)
+    poses[mode.columns >= 0] += spread.reshape(-1, 3, num_paths)
+    return poses, log_proposals
 
 
 def lane_rows(poses: FloatArray) -> FloatArray:

@@ -30,7 +30,8 @@ class Mode:
         odometry_infos: (k, 3, 3) float64. Information of the odometry from the key before; zeros where there is none.
         cost: Half the sum of squared distances (robust, and up to a constant of the frozen sightings).
         iterations: Systems solved.
-        reason: Why it is of no use; "" if it is of use.
+        damping: Of the last system; where a descent that was not given the time goes on.
+        reason: Why it is of no use; "" if it is of use. Poses and landmarks are then where the descent got to.
     """
 
     poses: FloatArray
@@ -42,10 +43,18 @@ class Mode:
     odometry_infos: FloatArray
     cost: float
     iterations: int
+    damping: float
     reason: str
 
+    @property
+    def unfinished(self) -> bool:
+        """Whether nothing is wrong with the descent but that it was given too few iterations."""
+        return bool(self.reason) and np.isfinite(self.cost)
 
-def find_mode(graph: PathGraph, camera: FloatArray, options: SmoothingOptions) -> Mode:
+
+def find_mode(
+    graph: PathGraph, camera: FloatArray, options: SmoothingOptions, most: int | None = None, damping: float = 0.0
+) -> Mode:
     """Descend from where the graph stands.
 
     A step that does not lower the cost is tried again with more damping (Levenberg, Marquardt).
@@ -54,6 +63,8 @@ def find_mode(graph: PathGraph, camera: FloatArray, options: SmoothingOptions) -
         graph: Key poses, odometry, measurements; its poses and landmarks are the start.
         camera: (7,) focal length, baseline, sigma_px, sigma_disparity, mount.
         options: Kernel, scale of the noise, tolerance, iterations.
+        most: Iterations; None: as in the options.
+        damping: Of the first one.
     """
     sought = graph.previous >= 0
     columns = np.where(sought, 3 * np.cumsum(sought) - 3, FREE)
@@ -62,8 +73,12 @@ def find_mode(graph: PathGraph, camera: FloatArray, options: SmoothingOptions) -
     poses, landmarks = graph.poses.copy(), graph.landmarks.copy()
     empty, informations = np.zeros((0, 0)), np.zeros_like(graph.noises)
 
-    def given_up(reason: str, iterations: int = 0) -> Mode:
-        return Mode(poses, landmarks, columns, empty, np.zeros(0), sightings, informations, np.inf, iterations, reason)
+    most = options.max_iterations if most is None else most
+
+    def given_up(reason: str, iterations: int = 0, cost: float = np.inf) -> Mode:
+        return Mode(
+            poses, landmarks, columns, empty, np.zeros(0), sightings, informations, cost, iterations, damping, reason
+        )
 
     if not size:
         return given_up("no pose to seek")
@@ -72,9 +87,8 @@ def find_mode(graph: PathGraph, camera: FloatArray, options: SmoothingOptions) -
         return given_up("odometry without noise")
     informations[sought] = np.linalg.inv(noises)
     system = _System(graph, columns, size, informations, sightings, camera, options)
-    damping = 0.0
     cost = system.form(poses, landmarks)
-    for iteration in range(1, options.max_iterations + 1):
+    for iteration in range(1, most + 1):
         if not np.isfinite(cost):
             return given_up("a landmark without information", iteration)
         factor = system.factor(damping)
@@ -91,7 +105,7 @@ def find_mode(graph: PathGraph, camera: FloatArray, options: SmoothingOptions) -
         if expected <= options.tolerance and damping == 0.0:
             return Mode(
                 trial_poses, trial_landmarks, columns, factor, slope, sightings, informations, cost - expected,
-                iteration, "",
+                iteration, damping, "",
             )  # fmt: skip
         trial_cost = system.form(trial_poses, trial_landmarks)
         if trial_cost <= cost + 1e-9 * abs(cost):
@@ -102,7 +116,7 @@ def find_mode(graph: PathGraph, camera: FloatArray, options: SmoothingOptions) -
             if damping > MOST_DAMPING:
                 return given_up("no descent", iteration)
             cost = system.form(poses, landmarks)
-    return given_up(f"no convergence in {options.max_iterations} iterations", options.max_iterations)
+    return given_up(f"no convergence in {most} iterations", most, cost)
 
 
 class _System:
@@ -123,9 +137,7 @@ class _System:
     def form(self, poses: FloatArray, landmarks: FloatArray) -> float:
         """Form the equations; return the cost."""
         seen, graph = self.sightings, self.graph
-        loss = seen.linearise(
-            graph, poses, landmarks, self.camera, self.options.noise_scale, self.options.kernel
-        )
+        loss = seen.linearise(graph, poses, landmarks, self.camera, self.options.noise_scale, self.options.kernel)
         self.matrix.fill(0.0)
         self.vector.fill(0.0)
         return loss + _kernels.assemble(
@@ -146,4 +158,3 @@ class _System:
         _kernels.move_landmarks(
             landmarks, self.columns, seen.keys, seen.starts, self.cross, self.spreads, self.forces, change
         )
-

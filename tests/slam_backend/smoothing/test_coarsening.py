@@ -5,7 +5,7 @@ from small_problems import TIGHT, camera_of, graph_of, logs_of, small_run
 
 from slam_backend.geometry import compose
 from slam_backend.run_log import RobotLog
-from slam_backend.smoothing.coarsening import coarsened
+from slam_backend.smoothing.coarsening import at_mode, coarsened
 from slam_backend.smoothing.graph import PathGraph, extended
 from slam_backend.smoothing.options import SmoothingOptions
 from slam_backend.smoothing.rejuvenation import rejuvenate
@@ -23,7 +23,7 @@ def test_condensed_sightings_of_single_poses_change_nothing():
     run = small_run(2)
     graph = graph_of(run)
     mode = find_mode(graph, camera_of(run), TIGHT)
-    frozen = coarsened(graph, mode, np.zeros(graph.num_keys), camera_of(run), limits(1000, 2))
+    frozen = coarsened(at_mode(graph, mode, np.zeros(graph.num_keys)), camera_of(run), limits(1000, 2))
     assert len(frozen.points) < len(graph.points)
     assert frozen.num_keys == graph.num_keys
     again = find_mode(frozen, camera_of(run), TIGHT)
@@ -55,7 +55,7 @@ def test_rigid_neighbours_keep_what_they_see():
     graph = graph_of(run)
     mode = find_mode(graph, camera_of(run), TIGHT)
     spreads = draw_paths(graph, mode, 50, np.random.default_rng(1)).spreads
-    fewer = coarsened(graph, mode, spreads, camera_of(run), limits(9, 3))
+    fewer = coarsened(at_mode(graph, mode, spreads), camera_of(run), limits(9, 3))
     assert fewer.num_keys == 9
     np.testing.assert_allclose(fewer.poses[fewer.tips], mode.poses[graph.tips])
     again = find_mode(fewer, camera_of(run), TIGHT)
@@ -70,7 +70,7 @@ def test_odometry_is_carried_to_the_joined_keys():
     run = small_run()
     graph = graph_of(run)
     mode = find_mode(graph, camera_of(run), TIGHT)
-    fewer = coarsened(graph, mode, np.full(graph.num_keys, 1e-6), camera_of(run), limits(5, 2))
+    fewer = coarsened(at_mode(graph, mode, np.full(graph.num_keys, 1e-6)), camera_of(run), limits(5, 2))
     for b in np.flatnonzero(fewer.previous >= 0):
         old = np.flatnonzero((np.abs(mode.poses - fewer.poses[b]) < 1e-12).all(axis=1))[0]
         before = compose(mode.poses[old - 1], graph.motions[old])
@@ -90,7 +90,7 @@ def test_unseen_keys_vanish_without_loss():
     grown = extended(PathGraph.at_starts(run.true_paths[:, 0]), [upto], run.spec.noise.motion, mount)
     whole = extended(grown, [rest], run.spec.noise.motion, mount)
     mode = find_mode(whole, camera_of(run), TIGHT)
-    fewer = coarsened(whole, mode, np.zeros(whole.num_keys), camera_of(run), limits(1000, 2))
+    fewer = coarsened(at_mode(whole, mode, np.zeros(whole.num_keys)), camera_of(run), limits(1000, 2))
     assert fewer.num_keys == whole.num_keys - 1
     again = find_mode(fewer, camera_of(run), TIGHT)
     np.testing.assert_allclose(again.poses, np.delete(mode.poses, 7, axis=0), atol=1e-3)
@@ -132,9 +132,9 @@ def test_a_graph_is_not_changed_by_what_is_made_of_it():
     before = {name: getattr(graph, name).copy() for name in graph.__dataclass_fields__}
     mode = find_mode(graph, camera_of(run), TIGHT)
     draws = draw_paths(graph, mode, 9, np.random.default_rng(1))
-    fewer = coarsened(graph, mode, draws.spreads, camera_of(run), limits(7, 3))
+    fewer = coarsened(at_mode(graph, mode, draws.spreads), camera_of(run), limits(7, 3))
     kept = {name: getattr(fewer, name).copy() for name in fewer.__dataclass_fields__}
-    coarsened(fewer, find_mode(fewer, camera_of(run), TIGHT), np.ones(7), camera_of(run), limits(4, 2))
+    coarsened(at_mode(fewer, find_mode(fewer, camera_of(run), TIGHT), np.ones(7)), camera_of(run), limits(4, 2))
     replace(graph)
     for name, value in before.items():
         np.testing.assert_array_equal(getattr(graph, name), value)

@@ -132,7 +132,7 @@ def test_where_there_is_nothing_to_smooth_the_filter_goes_on():
             if report.rejuvenation is not None:
                 reasons.add(report.rejuvenation.reason)
                 assert np.isnan(report.rejuvenation.ess)
-        assert reasons == {reason}
+        assert {told.partition(";")[0] for told in reasons} == {reason}
         assert np.isfinite(slam.pose(0).mean).all()
 
 

@@ -4,19 +4,23 @@ import copy
 import pickle
 
 import numpy as np
+import pytest
 from same_bits import assert_same
 from simulated_team import SimulatedTeam
 
 from slam_backend.alignment import AlignmentOptions
 from slam_backend.attempts import AttemptOptions
+from slam_backend.smoothing import slices
+from slam_backend.smoothing.options import SmoothingOptions
+from slam_backend.smoothing.solving import find_mode
 from slam_backend.team import TeamSlam
 
 
-def build(simulation, every=20):
+def build(simulation, every=20, slice_keys=None):
     """Return a team that merges early."""
     return simulation.build(
         alignment=AlignmentOptions(min_inliers=9), attempts=AttemptOptions(every=20, new_candidates=2),
-        rejuvenate_every=every,
+        rejuvenate_every=every, smoothing=SmoothingOptions(slice_keys=slice_keys),
     )  # fmt: skip
 
 
@@ -27,12 +31,13 @@ def rejuvenations(team):
     return [(robots, report) for robots, report in reports if report is not None]
 
 
-def test_a_merged_team_is_rejuvenated_and_knows_where_it_started():
-    """In the step after a merge the joint filter is smoothed; the other starts are then known."""
+@pytest.mark.parametrize("slice_keys", [None, 24])
+def test_a_merged_team_is_rejuvenated_and_knows_where_it_started(slice_keys):
+    """Soon after a merge the joint filter is smoothed, at once or in slices; the other starts are then known."""
     simulation = SimulatedTeam(seed=101)
-    team = build(simulation)
+    team = build(simulation, slice_keys=slice_keys)
     joint = []
-    for _ in range(90):
+    for _ in range(100):
         team.step(*simulation.read())
         joint += [report.reason for robots, report in rejuvenations(team) if robots == 3]
     assert team.groups == ((0, 1, 2),)
@@ -44,10 +49,11 @@ def test_a_merged_team_is_rejuvenated_and_knows_where_it_started():
     assert simulation.position_errors(team).max() < 0.2
 
 
-def test_a_snapshot_of_a_team_goes_on_through_merges_and_rejuvenations():
+@pytest.mark.parametrize("slice_keys", [None, 12])
+def test_a_snapshot_of_a_team_goes_on_through_merges_and_rejuvenations(slice_keys):
     """A restored team does, bit for bit, the same as the one that went on, its smoothers included."""
     simulation = SimulatedTeam(seed=101)
-    team = build(simulation)
+    team = build(simulation, slice_keys=slice_keys)
     simulation.run(team, 50)
     state = pickle.loads(pickle.dumps(team.get_state()))
     restored, readings = TeamSlam(3, seed=99), copy.deepcopy(simulation)
@@ -59,3 +65,43 @@ def test_a_snapshot_of_a_team_goes_on_through_merges_and_rejuvenations():
         merges += len(report.renamings)
     assert merges >= 1
     assert_same(restored.get_state(), team.get_state())
+
+
+def test_a_merge_goes_on_from_what_both_groups_have_smoothed():
+    """Just after a merge the joint smoother has all that the groups' smoothers had: nothing is done again."""
+    simulation = SimulatedTeam(seed=101)
+    team = build(simulation, slice_keys=12)
+    before = {}
+    for _ in range(90):
+        known = {group: state["latest"] for group, state in before.items()}
+        report = team.step(*simulation.read())
+        before = {group.robots: smoother_of(group) for group in team._groups}
+        for renaming in report.renamings:
+            robots = renaming.robots_a + renaming.robots_b
+            latest = before[tuple(sorted(robots))]["latest"][np.argsort(np.argsort(robots))]
+            asked = np.concatenate([known[renaming.robots_a], known[renaming.robots_b]])
+            assert (latest >= asked).all()
+            assert (asked >= 0).all()
+    assert team.groups == ((0, 1, 2),)
+
+
+def smoother_of(group):
+    """Return the graph of a group's joint filter as its state holds it."""
+    return group.trunk.filter.get_state()["rejuvenation"]["graph"] or {"latest": np.full(len(group.robots), -1)}
+
+
+def test_no_two_filters_work_on_their_smoothers_in_one_step(monkeypatch):
+    """Robots that do not look for each other have steps of their own in which their filters may smooth."""
+    simulation = SimulatedTeam(seed=101)
+    smoothing = SmoothingOptions(slice_keys=4)
+    team = simulation.build(attempts=AttemptOptions(enabled=False), rejuvenate_every=20, smoothing=smoothing)
+    worked = []
+
+    def noted(*arguments):
+        worked.append(team._step)
+        return find_mode(*arguments)
+
+    monkeypatch.setattr(slices, "find_mode", noted)
+    simulation.run(team, 60)
+    assert len(worked) > 10
+    assert len(set(worked)) == len(worked)

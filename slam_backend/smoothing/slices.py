@@ -1,0 +1,97 @@
+"""The work of a smoother in slices, each of them bounded, so that no step of a filter waits for more than one.
+
+A slice either takes in a few new keys and does one step of Gauss and Newton; or does one more such step, until the
+descent has ended, and then joins surplus keys; or, when all is at its mode, takes in the very last keys, ends the
+descent and draws. Between slices there is nothing but a graph, and how damped its next step is.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from slam_backend.errors import FloatArray
+from slam_backend.log_arrays import REJECTED, LogArrays
+from slam_backend.motion import OdometryModel
+from slam_backend.smoothing.coarsening import at_mode
+from slam_backend.smoothing.graph import PathGraph, extended
+from slam_backend.smoothing.options import SmoothingOptions
+from slam_backend.smoothing.rejuvenation import Looks, Rejuvenation, drawn, settled
+from slam_backend.smoothing.solving import Mode, find_mode
+
+LAST_STEPS = 3  # of Gauss and Newton in the slice that draws: the graph was at its mode but for the last few keys
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Draft:
+    """A graph in the middle of a descent.
+
+    Attributes:
+        graph: Its poses and landmarks are where the descent has got to.
+        damping: Of the next step.
+        steps: Done so far.
+    """
+
+    graph: PathGraph
+    damping: float = 0.0
+    steps: int = 0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Smoother:
+    """What all slices need.
+
+    Attributes:
+        motion: Noise of the odometry.
+        camera: (7,) focal length, baseline, sigma_px, sigma_disparity, mount.
+        options: What decides the rest.
+        rng: Source of the draws.
+    """
+
+    motion: OdometryModel
+    camera: FloatArray
+    options: SmoothingOptions
+    rng: np.random.Generator
+
+    def take_in(
+        self, graph: PathGraph, logs: Sequence[LogArrays], guesses: Sequence[Mapping[int, FloatArray]]
+    ) -> PathGraph | Draft | str:
+        """Take in all rows of the logs, which are few, and do one step; see `descend`."""
+        grown = extended(graph, logs, self.motion, self.camera[4:], guesses)
+        return self.descend(Draft(graph=grown))
+
+    def descend(self, draft: Draft) -> PathGraph | Draft | str:
+        """Do one step; return the graph if that ended the descent, how it now stands if not, or what is wrong."""
+        mode = find_mode(draft.graph, self.camera, self.options, 1, draft.damping)
+        return self._after(draft, mode)
+
+    def draw(
+        self,
+        graph: PathGraph,
+        logs: Sequence[LogArrays],
+        guesses: Sequence[Mapping[int, FloatArray]],
+        num_particles: int,
+        looks: Looks,
+    ) -> Rejuvenation | PathGraph | Draft | str:
+        """Take in the logs' last rows, and draw particles, if so few steps end the descent."""
+        grown = extended(graph, logs, self.motion, self.camera[4:], guesses)
+        draft = Draft(graph=grown)
+        mode = find_mode(grown, self.camera, self.options, LAST_STEPS)
+        if not mode.reason:
+            return drawn(grown, mode, self.camera, num_particles, self.rng, self.options, looks)
+        return self._after(draft, mode)
+
+    def without_measurements(self, graph: PathGraph, logs: Sequence[LogArrays]) -> PathGraph:
+        """Return the graph after all rows of the logs, of which only the odometry is believed."""
+        blind = [replace(log, ids=np.full_like(log.ids, REJECTED)) for log in logs]
+        return extended(graph, blind, self.motion, self.camera[4:])
+
+    def _after(self, draft: Draft, mode: Mode) -> PathGraph | Draft | str:
+        if not mode.reason:
+            return settled(draft.graph, mode, self.camera, self.options, self.rng)
+        steps = draft.steps + mode.iterations
+        if not mode.unfinished:
+            return mode.reason
+        if steps >= self.options.max_iterations:
+            return f"no convergence in {steps} iterations"
+        return Draft(graph=at_mode(draft.graph, mode), damping=mode.damping, steps=steps)
