@@ -49,7 +49,8 @@ class FastSlam:
         initial_poses: (K, 3) [m, m, rad], map frame. None: all at the origin.
         num_particles, camera, motion, proposal, resampling, resample_threshold, position_gate, descriptor_gate,
         dead_zone, dead_radius, recovery_position, recovery_heading, descriptor_sigma, ambiguity,
-        new_landmark_density, one_to_one, adaptive, existence, rejuvenate_every, smoothing: See `FilterOptions`.
+        new_landmark_density, one_to_one, landmark_noise, adaptive, existence, rejuvenate_every, smoothing: See
+        `FilterOptions`.
 
     Raises:
         ValueError: If an argument is out of its range; the text names it.
@@ -82,6 +83,7 @@ class FastSlam:
         ambiguity: float = 6.0,
         new_landmark_density: float = 0.01,
         one_to_one: bool = True,
+        landmark_noise: float | None = None,
         adaptive: AdaptiveParticles | None = None,
         existence: ExistenceModel | None = None,
         rejuvenate_every: int | None = None,
@@ -106,6 +108,7 @@ class FastSlam:
             ambiguity=ambiguity,
             new_landmark_density=new_landmark_density,
             one_to_one=one_to_one,
+            landmark_noise=landmark_noise,
             adaptive=adaptive,
             existence=existence,
             rejuvenate_every=rejuvenate_every,
@@ -393,7 +396,7 @@ class FastSlam:
         if result is None:
             return None
         if (new := result.particles) is not None:
-            write_maps(self._maps, self.best_particle, new)
+            write_maps(self._maps, self.best_particle, new, self.options.landmark_walk)
             self._poses[:, :, :m], self._starts[:, :, :m] = new.poses, new.starts
             self._means[:] = self._poses
             self._covariances.fill(0.0)
@@ -445,14 +448,15 @@ class FastSlam:
         if options.proposal == "fastslam1":
             _kernels.update_fastslam1(
                 poses, means, covariances, exact is None, move, sigmas, normals, *store, *readings,
-                options.descriptor_gate**2, options.position_gate, self._log_p0, options.one_to_one, *results,
+                options.descriptor_gate**2, options.position_gate, self._log_p0, options.landmark_walk,
+                options.one_to_one, *results,
             )  # fmt: skip
         else:
             _kernels.update_fastslam2(
                 poses, means, covariances, blind, move, sigmas, normals, *store, *readings,
                 options.descriptor_gate**2, options.descriptor_sigma**2, options.position_gate, options.dead_zone,
                 options.dead_radius, options.ambiguity, NOTHING if exact is not None else self._recovery,
-                self._log_p0, options.one_to_one, *results,
+                self._log_p0, options.landmark_walk, options.one_to_one, *results,
             )  # fmt: skip
             self._blind[robot] = False
         return used

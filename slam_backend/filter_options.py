@@ -12,6 +12,7 @@ from slam_backend.resampling import RESAMPLING
 from slam_backend.smoothing.options import SmoothingOptions
 
 PROPOSALS = ("fastslam2", "fastslam1")
+CALIBRATED_NOISE = 0.005  # [m]; chosen on simulated stereo runs, see docs/smoothing.md
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,6 +42,11 @@ class FilterOptions:
             makes a measurement ambiguous, and it is held back (`fastslam2`) [-].
         new_landmark_density: p0, density of measurements that match nothing [1/m^3].
         one_to_one: Match a landmark at most once in a frame; False: measurements choose independently, as in the paper.
+        landmark_noise: Standard deviation q [m] along each axis by which a landmark may move between two sightings: a
+            random walk, Sigma + q^2 I after each update, the first included. However often it is seen, its variance
+            then does not fall below the fixed point of Riccati's recursion. 0: landmarks stand still. None:
+            `CALIBRATED_NOISE` where particles are rejuvenated, for it makes honest what they claim in between, else 0:
+            a filter without smoother would only forget.
         adaptive: How the number of particles follows the spread of the poses at each resampling; None: it stays.
         existence: How the probability that a landmark exists follows from being seen and missed; particles delete
             landmarks that are too improbable. None: what is once in a map stays there.
@@ -65,6 +71,7 @@ class FilterOptions:
     ambiguity: float = 6.0
     new_landmark_density: float = 0.01
     one_to_one: bool = True
+    landmark_noise: float | None = None
     adaptive: AdaptiveParticles | None = None
     existence: ExistenceModel | None = None
     rejuvenate_every: int | None = None
@@ -83,6 +90,8 @@ class FilterOptions:
         check_float("dead_zone", self.dead_zone, "It starts where the gate ends.", at_least=self.position_gate)
         for name in ("dead_radius", "recovery_position", "recovery_heading"):
             check_float(name, getattr(self, name), "Use 0 to switch it off.", at_least=0.0)
+        if self.landmark_noise is not None:
+            check_float("landmark_noise", self.landmark_noise, "Use 0 for landmarks that stand still.", at_least=0.0)
         check_float("ambiguity", self.ambiguity, "Use 0 to hold nothing back.", at_least=0.0)
         for name, model in (("adaptive", AdaptiveParticles), ("existence", ExistenceModel)):
             value = getattr(self, name)
@@ -96,3 +105,10 @@ class FilterOptions:
             raise bad_argument("smoothing", "SmoothingOptions", self.smoothing, "Build them: SmoothingOptions().")
         if not isinstance(self.one_to_one, bool):
             raise bad_argument("one_to_one", "a bool", self.one_to_one, "Say True or False.")
+
+    @property
+    def landmark_walk(self) -> float:
+        """Variance [m^2] along each axis by which a landmark may move between two sightings."""
+        if self.landmark_noise is None:
+            return 0.0 if self.rejuvenate_every is None else CALIBRATED_NOISE**2
+        return float(self.landmark_noise) ** 2

@@ -24,7 +24,7 @@ def update_fastslam1(
     users: IntArray, free_rows: IntArray, free_slots: IntArray, tops: IntArray, ids: IntArray, identities: IntArray,
     stored: Float32Array, heads: Float32Array,
     points: FloatArray, noises: FloatArray, given: bool, camera: FloatArray, descriptors: Float32Array, names: IntArray,
-    named: bool, descriptor_gate: float, position_gate: float, log_p0: float, one_to_one: bool,
+    named: bool, descriptor_gate: float, position_gate: float, log_p0: float, walk: float, one_to_one: bool,
     work: FloatArray, records: FloatArray,
     found: Int32Array, distances: FloatArray, new_slots: IntArray, log_likelihood: FloatArray,
 ) -> None:
@@ -46,6 +46,7 @@ def update_fastslam1(
         descriptor_gate: Largest admitted squared distance E0.
         position_gate: D0.
         log_p0: Log-density of a measurement that starts a new landmark.
+        walk: Variance [m^2] along each axis by which a landmark may have moved between two sightings.
         one_to_one: Whether a landmark is matched at most once in a frame.
         work, records: Working space.
         found: (B, P), written: the slot, new ones included.
@@ -90,14 +91,14 @@ def update_fastslam1(
                     bar_taken(match[owners[p]], float(p), mask)
                     p = same[p]
                 innovate(work, tile, points, noises, b, given, camera)
-                gate_and_update(work, tile, record, chosen, seen, float(q), mask, gate)  # l. 33-37, 39
+                gate_and_update(work, tile, record, chosen, seen, float(q), mask, gate, walk)  # l. 33-37, 39
             log_clutter = log_p0 + (0.0 if given else 4.0 * math.log(points[b, 0]))
             if mask_of(chosen, -2.0, mask) > 0:  # l. 28-32
                 if new_slots[b] == REJECTED:
                     open_slot(b, new_slots, new_rows, row_of, map_of, values, counts, free_rows, free_slots, tops)
                 new_landmark(
                     work, tile_of(values, padded, new_rows[b], block), points, noises, b, given, camera, mask,
-                    counts[new_rows[b], first : first + LANES],
+                    counts[new_rows[b], first : first + LANES], walk,
                 )
                 for i in range(LANES):
                     work[CLUTTER + i] += log_clutter if mask[i] > 0.0 else 0.0

@@ -48,7 +48,7 @@ def update_fastslam2(
     points: FloatArray, noises: FloatArray, given: bool, camera: FloatArray, descriptors: Float32Array, names: IntArray,
     named: bool, descriptor_gate: float, descriptor_variance: float, position_gate: float, dead_zone: float,
     dead_radius: float, ambiguity: float,
-    recovery: FloatArray, log_p0: float, one_to_one: bool,
+    recovery: FloatArray, log_p0: float, walk: float, one_to_one: bool,
     work: FloatArray, records: FloatArray,
     found: Int32Array, distances: FloatArray, new_slots: IntArray, log_likelihood: FloatArray,
 ) -> None:
@@ -202,16 +202,16 @@ def update_fastslam2(
                     innovate(work, tile, points, noises, b, given, camera)
                     if num_young > 0:
                         before[:] = tile
-                        update(work, tile, young)
+                        update(work, tile, young, 0.0)
                         innovate(work, tile, points, noises, b, given, camera)
                         relinearise(work, tile, before)
-                    update(work, tile, mask)
+                    update(work, tile, mask, walk)
             if mask_of(match[b], -2.0, mask) > 0:
                 if new_slots[b] == REJECTED:
                     open_slot(b, new_slots, new_rows, row_of, map_of, values, counts, free_rows, free_slots, tops)
                 new_landmark(
                     work, tile_of(values, padded, new_rows[b], block), points, noises, b, given, camera, mask,
-                    counts[new_rows[b], first : first + LANES],
+                    counts[new_rows[b], first : first + LANES], walk,
                 )
             write_found(
                 found[b, first : first + LANES], distances[b, first : first + LANES], match[b], starts[b],

@@ -34,9 +34,9 @@ YOUNG = 4  # a landmark seen up to so many times is updated by the iterated EKF:
 @lanes_inlined
 def _updated(
     work: FloatArray, tile: FloatArray, i: int, i00: float, i01: float, i02: float, i11: float, i12: float, i22: float,
-    match: bool,
+    match: bool, walk: float,
 ) -> None:
-    """Update a landmark where `match`, S^-1 given (Eqs. 8-10)."""
+    """Update a landmark where `match`, S^-1 given (Eqs. 8-10), and let it walk: Sigma + walk I."""
     p00, p01, p02 = tile[3 * LANES + i], tile[4 * LANES + i], tile[5 * LANES + i]
     p11, p12, p22 = tile[6 * LANES + i], tile[7 * LANES + i], tile[8 * LANES + i]
     n00, n01, n02 = work[N00 + i], work[N01 + i], work[N02 + i]
@@ -58,12 +58,12 @@ def _updated(
     q01 = 0.5 * (k00 * n01 + k01 * n11 + k02 * n12 + k10 * n00 + k11 * n01 + k12 * n02)
     q02 = 0.5 * (k00 * n02 + k01 * n12 + k02 * n22 + k20 * n00 + k21 * n01 + k22 * n02)
     q12 = 0.5 * (k10 * n02 + k11 * n12 + k12 * n22 + k20 * n01 + k21 * n11 + k22 * n12)
-    tile[3 * LANES + i] = k00 * n00 + k01 * n01 + k02 * n02 if match else p00
+    tile[3 * LANES + i] = k00 * n00 + k01 * n01 + k02 * n02 + walk if match else p00
     tile[4 * LANES + i] = q01 if match else p01
     tile[5 * LANES + i] = q02 if match else p02
-    tile[6 * LANES + i] = k10 * n01 + k11 * n11 + k12 * n12 if match else p11
+    tile[6 * LANES + i] = k10 * n01 + k11 * n11 + k12 * n12 + walk if match else p11
     tile[7 * LANES + i] = q12 if match else p12
-    tile[8 * LANES + i] = k20 * n02 + k21 * n12 + k22 * n22 if match else p22
+    tile[8 * LANES + i] = k20 * n02 + k21 * n12 + k22 * n22 + walk if match else p22
 
 
 @lanes_inlined
@@ -78,18 +78,22 @@ def _inverse_of_sum(
 
 
 @lanes
-def update(work: FloatArray, tile: FloatArray, mask: FloatArray) -> None:
-    """At a known pose: update the landmark where `mask` is 1 and it lies ahead of the camera (Eqs. 5-10)."""
+def update(work: FloatArray, tile: FloatArray, mask: FloatArray, walk: float) -> None:
+    """At a known pose: update the landmark where `mask` is 1 and it lies ahead of the camera (Eqs. 5-10).
+
+    Args:
+        walk: Variance [m^2] by which the landmark may have moved, along each axis, when it is seen the next time.
+    """
     for i in range(LANES):
         i00, i01, i02, i11, i12, i22, _ = _inverse_of_sum(work, tile, i)
         match = mask[i] > 0.0 and work[DEPTH + i] >= MIN_DEPTH
-        _updated(work, tile, i, i00, i01, i02, i11, i12, i22, match)
+        _updated(work, tile, i, i00, i01, i02, i11, i12, i22, match, walk)
 
 
 @lanes
 def gate_and_update(
     work: FloatArray, tile: FloatArray, record: FloatArray, chosen: FloatArray, seen: Int32Array, q: float,
-    admit: FloatArray, gate: float,
+    admit: FloatArray, gate: float, walk: float,
 ) -> None:
     """At a known pose: where admitted and inside the gate, weigh and update the landmark (Eqs. 5-11).
 
@@ -98,13 +102,14 @@ def gate_and_update(
         seen: (LANES,) is counted up there.
         admit: (LANES,) 1 where the lane may match.
         record: Row Q_D is written.
+        walk: As in `update`.
     """
     for i in range(LANES):
         i00, i01, i02, i11, i12, i22, det = _inverse_of_sum(work, tile, i)
         distance = quadratic_form(i00, i01, i02, i11, i12, i22, work[R0 + i], work[R1 + i], work[R2 + i])
         depth = work[DEPTH + i]
         match = admit[i] > 0.0 and distance <= gate and depth >= MIN_DEPTH
-        _updated(work, tile, i, i00, i01, i02, i11, i12, i22, match)
+        _updated(work, tile, i, i00, i01, i02, i11, i12, i22, match, walk)
         count_likelihood(work, i, match, distance, det, depth)
         record[Q_D + i] = distance
         chosen[i] = q if match else chosen[i]
@@ -142,7 +147,7 @@ def count_matches(seen: Int32Array, mask: FloatArray) -> None:
 @lanes
 def new_landmark(
     work: FloatArray, tile: FloatArray, points: FloatArray, noises: FloatArray, n: int, given: bool, camera: FloatArray,
-    mask: FloatArray, seen: Int32Array,
+    mask: FloatArray, seen: Int32Array, walk: float,
 ) -> None:
     """Write mean and covariance of a landmark first seen from a known pose (Algorithm 1, l. 30-31 corrected).
 
@@ -156,11 +161,11 @@ def new_landmark(
         tile[2 * LANES + i] = up
     innovate(work, tile, points, noises, n, given, camera)
     for i in range(LANES):  # l. 31 *: G^-1 R G^-T
-        tile[3 * LANES + i] = work[N00 + i]
+        tile[3 * LANES + i] = work[N00 + i] + walk
         tile[4 * LANES + i] = work[N01 + i]
         tile[5 * LANES + i] = work[N02 + i]
-        tile[6 * LANES + i] = work[N11 + i]
+        tile[6 * LANES + i] = work[N11 + i] + walk
         tile[7 * LANES + i] = work[N12 + i]
-        tile[8 * LANES + i] = work[N22 + i]
+        tile[8 * LANES + i] = work[N22 + i] + walk
     for i in range(len(seen)):
         seen[i] = np.int32(1) if mask[i] > 0.0 else np.int32(0)

@@ -36,9 +36,9 @@ def fastslam1_turn(
                 break
         if match == REJECTED:  # l. 28-32
             match = NEW - b
-            landmarks[match] = frame.new_landmark(pose, b)
+            landmarks[match] = frame.new_landmark(pose, b, options.landmark_walk)
         else:  # l. 33-37
-            frame.update(pose, landmarks[match], b)
+            frame.update(pose, landmarks[match], b, options.landmark_walk)
         chosen.append(match)
         distances.append(distance)
         total += log_likelihood

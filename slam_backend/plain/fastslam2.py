@@ -55,11 +55,12 @@ def fastslam2_turn(
     matches = {b: name for b, name in enumerate(chosen) if name >= 0}
     posterior, log_evidence = pose_given(refined, landmarks, frame, matches)
     pose = posterior.sample(normals)
+    walk = options.landmark_walk
     for b, name in enumerate(chosen):
         if name >= 0:
-            frame.update(pose, landmarks[name], b, iterations=2 if landmarks[name].count <= YOUNG else 1)
+            frame.update(pose, landmarks[name], b, walk, iterations=2 if landmarks[name].count <= YOUNG else 1)
         elif name != REJECTED:
-            landmarks[name] = frame.new_landmark(pose, b)
+            landmarks[name] = frame.new_landmark(pose, b, walk)
     distances = [np.nan] * len(frame)
     for b, name in matches.items():
         distances[b] = gates[b, name].distance if (b, name) in gates else np.inf

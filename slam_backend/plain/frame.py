@@ -162,18 +162,19 @@ class Frame:
         jacobian = 4.0 * np.log(self.points[b, 2]) if self.in_image else 0.0
         return float(np.log(p0) + jacobian)
 
-    def new_landmark(self, pose: FloatArray, b: int) -> Landmark:
-        """Place what was never seen before (l. 30-31): mean g^-1(x, v), covariance G^-1 R G^-T."""
+    def new_landmark(self, pose: FloatArray, b: int, walk: float = 0.0) -> Landmark:
+        """Place what was never seen before (l. 30-31): mean g^-1(x, v), covariance G^-1 R G^-T + walk I."""
         turn = turn_about_vertical(pose[2])
         mean = turn @ self.camera.robot_from_camera(self.points[b]) + [pose[0], pose[1], 0.0]
         noise = self.camera.covariance(self.points[b]) if self.in_image else self.noises[b]
         to_map = turn @ ROBOT_FROM_CAMERA
-        return Landmark(mean, to_map @ noise @ to_map.T)
+        return Landmark(mean, to_map @ noise @ to_map.T + walk * np.eye(3))
 
-    def update(self, pose: FloatArray, landmark: Landmark, b: int, iterations: int = 1) -> None:
+    def update(self, pose: FloatArray, landmark: Landmark, b: int, walk: float = 0.0, iterations: int = 1) -> None:
         """Improve a landmark by its measurement at a known pose (iterated EKF); what cannot be seen is only counted.
 
-        From the second iteration on the model is linearised where the one before has led.
+        Afterwards it may walk by a variance `walk` [m^2] along each axis until it is measured the next time. From the
+        second iteration on the model is linearised where the one before has led.
         """
         landmark.count += 1
         mean, sigma = landmark.mean, landmark.covariance
@@ -190,3 +191,4 @@ class Frame:
                 keep = np.eye(3) - gain @ g
                 landmark.mean = here
                 landmark.covariance = keep @ sigma @ keep.T + gain @ self.noises[b] @ gain.T  # Eq. 10, Joseph's form
+                landmark.covariance += walk * np.eye(3)

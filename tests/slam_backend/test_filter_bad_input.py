@@ -35,6 +35,7 @@ ARGUMENTS = [
     ({"seed": "a"}, r"seed: expected an int >= 0, a SeedSequence or a Generator, got 'a'"),
     ({"seed": -1}, r"seed: expected an int >= 0, a SeedSequence or a Generator, got -1"),
     ({"dead_radius": -1.0}, r"dead_radius: expected a finite number >= 0, got -1\.0"),
+    ({"landmark_noise": -0.1}, r"landmark_noise: expected a finite number >= 0, got -0\.1"),
     ({"recovery_position": np.inf}, r"recovery_position: expected a finite number >= 0, got inf"),
     ({"one_to_one": 1}, r"one_to_one: expected a bool, got 1"),
     ({"initial_poses": [0.0, 0.0, 0.0]}, r"initial_poses: expected an array of shape \(1, 3\), got shape \(3,\)"),

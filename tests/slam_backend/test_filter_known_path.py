@@ -11,6 +11,7 @@ from slam_backend._kernels import YOUNG
 from slam_backend.camera import ROBOT_FROM_CAMERA
 from slam_backend.errors import FloatArray
 from slam_backend.filter import FastSlam
+from slam_backend.filter_options import CALIBRATED_NOISE
 from slam_backend.geometry import compose
 from slam_backend.measurements import Measurements
 
@@ -77,6 +78,46 @@ def test_stereo_on_a_known_path_makes_it_independent_ekfs(proposal: Any) -> None
         ekf = filters[int(np.argmax(world.descriptors @ look))]
         np.testing.assert_allclose(mean, ekf.mean, atol=1e-9)
         np.testing.assert_allclose(covariance, ekf.covariance, atol=1e-9 * ekf.covariance.max())
+
+
+def watch_one_landmark(
+    proposal: Any, sigma: float, landmark_noise: float | None, steps: int, **options: Any
+) -> FastSlam:
+    """Let a robot that stands at a known pose see one landmark again and again, with a covariance of sigma^2 I."""
+    slam = FastSlam(1, 3, CAMERA, proposal=proposal, landmark_noise=landmark_noise, **options)
+    frame = Measurements([[0.1, 0.2, 3.0]], np.eye(1, 3), [sigma**2 * np.eye(3)])
+    for _ in range(steps):
+        slam.step([None], [frame], identities=[[0]], poses=[np.zeros(3)])
+    return slam
+
+
+@PROPOSALS
+def test_a_landmark_that_may_walk_keeps_the_variance_at_which_riccatis_recursion_stays(proposal: Any) -> None:
+    """Sightings of variance r, and q^2 added after each: P = P r / (P + r) + q^2 from r + q^2 on, and P stays."""
+    sigma, q = 0.1, 0.02
+    r, variance = sigma**2, sigma**2 + q**2
+    for steps in (1, 2, 7):
+        found = watch_one_landmark(proposal, sigma, q, steps).map().covariances[0]
+        np.testing.assert_allclose(found, variance * np.eye(3), rtol=1e-12, atol=1e-18)
+        for _ in range({1: 1, 2: 5}.get(steps, 0)):
+            variance = variance * r / (variance + r) + q**2
+    fixed = 0.5 * (q**2 + np.sqrt(q**4 + 4.0 * q**2 * r))
+    found = watch_one_landmark(proposal, sigma, q, 200).map().covariances[0]
+    np.testing.assert_allclose(found, fixed * np.eye(3), rtol=1e-12, atol=1e-18)
+
+
+@PROPOSALS
+def test_landmarks_stand_still_unless_a_filter_is_rejuvenated(proposal: Any) -> None:
+    """By default nothing is added, to the last bit; with rejuvenation the calibrated noise is, unless another is."""
+    still, default = (watch_one_landmark(proposal, 0.1, noise, 9).map().covariances for noise in (0.0, None))
+    np.testing.assert_array_equal(still, default)
+    walking, calibrated, told = (
+        watch_one_landmark(proposal, 0.1, noise, 9, rejuvenate_every=every).map().covariances
+        for noise, every in ((CALIBRATED_NOISE, None), (None, 100), (0.0, 100))
+    )
+    np.testing.assert_array_equal(walking, calibrated)
+    np.testing.assert_array_equal(told, still)
+    assert (np.diagonal(walking[0]) > np.diagonal(still[0])).all()
 
 
 def extreme_variances(kind: str, step: int, rng: np.random.Generator) -> FloatArray:

@@ -192,6 +192,7 @@ def run_both(seed: int, num_particles: int, most: int, steps: int, proposal: str
         dead_radius=float(rng.choice([0.0, 0.4, 1.0])),
         recovery_position=float(rng.choice([0.0, 0.5])),
         one_to_one=bool(rng.random() < 0.6),
+        landmark_noise=(0.0, 0.03)[seed // 3 % 2],
         existence=some_existence(seed),
     )
     counts: Counter[str] = Counter()
