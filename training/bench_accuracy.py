@@ -1,15 +1,10 @@
 """The accuracy bench: trials over conditions, methods, particles and seeds, each kept as soon as it is finished."""
 
-from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 from slam_backend.errors import check_int
-from training import kept_trials
-from training.accuracy_trials import FILTERS, PEERS, Trial, play
+from training.accuracy_trials import FILTERS, PEERS, Trial
 from training.plain_config import PlainConfig, check_each_once
-from training.run_folder import RunFolder
 
 COMMAND = "bench accuracy"
 TRIALS_FILE = "trials.jsonl"
@@ -61,28 +56,3 @@ class AccuracyConfig(PlainConfig):
             for method in self.methods
             for particles in (self.particles if method in FILTERS else (0,))
         ]  # fmt: skip
-
-
-def open_folder(out: Path | None, config: AccuracyConfig) -> RunFolder:
-    """Make the run folder, or go on with the one in which the same bench was begun.
-
-    Raises:
-        ValueError: If `out` holds another bench, or cannot be written.
-    """
-    return kept_trials.open_folder(out, COMMAND, config.to_mapping(), config.seed)
-
-
-def finished_trials(folder: RunFolder) -> dict[Trial, dict[str, Any]]:
-    """Read the trials that a folder holds; a last line that was cut off is dropped, from the file too."""
-    return kept_trials.finished_trials(folder, TRIALS_FILE, Trial)
-
-
-def run_trials(
-    folder: RunFolder,
-    trials: Iterable[Trial],
-    processes: int,
-    interrupted: Callable[[], bool],
-    on_trial: Callable[[dict[str, Any]], None],
-) -> None:
-    """Run trials and append each to the folder as it ends; see `kept_trials.run_trials`."""
-    kept_trials.run_trials(folder, TRIALS_FILE, play, trials, processes, interrupted, on_trial)

@@ -7,8 +7,9 @@ import typer
 from rich.console import Console
 from rich.markdown import Markdown
 
-from training.command_options import Config, Json, Out, Seed, finish, gather
-from training.compiling import prepare
+from training.command_folder import begin, choose, finish
+from training.command_options import Config, Json, Out, Seed, words
+from training.command_progress import trials_shown
 
 if TYPE_CHECKING:  # what computes is imported when the command runs, so that --help answers at once
     from training.bench_stereo import StereoBenchConfig
@@ -35,18 +36,14 @@ def bench_stereo(
 
     from training.bench_stereo import StereoBenchConfig
     from training.figures_stereo import draw_stereo
-    from training.run_folder import RunFolder, plain
+    from training.run_folder import plain
     from training.stereo_tables import FRONT_END_MS, PAIR_MS, markdown
 
-    given: dict[str, Any] = {"steps": steps, "views": views, "seed": seed}
-    if descriptors is not None:
-        given["descriptors"] = tuple(word.strip() for word in descriptors.split(","))
-    values = gather(COMMAND, given, config, json, out)
-    chosen = StereoBenchConfig.from_mapping((QUICK if quick else {}) | values)
+    given = {"steps": steps, "views": views, "descriptors": words(descriptors), "seed": seed}
+    fast = QUICK if quick else None
+    chosen = choose(StereoBenchConfig, COMMAND, given, config=config, json=json, out=out, quick=fast)
     data = Path(os.environ["VSLAM_DATA"]) if real is None and "VSLAM_DATA" in os.environ else real
-    folder = RunFolder.create(out, COMMAND, chosen.to_mapping(), chosen.seed)
-    prepare()
-    console = Console()
+    console, folder = begin(COMMAND, chosen, out)
     result = _run_live(console, chosen, data)
     tables = markdown(result)
     console.print(Markdown(tables))
@@ -69,18 +66,16 @@ def bench_stereo(
 def _run_live(console: Console, config: "StereoBenchConfig", data: Path | None) -> dict[str, Any]:
     """Run all parts, telling of each; Ctrl-C ends after the one under way."""
     import cv2
-    from threadpoolctl import threadpool_limits
 
     from training.bench_stereo import run_stereo_bench
-    from training.interrupt import interrupt_flag
     from training.stereo_real import aloe_rows, chessboard, planar_scores
 
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
-    with threadpool_limits(1), interrupt_flag() as interrupted, console.status("") as status:
-        result = run_stereo_bench(config, status.update, interrupted)
+    with trials_shown(console, None) as (on_part, interrupted):
+        result = run_stereo_bench(config, on_part, interrupted)
         if data is not None and not interrupted():
-            status.update("real images")
+            on_part("real images")
             samples, planar = data / "opencv_samples", data / "homogr"
             if samples.is_dir():
                 result["aloe"] = {descriptor: aloe_rows(samples, descriptor) for descriptor in config.descriptors}

@@ -1,17 +1,16 @@
 """The command `vslam bench train`: where the time of a training goes, and what worker processes gain."""
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
 
-from training.bench_filter_command import parse_counts
-from training.command_options import Config, Json, finish, gather
-from training.compiling import prepare
+from training.command_folder import begin, choose, finish
+from training.command_options import Check, Config, Json, Out, numbers
+from training.command_progress import trials_shown
 
 if TYPE_CHECKING:  # what computes is imported when the command runs, so that --help answers at once
-    from training.bench_train import TrainBenchConfig, TrainBenchResult
+    from training.bench_train import TrainBenchResult
 
 COMMAND = "bench train"
 
@@ -25,9 +24,8 @@ def bench_train(
     ] = None,
     steps: Annotated[int | None, typer.Option(help="Timed per number of workers.", show_default="40")] = None,
     seed: Annotated[int | None, typer.Option(help="Of the episodes.", show_default="100")] = None,
-    out: Annotated[
-        Path | None, typer.Option(help="New run folder.", show_default="the next runs/bench-train-*")
-    ] = None,
+    check: Check = False,
+    out: Out = None,
     json: Json = None,
     config: Config = None,
 ) -> None:
@@ -35,48 +33,24 @@ def bench_train(
     from training.learn_extra import need_learner
 
     need_learner()
-    from training.bench_train import TrainBenchConfig
-    from training.run_folder import RunFolder, plain
+    from training.bench_train import TrainBenchConfig, count_trials, run_bench
+    from training.run_folder import plain
 
     given = {
         "world": world,
         "robots": robots,
         "envs": envs,
-        "workers": None if workers is None else parse_counts("workers", workers),
+        "workers": numbers("workers", workers),
         "steps": steps,
         "seed": seed,
     }
-    chosen = TrainBenchConfig.from_mapping(gather(COMMAND, given, config, json, out))
-    folder = RunFolder.create(out, COMMAND, chosen.to_mapping(), chosen.seed)
-    prepare()
-    console = Console()
-    result = _run_live(console, chosen)
+    chosen = choose(TrainBenchConfig, COMMAND, given, config=config, json=json, out=out)
+    console, folder = begin(COMMAND, chosen, out)
+    with trials_shown(console, count_trials(chosen)) as (on_trial, interrupted):
+        result = run_bench(chosen, on_trial, interrupted)
     _print(console, result)
-    finish(console, folder, folder.write_metrics(plain(result.to_mapping())), json)
-
-
-def _run_live(console: Console, config: "TrainBenchConfig") -> "TrainBenchResult":
-    """Run the trials under a progress bar, all libraries on one thread; Ctrl-C ends them after the running one."""
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-    from threadpoolctl import threadpool_limits
-
-    from training.bench_train import count_trials, run_bench
-    from training.interrupt import interrupt_flag
-
-    columns = (TextColumn("{task.description}"), BarColumn(20), TimeElapsedColumn())
-    with (
-        threadpool_limits(1),
-        interrupt_flag() as interrupted,
-        # Drawn between the trials only, so that no other thread of this process works while something is timed.
-        Progress(*columns, console=console, transient=True, auto_refresh=False) as progress,
-    ):
-        task = progress.add_task("", total=count_trials(config))
-
-        def on_trial(name: str) -> None:
-            progress.update(task, description=name, advance=1)
-            progress.refresh()
-
-        return run_bench(config, on_trial, interrupted)
+    metrics = folder.write_metrics(plain(result.to_mapping()))
+    finish(console, folder, metrics, json, check, [goal["met"] for goal in result.goals()])
 
 
 def _print(console: Console, result: "TrainBenchResult") -> None:

@@ -5,15 +5,13 @@ from typing import Annotated, Any
 
 import typer
 from rich.box import SIMPLE_HEAD
-from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from training.command_options import Config, Json, Out, Seed, finish, gather
-from training.compiling import prepare
+from training.command_folder import begin, choose, finish
+from training.command_options import Check, Config, Json, Out, Seed, numbers
+from training.command_progress import share_shown
 from training.replay_command import DATASET
-from training.replay_paths import default_path
 
 HEADINGS = (
     "after [s]", "barcodes", "method", "pairs", "aligned", "false", "median [m]", "worst [m]", "median [°]",
@@ -31,6 +29,7 @@ def bench_mrclam(
     ] = None,
     particles: Annotated[int | None, typer.Option(help="Of each robot's filter.", show_default="100")] = None,
     seed: Seed = None,
+    check: Check = False,
     out: Out = None,
     json: Json = None,
     config: Config = None,
@@ -39,27 +38,17 @@ def bench_mrclam(
 
     Errors are against the motion between the fits of both maps to the true landmarks.
     """
-    from training.bench_command import _numbers
     from training.mrclam_pairs import COMMAND, MrclamPairsConfig, align_log, check_goals, summarise
-    from training.run_folder import RunFolder, plain
+    from training.run_folder import plain
 
     given = {
-        "path": path, "durations": _numbers("durations", durations, float), "particles": particles, "seed": seed,
+        "path": path, "durations": numbers("durations", durations, float), "particles": particles, "seed": seed,
     }  # fmt: skip
-    values = gather(COMMAND, given, config, json, out)
-    if "path" not in values:
-        values["path"] = default_path(DATASET, "the MR.CLAM log")
-    chosen = MrclamPairsConfig.from_mapping(values)
-    folder = RunFolder.create(out, COMMAND, chosen.to_mapping(), chosen.seed)
-    prepare()
-    console = Console()
-    columns = (
-        TextColumn("robots map alone"), BarColumn(), TextColumn("{task.percentage:>3.0f} %"), TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )  # fmt: skip
-    with Progress(*columns, console=console) as progress:
-        task = progress.add_task("", total=1.0)
-        rows = align_log(chosen, lambda share: progress.update(task, completed=share))
+    log = (DATASET, "the MR.CLAM log")
+    chosen = choose(MrclamPairsConfig, COMMAND, given, config=config, json=json, out=out, log=log)
+    console, folder = begin(COMMAND, chosen, out)
+    with share_shown(console, "robots map alone") as update:
+        rows = align_log(chosen, update)
     lines, goals = summarise(rows), check_goals(rows)
     table = Table(title="Maps of real robots, aligned pairwise", box=SIMPLE_HEAD)
     for heading in HEADINGS:
@@ -72,7 +61,8 @@ def bench_mrclam(
         text = f"{goal['goal']}: {goal['measured']:.3g}, {goal['wanted']}: {verdict}"
         console.print(text, markup=False, highlight=False)
     folder.write_text("table.md", markdown(lines))
-    finish(console, folder, folder.write_metrics(plain({"summary": lines, "goals": goals, "pairs": rows})), json)
+    metrics = folder.write_metrics(plain({"summary": lines, "goals": goals, "pairs": rows}))
+    finish(console, folder, metrics, json, check, [goal["met"] for goal in goals])
 
 
 def cells(line: dict[str, Any]) -> list[str]:

@@ -5,16 +5,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from training.command_options import Config, Json, Out, Seed, finish, gather
-from training.compiling import prepare
+from training.command_folder import begin, choose, finish
+from training.command_options import Check, Config, FirstSeed, Json, Out, OutToGoOn, Seed
+from training.command_progress import KeptPart, play_kept
 
 if TYPE_CHECKING:  # what computes is imported when the command runs, so that --help answers at once
-    from training.paper_fig2 import Fig2Config
-    from training.paper_fig3 import AlignedPair, PairConfig
+    from training.paper_fig3 import AlignedPair
     from training.run_folder import RunFolder
 
+QUICK: dict[str, Any] = {"seeds": 3, "length": 40.0}
 Length = Annotated[float | None, typer.Option(help="Metres that each robot drives.", show_default="30")]
 Landmarks = Annotated[int | None, typer.Option(help="Of the office.", show_default="300")]
 Particles = Annotated[int | None, typer.Option(help="Of each robot's filter.", show_default="100")]
@@ -22,17 +22,14 @@ Particles = Annotated[int | None, typer.Option(help="Of each robot's filter.", s
 
 def fig2(
     seeds: Annotated[int | None, typer.Option(help="How many runs.", show_default="20")] = None,
-    first_seed: Annotated[int | None, typer.Option(help="The first of them.", show_default="0")] = None,
+    first_seed: FirstSeed = None,
     length: Annotated[float | None, typer.Option(help="Metres that each robot drives.", show_default="80")] = None,
     every: Annotated[float | None, typer.Option(help="Metres between two alignments.", show_default="5")] = None,
     landmarks: Landmarks = None,
     particles: Particles = None,
     quick: Annotated[bool, typer.Option("--quick", help="3 runs of 40 m.")] = False,
-    check: Annotated[bool, typer.Option("--check", help="Exit with status 1 unless all claims hold.")] = False,
-    out: Annotated[
-        Path | None,
-        typer.Option(help="Run folder: a new one, or that of a run to go on with.", show_default="the next in runs"),
-    ] = None,
+    check: Check = False,
+    out: OutToGoOn = None,
     json: Json = None,
     config: Config = None,
 ) -> None:
@@ -43,21 +40,30 @@ def fig2(
     that Ctrl-C has stopped.
     """
     from training.figures_fig2 import draw_fig2
-    from training.kept_trials import open_folder
-    from training.paper_fig2 import COMMAND, Fig2Config, check_claims, refusals, summarise, to_csv
+    from training.paper_fig2 import (
+        COMMAND,
+        TRIALS_FILE,
+        Fig2Config,
+        Fig2Trial,
+        check_claims,
+        play,
+        refusals,
+        summarise,
+        to_csv,
+    )
     from training.run_folder import plain
 
     given = {
         "seeds": seeds, "seed": first_seed, "length": length, "every": every, "landmarks": landmarks,
         "particles": particles,
     }  # fmt: skip
-    fast = {"seeds": 3, "length": 40.0} if quick else {}
-    told = fast | {name: value for name, value in given.items() if value is not None}
-    chosen = Fig2Config.from_mapping(gather(COMMAND, told, config, json, out))
-    folder = open_folder(out, COMMAND, chosen.to_mapping(), chosen.seed)
-    prepare()
-    console = Console()
-    rows = _run_live(console, folder, chosen)
+    fast = QUICK if quick else None
+    chosen = choose(Fig2Config, COMMAND, given, config=config, json=json, out=out, quick=fast)
+    console, folder = begin(COMMAND, chosen, out, goes_on=True)
+    part = KeptPart(
+        file=TRIALS_FILE, kind=Fig2Trial, play=play, trials=chosen.trials(), tell=lambda row: f"seed {row['seed']}"
+    )
+    (rows,) = play_kept(console, folder, part)
     lines, claims, poor = plain(summarise(rows)), plain(check_claims(summarise(rows))), refusals(rows)
     for claim in claims:
         held = "holds" if claim["holds"] else "does not hold"
@@ -70,9 +76,7 @@ def fig2(
     metrics = folder.write_metrics({"summary": lines, "claims": claims} | poor)
     folder.write_text("fig2.csv", to_csv(rows))
     draw_fig2(folder.path / "fig2.png", lines)
-    finish(console, folder, metrics, json)
-    if check and not (claims and all(claim["holds"] for claim in claims)):
-        raise typer.Exit(1)
+    finish(console, folder, metrics, json, check, [claim["holds"] for claim in claims])
 
 
 def fig3(
@@ -88,7 +92,8 @@ def fig3(
     from training.figures_fig3 import draw_fig3
     from training.paper_fig3 import FIG3, matches_csv
 
-    console, folder, _, pair = _align(FIG3, seed, length, landmarks, particles, out, json, config)
+    given = {"seed": seed, "length": length, "landmarks": landmarks, "particles": particles}
+    console, folder, pair = _align(FIG3, given, out, json, config)
     figures = pair.figures()
     console.print(
         f"{figures['inliers']} matches, {figures['true_inliers']} of them true; motion off by "
@@ -115,7 +120,8 @@ def fig4(
     from training.figures_fig3 import draw_fig4
     from training.paper_fig3 import FIG4, ellipses_csv, fuse_pair
 
-    console, folder, _, pair = _align(FIG4, seed, length, landmarks, particles, out, json, config)
+    given = {"seed": seed, "length": length, "landmarks": landmarks, "particles": particles}
+    console, folder, pair = _align(FIG4, given, out, json, config)
     fused = fuse_pair(pair)
     areas = 1e4 * np.sqrt(np.linalg.det(fused.covariances[..., :2, :2]))
     for name, one, two, both in zip(fused.names.tolist(), *areas, strict=True):
@@ -128,46 +134,12 @@ def fig4(
 
 
 def _align(
-    command: str,
-    seed: int | None,
-    length: float | None,
-    landmarks: int | None,
-    particles: int | None,
-    out: Path | None,
-    json: Path | None,
-    config: Path | None,
-) -> tuple[Console, "RunFolder", "PairConfig", "AlignedPair"]:
-    """Begin fig3 or fig4: return console, run folder, config, and the two maps with the motion between them."""
+    command: str, given: dict[str, Any], out: Path | None, json: Path | None, config: Path | None
+) -> tuple[Console, "RunFolder", "AlignedPair"]:
+    """Begin fig3 or fig4: return console, run folder, and the two maps with the motion between them."""
     from training.paper_fig3 import PairConfig, align_pair
-    from training.run_folder import RunFolder
 
-    given = {"seed": seed, "length": length, "landmarks": landmarks, "particles": particles}
-    chosen = PairConfig.from_mapping(gather(command, given, config, json, out))
-    prepare()
-    pair = align_pair(chosen)  # refused before a folder is made
-    return Console(), RunFolder.create(out, command, chosen.to_mapping(), chosen.seed), chosen, pair
-
-
-def _run_live(console: Console, folder: "RunFolder", config: "Fig2Config") -> list[dict[str, Any]]:
-    """Run what is not yet finished under a progress bar; return the rows of all finished runs, in order."""
-    from training.interrupt import interrupt_flag
-    from training.kept_trials import finished_trials, run_trials, trial_of
-    from training.paper_fig2 import TRIALS_FILE, Fig2Trial, play
-
-    trials = config.trials()
-    finished = finished_trials(folder, TRIALS_FILE, Fig2Trial)
-    columns = (
-        TextColumn("runs"), BarColumn(20), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn(),
-    )  # fmt: skip
-    with interrupt_flag() as interrupted, Progress(*columns, console=console) as progress:
-        task = progress.add_task("", total=len(trials), completed=len(finished))
-
-        def on_trial(row: dict[str, Any]) -> None:
-            finished[trial_of(row, Fig2Trial)] = row
-            progress.update(task, advance=1)
-
-        left = [trial for trial in trials if trial not in finished]
-        run_trials(folder, TRIALS_FILE, play, left, 1, interrupted, on_trial)
-    if len(finished) < len(trials):
-        console.print(f"Stopped; go on with --out {folder.path}.", highlight=False)
-    return [finished[trial] for trial in trials if trial in finished]
+    chosen = choose(PairConfig, command, given, config=config, json=json, out=out)
+    found: list[AlignedPair] = []
+    console, folder = begin(command, chosen, out, lambda: found.append(align_pair(chosen)))  # refused before a folder
+    return console, folder, found[0]

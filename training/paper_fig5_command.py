@@ -3,10 +3,9 @@
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
-from training.command_options import Config, Json, Out, Seed, finish, gather
-from training.compiling import prepare
+from training.command_folder import begin, choose, finish
+from training.command_options import Config, Json, Out, Seed
 
 
 def fig5(
@@ -21,13 +20,10 @@ def fig5(
     """Fig. 5: robots in a room with landmarks on its walls; what they see, and what walls hide from them."""
     from training.figures_fig5 import draw_fig5
     from training.paper_fig5 import COMMAND, Fig5Config, simulate_fig5
-    from training.run_folder import RunFolder
 
     given = {"seed": seed, "robots": robots, "decisions": decisions, "measurements": measurements}
-    chosen = Fig5Config.from_mapping(gather(COMMAND, given, config, json, out))
-    folder = RunFolder.create(out, COMMAND, chosen.to_mapping(), chosen.seed)
-    prepare()
-    console = Console()
+    chosen = choose(Fig5Config, COMMAND, given, config=config, json=json, out=out)
+    console, folder = begin(COMMAND, chosen, out)
     found = simulate_fig5(chosen)
     draw_fig5(folder.path / "fig5.png", found)
     folder.write_text("fig5.csv", found.to_csv())

@@ -5,12 +5,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from training.command_options import Config, Duration, Estimator, Json, Out, RejuvenateEvery, Seed, finish, gather
-from training.compiling import prepare
-from training.replay_paths import default_path
+from training.command_folder import begin, choose, finish
+from training.command_options import Config, Duration, Estimator, Json, Out, RejuvenateEvery, Seed, numbers
+from training.command_progress import share_shown
 
 if TYPE_CHECKING:  # what computes is imported when the command runs, so that --help answers at once
     from slam_backend.readers.mrclam import MrclamLog
@@ -53,11 +52,11 @@ def replay_mrclam(
     from training.figures_replay import draw_joint_map, draw_replay
     from training.replay_mrclam import ReplayConfig, replay
     from training.replay_scores import score_path, summarise
-    from training.run_folder import RunFolder, plain, to_json
+    from training.run_folder import plain, to_json
 
     given = {
         "path": path,
-        "robots": None if robots is None else parse_numbers(robots),
+        "robots": numbers("robots", robots),
         "truth": truth,
         "duration": duration,
         "identities": identities,
@@ -67,14 +66,10 @@ def replay_mrclam(
         "rejuvenate_every": rejuvenate_every,
         "seed": seed,
     }
-    values = gather(COMMAND, given, config, json, out)
-    if "path" not in values:
-        values["path"] = default_path(DATASET, "the MR.CLAM log")
-    chosen = ReplayConfig.from_mapping(values)
+    place = (DATASET, "the MR.CLAM log")
+    chosen = choose(ReplayConfig, COMMAND, given, config=config, json=json, out=out, log=place)
     log = load_mrclam(chosen.path, chosen.robots, chosen.duration, chosen.truth)
-    folder = RunFolder.create(out, COMMAND, chosen.to_mapping(), chosen.seed)
-    prepare()
-    console = Console()
+    console, folder = begin(COMMAND, chosen, out)
     result = _replay_live(console, log, chosen, replay)
     paths = [score_path(result, robot, own.truth) for robot, own in enumerate(log.robots)]
     scores = plain(summarise(result, log, paths))
@@ -91,37 +86,19 @@ def replay_mrclam(
     finish(console, folder, folder.write_metrics(scores), json)
 
 
-def parse_numbers(text: str) -> tuple[int, ...]:
-    """Return the numbers of a text such as `1,2,5`.
-
-    Raises:
-        ValueError: If it is none.
-    """
-    from slam_backend.errors import bad_argument
-
-    words = text.split(",")
-    if not all(word.strip().isdecimal() for word in words):
-        raise bad_argument("robots", "numbers with commas between", repr(text), "Write them like 1,2,5.")
-    return tuple(int(word) for word in words)
-
-
 def _replay_live(console: Console, log: "MrclamLog", config: "ReplayConfig", replay: Any) -> "Replay":
     """Run the replay under a progress bar, and tell of each merge as it comes."""
-    numbers = [own.robot for own in log.robots]
-    columns = (
-        TextColumn("[progress.description]{task.description}"), BarColumn(), TextColumn("{task.percentage:>3.0f} %"),
-        TextColumn("{task.fields[groups]} groups"), TimeElapsedColumn(), TimeRemainingColumn(),
-    )  # fmt: skip
-    with Progress(*columns, console=console) as progress:
-        task = progress.add_task(f"{len(numbers)} robots", total=1.0, groups=len(numbers))
+    names = [own.robot for own in log.robots]
+    team = f"{len(names)} robots"
+    with share_shown(console, team, "{task.fields[groups]} groups", groups=len(names)) as update:
 
         def on_step(done: float, report: Any) -> None:
-            progress.update(task, completed=done, groups=len(report.groups))
+            update(done, groups=len(report.groups))
             for event in report.events:
                 if event.kind == "merge":
-                    sides = [", ".join(str(numbers[r]) for r in side) for side in (event.robots_a, event.robots_b)]
+                    sides = [", ".join(str(names[r]) for r in side) for side in (event.robots_a, event.robots_b)]
                     seconds = report.step * config.dt
-                    progress.console.print(f"{seconds:6.1f} s  maps of {sides[0]} and {sides[1]} merged")
+                    console.print(f"{seconds:6.1f} s  maps of {sides[0]} and {sides[1]} merged")
 
         result: Replay = replay(log, config, on_step)
     return result

@@ -22,10 +22,18 @@ from slam_backend.geometry import compose, inverse
 from slam_backend.measurements import Measurements
 from slam_backend.motion import OdometryModel
 from slam_backend.readers.kitti_images import KittiImages
-from slam_backend.trajectory import dead_reckoning
+from slam_backend.reports import StepReport
 from training.plain_config import PlainConfig
 from training.replay_config import check_common
-from training.replay_one import PLANAR_GATE, OneReplay, PositionScore, score_positions
+from training.replay_one import (
+    PLANAR_GATE,
+    OneReplay,
+    PositionScore,
+    metrics_of,
+    path_length,
+    replay_one,
+    score_paths,
+)
 
 CORNERS = 2500  # of an image of KITTI's size, spread over it
 NEAREST = 3.0  # [m] nothing of interest is nearer to a car's cameras
@@ -116,71 +124,72 @@ def replay_images(
         config: Assumptions and sizes.
         on_step: Called after each frame with the share of the drive that is done, in (0, 1].
     """
-    gate = KINDS[config.descriptor].gate
-    near = config.camera(log, ODOMETRY_SIGMA, ODOMETRY_SIGMA_DISPARITY)
-    seen = FrontEndOptions(descriptor=config.descriptor, corners=CornerOptions(most=CORNERS), nearest=NEAREST)
-    eye = StereoFrontEnd(near, seen, log.pair.centre_px)
-    assumed = config.camera(log, config.sigma_px, config.sigma_disparity_px)
     options = FilterOptions(
         num_particles=config.particles,
-        camera=assumed,
+        camera=config.camera(log, config.sigma_px, config.sigma_disparity_px),
         motion=ODOMETRY,
         proposal=config.estimator,
         rejuvenate_every=config.rejuvenate_every,
         position_gate=PLANAR_GATE,
-        descriptor_gate=gate,
+        descriptor_gate=KINDS[config.descriptor].gate,
         # A street repeats itself: many look-alikes at once would be taken for a lost pose.
         recovery_position=0.0,
         existence=ExistenceModel(detection=0.6),
     )
     filter_seed, sample_seed = np.random.SeedSequence(config.seed).spawn(2)
-    slam, rng = FastSlam.from_options(1, options, filter_seed), np.random.default_rng(sample_seed)
-    count = len(log.times)
-    odometry, inliers, features = np.zeros((count, 3)), np.zeros(count, np.int64), np.zeros(count, np.int64)
-    path = np.zeros((count, 3))
-    matched, created, rejected, filter_seconds, eye_seconds = 0, 0, 0, 0.0, 0.0
-    before: Measurements | None = None
-    heights: dict[int, float] = {}
-    for step in range(count):
-        images = log.images(step)
+    slam = FastSlam.from_options(1, options, filter_seed)
+    eye = _Eye(log, config, np.random.default_rng(sample_seed))
+    steps = map(eye.look, range(len(log.times)))
+    replay = replay_one(slam, log.times, steps, on_step, on_report=eye.remember)
+    return ImagesReplay(
+        replay=replay,
+        odometry_inliers=eye.inliers,
+        features=eye.features,
+        front_end_seconds=eye.seconds,
+        last=eye.frame,
+        last_ids=eye.ids,
+        heights=eye.heights,
+    )
+
+
+class _Eye:
+    """Front end and visual odometry of a drive, frame by frame; attributes as in `ImagesReplay`."""
+
+    frame: StereoFrame
+    ids: IntArray
+
+    def __init__(self, log: KittiImages, config: ImagesConfig, rng: np.random.Generator) -> None:
+        self._log, self._rng, self._gate = log, rng, KINDS[config.descriptor].gate
+        self._camera = config.camera(log, ODOMETRY_SIGMA, ODOMETRY_SIGMA_DISPARITY)
+        seen = FrontEndOptions(descriptor=config.descriptor, corners=CornerOptions(most=CORNERS), nearest=NEAREST)
+        self._front_end = StereoFrontEnd(self._camera, seen, log.pair.centre_px)
+        self._before: Measurements | None = None
+        self._motion = np.zeros(3)
+        self.inliers, self.features = (np.zeros(len(log.times), np.int64) for _ in range(2))
+        self.seconds = 0.0
+        self.heights: dict[int, float] = {}
+
+    def look(self, step: int) -> tuple[FloatArray, Measurements]:
+        """Return the motion since the frame before (3,) [m, m, rad], and what the filter is given of this one."""
+        images = self._log.images(step)
         begin = time.perf_counter()
-        frame = eye.measure(*images)
-        points, descriptors = frame.measurements.points, frame.measurements.descriptors
+        self.frame = self._front_end.measure(*images)
+        points, descriptors = self.frame.measurements.points, self.frame.measurements.descriptors
         own = Measurements(points[1::2], descriptors[1::2])
-        if before is not None:
-            moved = camera_motion(before, own, near, gate, rng)
-            odometry[step] = odometry[step - 1] if moved is None else moved.planar
-            inliers[step] = 0 if moved is None else int(moved.inliers.sum())
-        before, features[step] = own, len(points)
-        eye_seconds += time.perf_counter() - begin
-        begin = time.perf_counter()
+        if self._before is not None:
+            moved = camera_motion(self._before, own, self._camera, self._gate, self._rng)
+            if moved is not None:
+                self._motion, self.inliers[step] = moved.planar, int(moved.inliers.sum())
+        self._before, self.features[step] = own, len(points)
+        self.seconds += time.perf_counter() - begin
         level = points[::2].copy()
         level[:, 1] = 0.0  # a plane knows no rows; see `slam_backend.readers.kitti_steps`
-        report = slam.step([odometry[step] if step else None], [Measurements(level, descriptors[::2])])
-        path[step] = slam.pose().mean
-        heights |= zip(report.associations[0].tolist(), (-points[::2, 1]).tolist(), strict=True)
-        filter_seconds += time.perf_counter() - begin
-        matched, created = matched + report.num_matched, created + report.num_new
-        rejected += report.num_rejected
-        on_step((step + 1) / count)
-    return ImagesReplay(
-        replay=OneReplay(
-            times=log.times,
-            path=path,
-            reckoned=dead_reckoning(np.zeros(3), odometry[1:]),
-            landmarks=slam.map(),
-            matched=matched,
-            created=created,
-            rejected=rejected,
-            seconds=filter_seconds,
-        ),
-        odometry_inliers=inliers,
-        features=features,
-        front_end_seconds=eye_seconds,
-        last=frame,
-        last_ids=report.associations[0],
-        heights=heights,
-    )
+        return self._motion, Measurements(level, descriptors[::2])
+
+    def remember(self, report: StepReport) -> None:
+        """Keep which landmarks the frame's points are of, and how high these are."""
+        self.ids = report.associations[0]
+        self.heights |= zip(self.ids.tolist(), (-self.frame.measurements.points[::2, 1]).tolist(), strict=True)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -209,43 +218,30 @@ def score_images(result: OneReplay, log: KittiImages) -> ImagesScore | None:
     if log.truth is None:
         return None
     truth = log.truth.poses[: len(result.times)]
-    scores, ends = [], []
-    for path in (result.path, result.reckoned):
-        start = compose(truth[0], inverse(path[0]))
-        scores.append(score_positions(path[: len(truth), :2], truth[:, :2], start))
-        ends.append(float(np.hypot(*(compose(start, path[len(truth) - 1]) - truth[-1])[:2])))
-    length = float(np.hypot(*np.diff(truth[:, :2], axis=0).T).sum())
-    return ImagesScore(truth, length, scores[0], scores[1], ends[0], ends[1])
+    paths = (result.path, result.reckoned)
+    scores = score_paths(paths, truth)
+    starts = [compose(truth[0], inverse(path[0])) for path in paths]
+    ends = [
+        float(np.hypot(*(compose(start, path[len(truth) - 1]) - truth[-1])[:2]))
+        for start, path in zip(starts, paths, strict=True)
+    ]
+    return ImagesScore(truth, path_length(truth), scores[0], scores[1], ends[0], ends[1])
 
 
 def summarise_images(result: ImagesReplay, scored: ImagesScore | None) -> dict[str, Any]:
     """Return the content of `metrics.json`; what cannot be known is NaN, as are errors of the map."""
     nan, one = float("nan"), result.replay
-    return {
-        "robots": [
-            {
-                "ate_aligned_m": scored.estimate.aligned if scored else nan,
-                "ate_start_m": scored.estimate.start if scored else nan,
-                "dead_reckoning_ate_aligned_m": scored.odometry.aligned if scored else nan,
-                "dead_reckoning_ate_start_m": scored.odometry.start if scored else nan,
-                "map_rmse_m": nan,
-                "map_recall": nan,
-                "map_precision": nan,
-                "map_error": nan,
-                "path_m": float(np.hypot(*np.diff(one.path[:, :2], axis=0).T).sum()),
-                "true_path_m": scored.length if scored else nan,
-                "end_error_m": scored.end_error if scored else nan,
-                "end_error_percent": 100.0 * scored.end_error / scored.length if scored else nan,
-                "visual_odometry_end_error_m": scored.odometry_end_error if scored else nan,
-            }
-        ],
-        "landmarks": len(one.landmarks),
-        "landmarks_seen_three_times": int((one.landmarks.counts >= 3).sum()),
-        "features_per_frame": float(result.features.mean()),
-        "odometry_inliers_per_frame": float(result.odometry_inliers[1:].mean()),
-        "measurements": {"matched": one.matched, "created": one.created, "rejected": one.rejected},
-        "merges": [],
-        "groups": [[1]],
-        "coverage": nan,
-        "duration_s": float(one.times[-1] - one.times[0]),
+    own = {
+        "true_path_m": scored.length if scored else nan,
+        "end_error_m": scored.end_error if scored else nan,
+        "end_error_percent": 100.0 * scored.end_error / scored.length if scored else nan,
+        "visual_odometry_end_error_m": scored.odometry_end_error if scored else nan,
     }
+    return metrics_of(
+        one,
+        (scored.estimate, scored.odometry) if scored else None,
+        own,
+        landmarks_seen_three_times=int((one.landmarks.counts >= 3).sum()),
+        features_per_frame=float(result.features.mean()),
+        odometry_inliers_per_frame=float(result.odometry_inliers[1:].mean()),
+    )

@@ -4,10 +4,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-
-from training.command_options import finish
-from training.compiling import prepare
+from training.command_folder import begin
+from training.command_progress import share_shown
 
 COMMAND = "replay kitti"
 
@@ -16,42 +14,27 @@ def replay_folder_of_images(values: Mapping[str, Any], out: Path | None, json: P
     """Replay a folder of stereo images, print how far off it ended, and write the run folder."""
     from slam_backend.readers.kitti_images import load_kitti_images
     from training.figures_images import draw_frame, expected_pixels
-    from training.figures_replay_one import draw_one
     from training.replay_images import ImagesConfig, replay_images, score_images, summarise_images
-    from training.replay_one_command import print_table, with_progress, write_paths
-    from training.run_folder import RunFolder, plain
+    from training.replay_one_command import finish_one
 
     chosen = ImagesConfig.from_mapping(values)
     log = load_kitti_images(chosen.path, chosen.truth, chosen.duration)
-    folder = RunFolder.create(out, COMMAND, chosen.to_mapping(), chosen.seed)
-    prepare()
-    console = Console()
-    result = with_progress(console, lambda on_step: replay_images(log, chosen, on_step))
-    one = result.replay
-    scored = score_images(one, log)
-    metrics = plain(summarise_images(result, scored))
-    print_table(console, metrics, one)
-    console.print(
+    console, folder = begin(COMMAND, chosen, out)
+    with share_shown(console, "replay") as on_step:
+        result = replay_images(log, chosen, on_step)
+    one, scored = result.replay, score_images(result.replay, log)
+    metrics = summarise_images(result, scored)
+    told = [
         f"Odometry: visual, from every second of {metrics['features_per_frame']:.0f} features a frame "
         f"({metrics['odometry_inliers_per_frame']:.0f} agreed); the filter got the others. Motion is taken to be in "
-        f"the plane. Front end and odometry took {1e3 * result.front_end_seconds / len(log.times):.0f} ms a frame.",
-        highlight=False,
-    )
+        f"the plane. Front end and odometry took {1e3 * result.front_end_seconds / len(log.times):.0f} ms a frame."
+    ]
     if scored is not None:
         ends = [100.0 * error / scored.length for error in (scored.end_error, scored.odometry_end_error)]
-        console.print(
+        told.append(
             f"End of {scored.length:.1f} m: off by {scored.end_error:.2f} m, {ends[0]:.2f} % of the path "
-            f"(visual odometry alone {ends[1]:.2f} %).",
-            highlight=False,
+            f"(visual odometry alone {ends[1]:.2f} %)."
         )
-    draw_one(
-        folder.path / "replay.png",
-        "KITTI stereo images in the plane",
-        one,
-        (one.path[:, :2], one.reckoned[:, :2]),
-        (scored.estimate, scored.odometry) if scored else None,
-        scored.truth[:, :2] if scored else None,
-    )
     landmarks = one.landmarks
     counts = dict(zip(landmarks.ids.tolist(), landmarks.counts.tolist(), strict=True))
     often = landmarks.subset(landmarks.counts >= 3)
@@ -60,5 +43,10 @@ def replay_folder_of_images(values: Mapping[str, Any], out: Path | None, json: P
     expected = expected_pixels(means, one.path[-1], log.pair.focal_px, log.pair.centre_px, 30.0)
     image = log.images(len(log.times) - 1)[0]
     draw_frame(folder.path / "frame.png", image, result.last.pixels[::2], result.last_ids, counts, expected)
-    write_paths(folder, one, log.truth)
-    finish(console, folder, folder.write_metrics(metrics), json)
+    finish_one(
+        console, folder, json, one, metrics, told, "KITTI stereo images in the plane",
+        paths=(one.path, one.reckoned),
+        scores=(scored.estimate, scored.odometry) if scored else None,
+        known=scored.truth if scored else None,
+        truth=log.truth,
+    )  # fmt: skip

@@ -9,12 +9,12 @@ import numpy as np
 from slam_backend.errors import FloatArray, check_float
 from slam_backend.filter import FastSlam
 from slam_backend.filter_options import FilterOptions
-from slam_backend.geometry import between, compose, inverse
+from slam_backend.geometry import between, compose
 from slam_backend.readers.kitti import KittiLog
 from slam_backend.readers.kitti_steps import make_camera, motion_noise, steps
 from training.plain_config import PlainConfig
 from training.replay_config import check_common
-from training.replay_one import PLANAR_GATE, OneReplay, PositionScore, replay_one, score_positions
+from training.replay_one import PLANAR_GATE, OneReplay, PositionScore, metrics_of, path_length, replay_one, score_paths
 
 # A track has its number for a descriptor, so that none is taken for another, and unlike a given identity leaves the
 # gate in force: tracks on other cars are refused, and a refused track never starts a second landmark.
@@ -105,7 +105,8 @@ def replay(log: KittiLog, config: KittiConfig, on_step: Callable[[float], None] 
         descriptor_gate=OWN_TRACK,
     )
     slam = FastSlam.from_options(1, options, config.seed)
-    return replay_one(slam, readings.times, readings.odometry, readings.measurements, on_step)
+    read = zip(readings.odometry, readings.measurements, strict=True)
+    return replay_one(slam, readings.times, read, on_step)
 
 
 def score(result: OneReplay, log: KittiLog) -> KittiScore | None:
@@ -114,9 +115,7 @@ def score(result: OneReplay, log: KittiLog) -> KittiScore | None:
         return None
     truth = log.truth.poses[: len(result.times)]
     paths = [compose(poses, np.array([*log.mount[:2], 0.0])) for poses in (result.path, result.reckoned)]
-    scores = [
-        score_positions(path[: len(truth), :2], truth[:, :2], compose(truth[0], inverse(path[0]))) for path in paths
-    ]
+    scores = score_paths(paths, truth)
     loop = find_loop(truth)
     error = float("nan")
     if loop is not None:
@@ -136,27 +135,8 @@ def find_loop(truth: FloatArray) -> tuple[int, int] | None:
 
 def summarise(result: OneReplay, scored: KittiScore | None) -> dict[str, Any]:
     """Return the content of `metrics.json`; what cannot be known is NaN, as are errors of the map."""
-    nan = float("nan")
-    return {
-        "robots": [
-            {
-                "ate_aligned_m": scored.estimate.aligned if scored else nan,
-                "ate_start_m": scored.estimate.start if scored else nan,
-                "dead_reckoning_ate_aligned_m": scored.odometry.aligned if scored else nan,
-                "dead_reckoning_ate_start_m": scored.odometry.start if scored else nan,
-                "map_rmse_m": nan,
-                "map_recall": nan,
-                "map_precision": nan,
-                "map_error": nan,
-                "path_m": float(np.hypot(*np.diff(result.path[:, :2], axis=0).T).sum()),
-                "true_path_m": float(np.hypot(*np.diff(scored.truth[:, :2], axis=0).T).sum()) if scored else nan,
-                "loop_error_m": scored.loop_error if scored else nan,
-            }
-        ],
-        "landmarks": len(result.landmarks),
-        "measurements": {"matched": result.matched, "created": result.created, "rejected": result.rejected},
-        "merges": [],
-        "groups": [[1]],
-        "coverage": nan,
-        "duration_s": float(result.times[-1] - result.times[0]),
+    own = {
+        "true_path_m": path_length(scored.truth) if scored else float("nan"),
+        "loop_error_m": scored.loop_error if scored else float("nan"),
     }
+    return metrics_of(result, (scored.estimate, scored.odometry) if scored else None, own)

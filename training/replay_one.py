@@ -1,17 +1,19 @@
 """One filter lives through the log of one robot, and its path is scored against known positions."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from slam_backend.errors import FloatArray
 from slam_backend.filter import FastSlam
-from slam_backend.geometry import compose, transform_points
+from slam_backend.geometry import compose, inverse, transform_points
 from slam_backend.landmark_map import LandmarkMap
 from slam_backend.measurements import Measurements
 from slam_backend.metrics import align_se2
+from slam_backend.reports import StepReport
 from slam_backend.trajectory import dead_reckoning
 
 # Of what moves in the plane a measurement fixes two coordinates: 99.9 % of right matches have a smaller squared
@@ -69,33 +71,35 @@ class PositionScore:
 def replay_one(
     slam: FastSlam,
     times: FloatArray,
-    odometry: FloatArray,
-    frames: Sequence[Measurements | None],
+    steps: Iterable[tuple[FloatArray, Measurements | None]],
     on_step: Callable[[float], None] = lambda done: None,
     describe: Callable[[Measurements, FloatArray], Measurements] = lambda frame, pose: frame,
+    on_report: Callable[[StepReport], None] = lambda report: None,
 ) -> OneReplay:
     """Let a filter of one robot live through a log.
 
     Args:
         slam: Before its first step.
         times: (T,) float64 [s].
-        odometry: (T, 3) float64 [m, m, rad]. Motion since the step before; the first is not used.
-        frames: T entries.
+        steps: T pairs: the motion since the step before (3,) [m, m, rad], of which the first is not used, and the
+            frame. What makes them, as they are asked for, is not timed.
         on_step: Called after each step with the share of the log that is done, in (0, 1].
         describe: Makes of a frame and the predicted pose (3,), start frame, the frame that the filter is given.
+        on_report: Called with what the filter tells of each step.
     """
-    path = np.zeros((len(times), 3))
+    path, odometry = np.zeros((len(times), 3)), np.zeros((len(times), 3))
     matched, created, rejected, seconds = 0, 0, 0, 0.0
-    for step, frame in enumerate(frames):
+    for step, (move, frame) in enumerate(steps):
+        odometry[step] = move if step else 0.0
         started = time.perf_counter()
-        move = odometry[step] if step else np.zeros(3)
-        told = None if frame is None else describe(frame, compose(slam.pose().mean, move))
-        report = slam.step([move if step else None], [told])
+        told = None if frame is None else describe(frame, compose(slam.pose().mean, odometry[step]))
+        report = slam.step([odometry[step] if step else None], [told])
         path[step] = slam.pose().mean
         seconds += time.perf_counter() - started
         matched += report.num_matched
         created += report.num_new
         rejected += report.num_rejected
+        on_report(report)
         on_step((step + 1) / len(times))
     return OneReplay(
         times=times,
@@ -120,3 +124,53 @@ def score_positions(points: FloatArray, truth: FloatArray, world_from_start: Flo
     fit = align_se2(truth, points)
     raw, fitted = (np.hypot(*(transform_points(pose, points) - truth).T) for pose in (world_from_start, fit))
     return PositionScore(float(np.sqrt(np.mean(raw**2))), float(np.sqrt(np.mean(fitted**2))), fit, fitted)
+
+
+def score_paths(paths: Iterable[FloatArray], truth: FloatArray) -> list[PositionScore]:
+    """Score paths (T, 3), each in a frame of its own, against the true poses (n, 3) of the first n steps."""
+    return [
+        score_positions(path[: len(truth), :2], truth[:, :2], compose(truth[0], inverse(path[0]))) for path in paths
+    ]
+
+
+def path_length(path: FloatArray) -> float:
+    """Return the length [m] of a path (T, 2) or (T, 3)."""
+    return float(np.hypot(*np.diff(path[:, :2], axis=0).T).sum())
+
+
+def metrics_of(
+    result: OneReplay, scores: tuple[PositionScore, PositionScore] | None, own: Mapping[str, Any], **more: Any
+) -> dict[str, Any]:
+    """Return the content of `metrics.json`; what cannot be known is NaN, as are errors of the map.
+
+    Args:
+        result: Of the replay.
+        scores: Of the estimate and of dead reckoning; None where the truth is not known.
+        own: What else is known of the robot.
+        more: What else is known of the replay.
+    """
+    nan = float("nan")
+    estimate, reckoned = ((nan, nan), (nan, nan)) if scores is None else ((s.aligned, s.start) for s in scores)
+    return {
+        "robots": [
+            {
+                "ate_aligned_m": estimate[0],
+                "ate_start_m": estimate[1],
+                "dead_reckoning_ate_aligned_m": reckoned[0],
+                "dead_reckoning_ate_start_m": reckoned[1],
+                "map_rmse_m": nan,
+                "map_recall": nan,
+                "map_precision": nan,
+                "map_error": nan,
+                "path_m": path_length(result.path),
+                **own,
+            }
+        ],
+        "landmarks": len(result.landmarks),
+        **more,
+        "measurements": {"matched": result.matched, "created": result.created, "rejected": result.rejected},
+        "merges": [],
+        "groups": [[1]],
+        "coverage": nan,
+        "duration_s": float(result.times[-1] - result.times[0]),
+    }

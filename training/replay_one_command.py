@@ -1,36 +1,23 @@
 """The commands `vslam replay victoria` and `vslam replay kitti`: one robot's log, one filter."""
 
-from collections.abc import Callable
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from training.command_options import (
-    Config,
-    Duration,
-    Estimator,
-    Json,
-    Out,
-    Particles,
-    RejuvenateEvery,
-    Seed,
-    finish,
-    gather,
-)
-from training.compiling import prepare
+from training.command_folder import begin, choose, finish, gather
+from training.command_options import Config, Duration, Estimator, Json, Out, Particles, RejuvenateEvery, Seed
+from training.command_progress import share_shown
 from training.replay_images_command import replay_folder_of_images
-from training.replay_paths import default_path
 
 if TYPE_CHECKING:  # what computes is imported when the command runs, so that --help answers at once
+    from slam_backend.errors import FloatArray
     from slam_backend.trajectory import Trajectory
-    from training.replay_one import OneReplay
+    from training.replay_one import OneReplay, PositionScore
     from training.run_folder import RunFolder
-
-Result = TypeVar("Result")
 
 VICTORIA = Path("victoria_park")
 KITTI = Path("kitti_landmarks")
@@ -51,42 +38,29 @@ def replay_victoria(
 ) -> None:
     """A car among the trees of a park: trees without names, matched by where they stand, GPS as the truth."""
     from slam_backend.readers.victoria import load_victoria
-    from training.figures_replay_one import draw_one
     from training.replay_victoria import VictoriaConfig, replay, score, summarise
-    from training.run_folder import RunFolder, plain
 
     command = "replay victoria"
     given = {"path": path, "duration": duration, "particles": particles, "estimator": estimator}
     given |= {"rejuvenate_every": rejuvenate_every, "seed": seed}
-    values = gather(command, given, config, json, out)
-    if "path" not in values:
-        values["path"] = default_path(VICTORIA, "the Victoria Park log")
-    chosen = VictoriaConfig.from_mapping(values)
+    place = (VICTORIA, "the Victoria Park log")
+    chosen = choose(VictoriaConfig, command, given, config=config, json=json, out=out, log=place)
     log = load_victoria(chosen.path, chosen.duration)
-    folder = RunFolder.create(out, command, chosen.to_mapping(), chosen.seed)
-    prepare()
-    console = Console()
-    result = with_progress(console, lambda on_step: replay(log, chosen, on_step))
+    console, folder = begin(command, chosen, out)
+    with share_shown(console, "replay") as on_step:
+        result = replay(log, chosen, on_step)
     scored = score(result, log)
-    metrics = plain(summarise(result, scored))
-    print_table(console, metrics, result)
+    metrics = summarise(result, scored)
     gps = metrics["gps"]
-    console.print(
+    told = (
         f"At {gps['fixes']} GPS fixes: median {gps['median_m']:.2f} m, 95 % within {gps['percentile_95_m']:.2f} m, "
-        f"worst {gps['worst_m']:.1f} m. Trees seen ten times or more: {metrics['landmarks_seen_ten_times']}.",
-        highlight=False,
+        f"worst {gps['worst_m']:.1f} m. Trees seen ten times or more: {metrics['landmarks_seen_ten_times']}."
     )
-    draw_one(
-        folder.path / "replay.png",
-        "Victoria Park",
-        result,
-        (scored.path, scored.reckoned),
-        (scored.estimate, scored.odometry),
-        scored.fixes,
-        "GPS",
-    )
-    write_paths(folder, result)
-    finish(console, folder, folder.write_metrics(metrics), json)
+    finish_one(
+        console, folder, json, result, metrics, [told], "Victoria Park",
+        paths=(scored.path, scored.reckoned), scores=(scored.estimate, scored.odometry), known=scored.fixes,
+        known_as="GPS",
+    )  # fmt: skip
 
 
 def replay_kitti(
@@ -111,57 +85,83 @@ def replay_kitti(
     """A car in a town: stereo images, or stereo features whose tracks are the landmarks; motion taken to be planar."""
     from slam_backend.readers.kitti import load_kitti
     from slam_backend.readers.kitti_images import holds_images
-    from training.figures_replay_one import draw_one
     from training.replay_kitti import KittiConfig, replay, score, summarise
-    from training.run_folder import RunFolder, plain
 
     command = "replay kitti"
     given = {"path": path, "truth": truth, "duration": duration, "particles": particles, "estimator": estimator}
     given |= {"rejuvenate_every": rejuvenate_every, "seed": seed}
-    values = gather(command, given, config, json, out)
-    if "path" not in values:
-        values["path"] = default_path(KITTI, "KITTI features")
+    place = (KITTI, "KITTI features")
+    values = gather(command, given, config=config, json=json, out=out, log=place)
     if holds_images(values["path"]):
         replay_folder_of_images(values, out, json)
         return
     chosen = KittiConfig.from_mapping(values)
     log = load_kitti(chosen.path, chosen.truth, chosen.duration)
-    folder = RunFolder.create(out, command, chosen.to_mapping(), chosen.seed)
-    prepare()
-    console = Console()
-    result = with_progress(console, lambda on_step: replay(log, chosen, on_step))
+    console, folder = begin(command, chosen, out)
+    with share_shown(console, "replay") as on_step:
+        result = replay(log, chosen, on_step)
     scored = score(result, log)
-    metrics = plain(summarise(result, scored))
-    print_table(console, metrics, result)
+    told = []
     if scored is not None and scored.loop is not None:
         seconds = [float(result.times[step] - result.times[0]) for step in scored.loop]
-        console.print(
+        told.append(
             f"The place of {seconds[0]:.0f} s was seen again at {seconds[1]:.0f} s; the motion between is off by "
-            f"{scored.loop_error:.2f} m. Tracks that ended never come back, so nothing closes this loop.",
-            highlight=False,
+            f"{scored.loop_error:.2f} m. Tracks that ended never come back, so nothing closes this loop."
         )
-    paths = (scored.path[:, :2], scored.reckoned[:, :2]) if scored else (result.path[:, :2], result.reckoned[:, :2])
-    draw_one(
-        folder.path / "replay.png",
-        "KITTI, tracked stereo features in the plane",
-        result,
-        paths,
-        (scored.estimate, scored.odometry) if scored else None,
-        scored.truth[:, :2] if scored else None,
-    )
-    write_paths(folder, result, log.truth)
-    finish(console, folder, folder.write_metrics(metrics), json)
-
-
-def with_progress(console: Console, work: Callable[[Callable[[float], None]], Result]) -> Result:
-    """Run a replay under a progress bar."""
-    columns = (
-        TextColumn("replay"), BarColumn(), TextColumn("{task.percentage:>3.0f} %"), TimeElapsedColumn(),
-        TimeRemainingColumn(),
+    finish_one(
+        console, folder, json, result, summarise(result, scored), told, "KITTI, tracked stereo features in the plane",
+        paths=(scored.path, scored.reckoned) if scored else (result.path, result.reckoned),
+        scores=(scored.estimate, scored.odometry) if scored else None,
+        known=scored.truth if scored else None,
+        truth=log.truth,
     )  # fmt: skip
-    with Progress(*columns, console=console) as progress:
-        task = progress.add_task("replay", total=1.0)
-        return work(lambda done: progress.update(task, completed=done))
+
+
+def finish_one(
+    console: Console,
+    folder: "RunFolder",
+    json: Path | None,
+    result: "OneReplay",
+    metrics: Mapping[str, Any],
+    told: Sequence[str],
+    title: str,
+    *,
+    paths: "tuple[FloatArray, FloatArray]",
+    scores: "tuple[PositionScore, PositionScore] | None",
+    known: "FloatArray | None",
+    known_as: str = "true path",
+    truth: "Trajectory | None" = None,
+) -> None:
+    """Show and keep what came of one robot's log.
+
+    Args:
+        console: Where to print.
+        folder: Of the run.
+        json: The option of that name.
+        result: Of the replay.
+        metrics: As `metrics_of` gives them.
+        told: Lines below the table.
+        title: Of the picture.
+        paths: Of the estimate and of dead reckoning (T, 2 or 3) [m], start frame, as they are scored.
+        scores: Of both; None without truth.
+        known: Positions (n, 2 or 3) [m], world frame; None likewise.
+        known_as: What the picture calls them.
+        truth: The true path, to be kept beside the others.
+    """
+    from training.figures_replay_one import draw_one
+    from training.run_folder import plain
+
+    shown = plain(metrics)
+    print_table(console, shown, result)
+    for line in told:
+        console.print(line, highlight=False)
+    flat = tuple(path[:, :2] for path in paths)
+    draw_one(
+        folder.path / "replay.png", title, result, (flat[0], flat[1]), scores,
+        None if known is None else known[:, :2], known_as,
+    )  # fmt: skip
+    write_paths(folder, result, truth)
+    finish(console, folder, folder.write_metrics(shown), json)
 
 
 def print_table(console: Console, metrics: dict[str, Any], result: "OneReplay") -> None:

@@ -4,12 +4,10 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 from rich.table import Table
 
-from training.command_options import Config, Json, Out, Seed, finish, gather
-from training.compiling import prepare
-from training.replay_paths import default_path
+from training.command_folder import begin, choose, finish
+from training.command_options import Config, Json, Out, Seed
 
 COMMAND = "replay stereo"
 PAIRS = Path("euroc_pairs")
@@ -33,20 +31,16 @@ def replay_stereo(
     from slam_backend.frontend import DESCRIPTORS
     from training.figures_images import draw_matches
     from training.replay_pairs import PairsConfig, align_pairs, load_pairs, summarise_pairs
-    from training.run_folder import RunFolder, plain
+    from training.run_folder import plain
 
-    values = gather(COMMAND, {"path": path, "descriptor": descriptor, "seed": seed}, config, json, out)
-    if "path" not in values:
-        values["path"] = default_path(PAIRS, "the stereo pairs")
-    chosen = PairsConfig.from_mapping(values)
+    given, place = {"path": path, "descriptor": descriptor, "seed": seed}, (PAIRS, "the stereo pairs")
+    chosen = choose(PairsConfig, COMMAND, given, config=config, json=json, out=out, log=place)
     log = load_pairs(chosen.path)
-    folder = RunFolder.create(out, COMMAND, chosen.to_mapping(), chosen.seed)
-    prepare()
+    console, folder = begin(COMMAND, chosen, out)
     order = [chosen.descriptor, *(name for name in DESCRIPTORS if name != chosen.descriptor)]
     told = chosen.to_mapping() | {"seed": chosen.seed}
     results = {name: align_pairs(log, PairsConfig.from_mapping(told | {"descriptor": name})) for name in order}
     metrics = plain(summarise_pairs(results))
-    console = Console()
     table = Table(title="Motion between the two places")
     for title in ("descriptor", "points", "matches", "inliers", "error (m)", "error (degrees)"):
         table.add_column(title, justify="right")

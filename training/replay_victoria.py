@@ -19,7 +19,7 @@ from slam_backend.readers.victoria_steps import SENSOR, TreeNoise, steps
 from slam_backend.trajectory import Trajectory
 from training.plain_config import PlainConfig
 from training.replay_config import check_common
-from training.replay_one import PLANAR_GATE, OneReplay, PositionScore, replay_one, score_positions
+from training.replay_one import PLANAR_GATE, OneReplay, PositionScore, metrics_of, replay_one, score_positions
 
 # Against the motion that fits the trees of two scans best, a second apart, the odometry turns 4 % and 0.0014 rad/m too
 # little, drifts 2 % sideways, and scatters by 1.5 % of the distance, 0.002 rad/m and the noise of the trees. What it
@@ -118,7 +118,8 @@ def replay(log: VictoriaLog, config: VictoriaConfig, on_step: Callable[[float], 
         descriptor_sigma=NO_WEIGHT,
     )
     slam = FastSlam.from_options(1, options, config.seed)
-    return replay_one(slam, readings.times, readings.odometry, readings.measurements, on_step, describe_by_place)
+    read = zip(readings.odometry, readings.measurements, strict=True)
+    return replay_one(slam, readings.times, read, on_step, describe_by_place)
 
 
 def describe_by_place(frame: Measurements, pose: FloatArray) -> Measurements:
@@ -159,34 +160,13 @@ def summarise(result: OneReplay, scored: VictoriaScore) -> dict[str, Any]:
     `ate_start_m` puts the start frame where the first 30 m of the path fit the fixes. `gps` tells of the distances to
     the fixes after the SE(2) alignment of the whole path: among the fixes are some that jumped.
     """
-    nan = float("nan")
     errors = scored.estimate.errors
-    return {
-        "robots": [
-            {
-                "ate_aligned_m": scored.estimate.aligned,
-                "ate_start_m": scored.estimate.start,
-                "dead_reckoning_ate_aligned_m": scored.odometry.aligned,
-                "dead_reckoning_ate_start_m": scored.odometry.start,
-                "map_rmse_m": nan,
-                "map_recall": nan,
-                "map_precision": nan,
-                "map_error": nan,
-                "path_m": float(np.hypot(*np.diff(result.path[:, :2], axis=0).T).sum()),
-            }
-        ],
-        "gps": {
-            "fixes": len(scored.fixes),
-            "rms_m": scored.estimate.aligned,
-            "median_m": float(np.median(errors)),
-            "percentile_95_m": float(np.quantile(errors, 0.95)),
-            "worst_m": float(errors.max()),
-        },
-        "landmarks": len(result.landmarks),
-        "landmarks_seen_ten_times": int(np.count_nonzero(result.landmarks.counts >= 10)),
-        "measurements": {"matched": result.matched, "created": result.created, "rejected": result.rejected},
-        "merges": [],
-        "groups": [[1]],
-        "coverage": nan,
-        "duration_s": float(result.times[-1] - result.times[0]),
+    gps = {
+        "fixes": len(scored.fixes),
+        "rms_m": scored.estimate.aligned,
+        "median_m": float(np.median(errors)),
+        "percentile_95_m": float(np.quantile(errors, 0.95)),
+        "worst_m": float(errors.max()),
     }
+    often = int(np.count_nonzero(result.landmarks.counts >= 10))
+    return metrics_of(result, (scored.estimate, scored.odometry), {}, gps=gps, landmarks_seen_ten_times=often)

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
-from training.command_options import Config, Json, Out, Particles, RejuvenateEvery, Seed, finish, gather
-from training.compiling import prepare
+from training.command_folder import begin, choose, finish
+from training.command_options import Config, Json, Out, Particles, RejuvenateEvery, Seed
 
 if TYPE_CHECKING:  # what computes is imported when the command runs, so that --help answers at once
     from training.episode import EpisodeRecord
@@ -50,7 +50,7 @@ def run(
     from training.episode_scores import score_episode
     from training.figures import draw_errors, draw_maps
     from training.run_config import RunConfig
-    from training.run_folder import RunFolder, plain
+    from training.run_folder import plain
     from training.run_tables import print_tables
 
     if action_type is None and policy is not None and is_model(policy):
@@ -67,13 +67,12 @@ def run(
         "preset": preset,
         "sensor": sensor,
     }
-    chosen = RunConfig.from_mapping(gather(COMMAND, given, config, json, out))
+    chosen = choose(RunConfig, COMMAND, given, config=config, json=json, out=out)
     env = chosen.make_env()
     policies = chosen.make_policies(env)
-    prepare(lambda: _first_steps(env, policies, chosen.seed))  # a bad world shows before there is a folder
-    folder = RunFolder.create(out, COMMAND, chosen.to_mapping(), chosen.seed)
+    # A bad world shows before there is a folder.
+    console, folder = begin(COMMAND, chosen, out, lambda: _first_steps(env, policies, chosen.seed))
     folder.write_text("environment.toml", env.config.replace(world=folder.config["world"]).to_toml())
-    console = Console()
     record = _run_live(console, env, policies, chosen, folder.path / "video.mp4" if video else None)
     scores = plain(score_episode(record))
     print_tables(console, scores)

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
-from training.command_options import Config, Json, finish, gather
+from training.command_folder import begin, choose, finish
+from training.command_options import Config, Json, Out, Seed
 from training.compiling import prepare
 
 if TYPE_CHECKING:  # what computes is imported when the command runs, so that --help answers at once
@@ -30,8 +31,8 @@ def train(
         typer.Option(help="Processes that step them; 0: this one. Weights do not depend on it.", show_default="cores"),
     ] = None,
     device: Annotated[str, typer.Option(help="cpu, or cuda for the updates of the network.")] = "cpu",
-    seed: Annotated[int | None, typer.Option(help="Of all random draws.", show_default="0")] = None,
-    out: Annotated[Path | None, typer.Option(help="New run folder.", show_default="the next free one in runs")] = None,
+    seed: Seed = None,
+    out: Out = None,
     resume: Annotated[
         Path | None,
         typer.Option(help="Run folder of a training that stopped: go on as if it had not.", show_default=False),
@@ -57,7 +58,7 @@ def train(
         check_int("workers", workers, 0, "Use 0 for none, or a number of processes.")
     check_device(device)
     if resume is None:
-        chosen = TrainConfig.from_mapping(gather(COMMAND, given, config, json, out))
+        chosen = choose(TrainConfig, COMMAND, given, config=config, json=json, out=out)
     else:
         others = [name for name, value in {**given, "out": out, "config": config}.items() if value is not None]
         if others:
@@ -67,12 +68,12 @@ def train(
         chosen = TrainConfig.from_mapping(values | {"seed": kept_seed})
     crew = default_workers(chosen) if workers is None else workers
     if resume is None:
-        prepare(lambda: _first_steps(chosen))  # a bad world shows before there is a folder
-        folder = RunFolder.create(out, COMMAND, chosen.to_mapping(), chosen.seed)
+        # A bad world shows before there is a folder.
+        console, folder = begin(COMMAND, chosen, out, lambda: _first_steps(chosen))
     else:
         prepare()
         folder = RunFolder(resume, COMMAND, chosen.to_mapping(), chosen.seed, installed_versions())
-    console = Console()
+        console = Console()
     training = Training(chosen, folder.path, crew, device)
     try:
         if resume is not None:

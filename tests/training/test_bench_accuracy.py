@@ -16,9 +16,10 @@ from training import accuracy_trials, cli
 from training.accuracy_summary import FIGURES, GOALS, check_goals, describe, interval, summarise
 from training.accuracy_tables import markdown, print_tables
 from training.accuracy_trials import FALSE_POINT, Answer, Trial, play, score
-from training.bench_accuracy import TRIALS_FILE, AccuracyConfig, finished_trials, open_folder, run_trials
+from training.bench_accuracy import COMMAND, TRIALS_FILE, AccuracyConfig
 from training.figures_accuracy import draw_accuracy
-from training.run_folder import plain
+from training.kept_trials import finished_trials, open_folder, run_trials
+from training.run_folder import RunFolder, plain
 from training.stereo_runs import RunSpec, StereoRun, simulate_run
 
 SMALL = AccuracyConfig(robots=(2,), lengths=(4.0,), particles=(5, 9), seeds=2, seed=31)
@@ -189,30 +190,35 @@ def test_goals_are_held_against_the_trials_they_are_about() -> None:
     assert len({goal.name for goal in GOALS}) == len(GOALS)
 
 
+def _open(out: Path, config: AccuracyConfig) -> RunFolder:
+    return open_folder(out, COMMAND, config.to_mapping(), config.seed)
+
+
 def test_what_is_finished_is_kept(tmp_path: Path, rows: list[dict[str, Any]]) -> None:
     """Stopped after three trials and begun again, a bench plays the rest only; a line cut off is played again."""
-    folder = open_folder(tmp_path / "bench", SMALL)
+    folder = _open(tmp_path / "bench", SMALL)
     done: list[dict[str, Any]] = []
-    run_trials(folder, SMALL.trials(), 1, lambda: len(done) >= 3, done.append)
+    run_trials(folder, TRIALS_FILE, play, SMALL.trials(), 1, lambda: len(done) >= 3, done.append)
     assert len(done) == 3
     file = folder.path / TRIALS_FILE
     file.write_text(file.read_text()[:-20])
-    again = open_folder(tmp_path / "bench", SMALL)
-    kept = finished_trials(again)
+    again = _open(tmp_path / "bench", SMALL)
+    kept = finished_trials(again, TRIALS_FILE, Trial)
     assert list(kept) == SMALL.trials()[:2]
     rest: list[dict[str, Any]] = []
-    run_trials(again, [trial for trial in SMALL.trials() if trial not in kept], 1, lambda: False, rest.append)
+    left = [trial for trial in SMALL.trials() if trial not in kept]
+    run_trials(again, TRIALS_FILE, play, left, 1, lambda: False, rest.append)
     assert len(rest) == len(rows) - 2
-    assert list(finished_trials(again)) == SMALL.trials()
+    assert list(finished_trials(again, TRIALS_FILE, Trial)) == SMALL.trials()
     for line, row in zip(file.read_text().splitlines(), rows, strict=True):
         assert json.loads(line)["pose_rms_m"] == row["pose_rms_m"]
 
 
 def test_a_folder_belongs_to_one_bench(tmp_path: Path) -> None:
     """Another choice of options is refused in the folder of a bench."""
-    open_folder(tmp_path / "bench", SMALL)
+    _open(tmp_path / "bench", SMALL)
     with pytest.raises(ValueError, match="out: expected a folder of this very bench, got a folder of one with other"):
-        open_folder(tmp_path / "bench", replace(SMALL, seeds=3))
+        _open(tmp_path / "bench", replace(SMALL, seeds=3))
 
 
 @pytest.mark.slow
@@ -225,7 +231,7 @@ def test_processes_change_nothing(tmp_path: Path, rows: list[dict[str, Any]]) ->
     """
     few = [trial for trial in SMALL.trials() if trial.method in ("batch_ml", "fastslam2")]
     done: list[dict[str, Any]] = []
-    run_trials(open_folder(tmp_path / "bench", SMALL), few, 2, lambda: False, done.append)
+    run_trials(_open(tmp_path / "bench", SMALL), TRIALS_FILE, play, few, 2, lambda: False, done.append)
     expected = {(row["seed"], row["method"], row["particles"]): row["pose_rms_m"] for row in rows}
     assert len(done) == len(few)
     for row in done:

@@ -13,7 +13,6 @@ from rich.console import Console
 
 from training import cli, compile_timing
 from training.bench_filter import BenchConfig, BenchResult, count_trials, run_bench
-from training.bench_filter_command import parse_counts
 from training.filter_bounds import arithmetic_bound_ms, bytes_moved, copy_bound_ms, map_bytes
 from training.filter_goals import goals_of
 from training.filter_load import FilterLoad
@@ -233,10 +232,3 @@ def test_a_bench_tells_what_compiling_costs(
     told = json.loads((tmp_path / "bench" / "metrics.json").read_text())["compilation"]
     assert (told["cold"]["compile_s"], told["cached"]["compile_s"]) == (41.0, 0.0)
     assert (told["cache_files"], told["cache_bytes"]) == (2, 300_000)
-
-
-def test_counts_with_commas() -> None:
-    """Blanks around the numbers do not matter; anything else is refused by the option's name."""
-    assert parse_counts("robots", "1, 3") == (1, 3)
-    with pytest.raises(ValueError, match="robots: expected numbers with commas between, got '1-3'"):
-        parse_counts("robots", "1-3")

@@ -4,7 +4,7 @@ import sys
 import pytest
 
 from training import cli
-from training.replay_command import parse_numbers
+from training.command_options import numbers, words
 
 
 def _run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
@@ -71,8 +71,13 @@ def test_a_fault_of_the_program_keeps_its_traceback(monkeypatch: pytest.MonkeyPa
 
 
 def test_numbers_with_commas() -> None:
-    """Blanks around the numbers do not matter."""
-    assert parse_numbers("1, 4,2") == (1, 4, 2)
+    """Blanks do not matter; what is no number is refused by the option's name, and what is not given stays so."""
+    assert numbers("robots", "1, 4,2") == (1, 4, 2)
+    assert numbers("length", "1, 2.5", float) == (1.0, 2.5)
+    assert words("a, b") == ("a", "b")
+    assert numbers("robots", None) is words(None) is None
+    with pytest.raises(ValueError, match="robots: expected numbers with commas between, got '1-3'"):
+        numbers("robots", "1-3")
 
 
 def test_help_needs_no_heavy_import() -> None:

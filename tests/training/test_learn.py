@@ -240,7 +240,7 @@ def test_the_commands_train_go_on_evaluate_and_play(tmp_path: Path, monkeypatch:
     assert "resume: expected no other options that decide the training, got ['steps']" in str(result.exception)
 
     tried = tmp_path / "tried"
-    result = runner.invoke(app, ["evaluate", str(out), "--seeds", "2", "--seed", "100", "--out", str(tried)])
+    result = runner.invoke(app, ["evaluate", str(out), "--seeds", "2", "--first-seed", "100", "--out", str(tried)])
     assert result.exit_code == 0, result.output
     metrics = json.loads((tried / "metrics.json").read_text())
     assert [line["policy"] for line in metrics["policies"]] == ["model", "random_goals", "frontier"]

@@ -310,7 +310,7 @@ def test_check_tells_by_the_exit_status(tmp_path: Path, factor: float, status: i
         (("--regimes", "best"), "regimes: expected one of 'paper', 'look_alikes', 'good', got 'best'."),
         (("--length", "0"), "length: expected a finite number >= 0.25, got 0.0."),
         (("--seeds", "0"), "seeds: expected an int >= 1, got 0."),
-        (("--jobs", "0"), "jobs: expected an int >= 1, got 0."),
+        (("--processes", "0"), "processes: expected an int >= 1, got 0."),
         (("--json", "/nowhere/copy.json"), "json: expected a place that can be written, got no access."),
     ],
 )

@@ -56,7 +56,8 @@ KINDS = [pytest.param(kind, id=kind.__name__) for kind in CASES]
 
 def test_every_configuration_is_among_them() -> None:
     """The laws below are asked of all classes that the commands use."""
-    assert {kind.__name__ for kind in PlainConfig.__subclasses__()} == {kind.__name__ for kind in CASES}
+    found = {kind.__name__ for kind in PlainConfig.__subclasses__() if kind.__module__.startswith("training.")}
+    assert found == {kind.__name__ for kind in CASES}
 
 
 @pytest.mark.parametrize("kind", KINDS)
