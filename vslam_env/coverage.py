@@ -1,6 +1,6 @@
-"""How much of the reachable floor the robots have seen, by their own grids."""
+"""How much of the reachable floor the robots have seen, by their own grids, and which of them found it."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -60,10 +60,11 @@ class CoverageMeter:
             _flat_cells(transform_points(inverse(start), free_area_cells)) for start in np.asarray(true_starts)
         )
         self.count = len(free_area_cells)
+        self.cells = free_area_cells
 
 
 class Coverage:
-    """Share of the free floor inside the union of the robots' grids.
+    """Share of the free floor inside the union of the robots' grids, and each robot's part in it.
 
     It goes by what has changed in the grids since it was asked last, so it is asked about the same ones throughout.
 
@@ -77,6 +78,8 @@ class Coverage:
         self._seers = np.zeros(meter.count, np.int64)
         self._covered = 0
         self._began = False
+        self._ever = np.zeros(meter.count, np.bool_)
+        self._found = np.zeros(len(meter.places), np.int64)
 
     def share(self, grids: Sequence[SeenGrid]) -> float:
         """Return the coverage in [0, 1] of the robots' grids, whose changes are taken."""
@@ -87,6 +90,30 @@ class Coverage:
             self._covered += _recount(changes, grid.cells.ravel(), places, floor, seen, self._seers)
         self._began = True
         return self._covered / max(self._meter.count, 1)
+
+    def found(self, positions: FloatArray) -> FloatArray:
+        """Return what each robot has found (K,): the share of the free floor that it was nearest to when first seen.
+
+        To be asked after each `share`. A cell is found once, so that what has been found never falls, and sums up to
+        the coverage unless floor has been lost again.
+
+        Args:
+            positions: (K, 2) float64 [m], world frame. True positions of the robots.
+        """
+        fresh = np.flatnonzero((self._seers > 0) & ~self._ever)
+        if len(fresh):
+            self._ever[fresh] = True
+            gaps = ((self._meter.cells[fresh, None] - positions) ** 2).sum(axis=-1)
+            self._found += np.bincount(gaps.argmin(axis=1), minlength=len(positions))
+        return self._found / max(self._meter.count, 1)
+
+    def get_state(self) -> dict[str, Any]:
+        """Return a copy of what cannot be counted again from the grids."""
+        return {"ever": self._ever.copy(), "found": self._found.copy()}
+
+    def set_state(self, state: Mapping[str, Any]) -> None:
+        """Go on with what `get_state` returned; the grids are asked for their changes as ever."""
+        self._ever, self._found = state["ever"].copy(), state["found"].copy()
 
 
 def _flat_cells(points: FloatArray) -> tuple[NDArray[np.int32], NDArray[np.int32]]:

@@ -140,6 +140,7 @@ class Episode:
             pose_errors=pose_errors[:, 0],
             pose_sigmas=self.belief.position_sigmas,
             coverage=self._coverage.share(self.belief.grids),
+            found=self._coverage.found(self._simulator.poses[:, :2]),
             collisions=self._collisions.copy(),
             distances=self._distances.copy(),
             bytes_sent=self.belief.bytes_sent,
@@ -158,6 +159,7 @@ class Episode:
             "streams": {name: stream.bit_generator.state for name, stream in self._streams.items()},
             "belief": self.belief.get_state(),
             "ledger": self.ledger.get_state(),
+            "coverage": self._coverage.get_state(),
             "counts": (self._collisions.copy(), self._distances.copy()),
             "last": (self.readings, tuple(self.frames)),
             "paths": (tuple(self.true_path), tuple(self.estimated_path), tuple(self.merge_ticks)),
@@ -176,6 +178,7 @@ class Episode:
             self._streams[name].bit_generator.state = stream
         self.belief.set_state(state["belief"])
         self.ledger.set_state(state["ledger"])
+        self._coverage.set_state(state["coverage"])
         self.tick = state["tick"]
         self._collisions, self._distances = (counts.copy() for counts in state["counts"])
         self.readings, self.frames = state["last"][0], list(state["last"][1])

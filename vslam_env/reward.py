@@ -20,6 +20,7 @@ class Standing:
         pose_errors: (K,) float64 [m].
         pose_sigmas: (K,) float64 [m]. One sigma of the position in its own start frame, as each believes.
         coverage: Share of the free floor that the team has seen.
+        found: (K,) float64. Share of it that each was nearest to when the team first saw it.
         collisions: (K,) int64. Ticks since the reset in which each robot was kept from moving as commanded.
         distances: (K,) float64 [m]. Way that each has gone since the reset.
         bytes_sent: (K,) int64. Since the reset.
@@ -33,6 +34,7 @@ class Standing:
     pose_errors: FloatArray
     pose_sigmas: FloatArray
     coverage: float
+    found: FloatArray
     collisions: IntArray
     distances: FloatArray
     bytes_sent: IntArray
@@ -89,6 +91,10 @@ def _coverage(before: Standing, after: Standing) -> FloatArray:
     return np.full(len(after.map_errors), after.coverage - before.coverage)
 
 
+def _own_coverage(before: Standing, after: Standing) -> FloatArray:
+    return after.found - before.found
+
+
 def _collisions(before: Standing, after: Standing) -> FloatArray:
     return (before.collisions - after.collisions).astype(np.float64)
 
@@ -110,6 +116,7 @@ POTENTIALS: dict[str, Callable[[Standing, Standing], FloatArray]] = {
     "recall": _recall,
     "pose_uncertainty": _pose_uncertainty,
     "coverage": _coverage,
+    "own_coverage": _own_coverage,
 }
 COSTS: dict[str, Callable[[Standing, Standing], FloatArray]] = {
     "collisions": _collisions,

@@ -225,7 +225,7 @@ def test_a_refused_state_leaves_the_environment_alone() -> None:
     [
         (lambda content: content[: len(content) // 2], "path: expected a whole file of a state, got a damaged file"),
         (lambda content: b"hello" + content, "path: expected the file of a state"),
-        (lambda content: content.replace(b"state 1/", b"state 9/", 1), r"expected a state of version .*got '9/"),
+        (lambda content: content.replace(b"state 2/", b"state 9/", 1), r"expected a state of version .*got '9/"),
         (None, "path: expected the file of a state, .*no such file|No such file"),
     ],
 )
