@@ -10,9 +10,13 @@ T is then drawn from N(T^, Lambda^-1): the pair's uncertainty about T becomes a 
 particle T is known. Pairs are weighed by their evidence, the integral of exp(-chi^2 / 2) over T by Laplace's formula.
 Landmarks in common are fused at the drawn T (Eqs. 13-15), the others of b are moved (Eq. 16).
 
-Maps of particle filters are over-confident, and two of them then contradict each other. The contradiction is
-measured, phi = median over pairs of chi^2 / degrees of freedom, and where it exceeds 1 both maps' covariances are
-scaled by it (the Birge ratio): the joint filter starts with uncertainties that explain what was seen.
+Maps of particle filters are over-confident, and two of them then contradict each other. First the variance tau^2 is
+found, up to (5 cm)^2, that has to be added to all S for chi^2 to be its degrees of freedom (Mandel and Paule 1970,
+"Interlaboratory evaluation of a material with unequal numbers of replicates", Analytical Chemistry 42); the landmarks
+of either map bear half of it. What then still contradicts is measured by phi = median over pairs of chi^2 / degrees of
+freedom, and where that exceeds 1 both maps' covariances are scaled by it (the Birge ratio). So the joint filter starts
+with uncertainties that explain what was seen. To scale from the start would make the worst known landmarks worse by as
+much as the best known ones contradict each other: they would take anything for themselves.
 """
 
 import math
@@ -34,6 +38,9 @@ from slam_backend.resampling import systematic
 MIN_PAIRS = 3  # fewer shared landmarks in a particle do not fix a motion better than the consensus does
 _UNIT = np.array([1.0, 0.0, 0.0, 1.0, 0.0, 1.0])[:, None]  # a packed identity, where a particle lacks a landmark
 CANDIDATES = 4  # pairs of particles weighed for each that is kept
+ROUNDS = 8  # of looking for what two maps' covariances do not explain
+MOST_EXTRA = 0.05**2  # [m^2] two robots may place what they take for one corner so far apart; more is a contradiction
+DIAGONAL = np.array([3, 6, 8])  # where a landmark's nine numbers hold its variances
 
 
 def inverse_alignment(alignment: Alignment) -> Alignment:
@@ -75,11 +82,13 @@ def merge_filters(
     shared_a, shared_b = np.searchsorted(dense_a.ids, pairs[:, 0]), np.searchsorted(dense_b.ids, pairs[:, 1])
     from_a = systematic(a.weights, rng, CANDIDATES * count)
     from_b = rng.permutation(systematic(b.weights, rng, CANDIDATES * count))
-    motions, informations, chi2, log_dets, shared = _align_pairs(
-        dense_a.values[shared_a], dense_a.counts[shared_a] > 0, dense_b.values[shared_b], dense_b.counts[shared_b] > 0,
-        from_a, from_b, alignment.transform,
-    )
-    scale = _contradiction(chi2, shared)
+    common = (
+        dense_a.values[shared_a], dense_a.counts[shared_a] > 0, dense_b.values[shared_b], dense_b.counts[shared_b] > 0
+    )  # fmt: skip
+    extra = _unexplained(*common, from_a[::CANDIDATES], from_b[::CANDIDATES], alignment.transform)
+    aligned = _align_pairs(*common, from_a, from_b, alignment.transform, extra)
+    motions, informations, chi2, log_dets, shared = aligned
+    scale = _contradiction(chi2, shared) if extra == MOST_EXTRA else 1.0
     evidence, factors = _weigh(motions, informations, chi2, log_dets, shared, scale, alignment)
     weights = np.exp(evidence - evidence.max())
     chosen = systematic(weights / weights.sum(), rng, count)
@@ -94,8 +103,9 @@ def merge_filters(
     values_b, counts_b = np.take(dense_b.values, from_b, axis=2), np.take(dense_b.counts, from_b, axis=1)
     model = a.options.existence
     odds_a, odds_b = _odds_of(dense_a, from_a, model), _odds_of(dense_b, from_b, model)
-    values_a[:, 3:] *= scale
-    values_b[:, 3:] *= scale
+    for values in (values_a, values_b):  # either map bears half of what they do not explain
+        values[:, DIAGONAL] += 0.5 * extra
+        values[:, 3:] *= scale
     _move_landmarks(values_b, motion)
     descriptors, identities = dense_a.descriptors.copy(), dense_a.identities.copy()
     if len(shared_a):
@@ -211,8 +221,29 @@ def stack_descriptors(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray
     return np.concatenate([a, b])
 
 
+def _unexplained(
+    landmarks_a: FloatArray, present_a: BoolArray, landmarks_b: FloatArray, present_b: BoolArray,
+    from_a: IntArray, from_b: IntArray, initial: FloatArray,
+) -> float:
+    """Return tau^2 [m^2], what the differences of shared landmarks need beyond both maps' covariances.
+
+    For each pair of particles chi^2(tau^2) = degrees of freedom, by Newton's method on the latter over the former,
+    which is concave in tau^2: it rises to the root and not beyond. The median over pairs is taken; 0 where maps agree,
+    and `MOST_EXTRA` at most. The arguments are those of `_align_pairs`.
+    """
+    extra = np.zeros(len(from_a))
+    arguments = (landmarks_a, present_a, landmarks_b, present_b, from_a, from_b)
+    motions = np.tile(initial, (len(from_a), 1))
+    for _ in range(ROUNDS):
+        motions, _, chi2, _, shared, slope = _fit_pairs(*arguments, motions, extra, 1)
+        freedom = np.maximum(3.0 * shared - 3.0, 1.0)
+        extra = np.maximum(extra + chi2 * (chi2 - freedom) / np.maximum(freedom * slope, 1e-300), 0.0)
+    enough = shared >= MIN_PAIRS
+    return min(float(np.median(extra[enough])), MOST_EXTRA) if enough.any() else 0.0
+
+
 def _contradiction(chi2: FloatArray, shared: IntArray) -> float:
-    """Return phi >= 1, by how much the maps' covariances understate the differences between them."""
+    """Return phi >= 1, by how much the widened covariances still understate the differences between maps."""
     enough = shared >= MIN_PAIRS
     if not enough.any():
         return 1.0
@@ -295,7 +326,7 @@ def _fuse_odds(
 
 def _align_pairs(
     landmarks_a: FloatArray, present_a: BoolArray, landmarks_b: FloatArray, present_b: BoolArray,
-    from_a: IntArray, from_b: IntArray, initial: FloatArray,
+    from_a: IntArray, from_b: IntArray, initial: FloatArray, extra: float,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, IntArray]:
     """Estimate the motion between the maps of each pair of particles by Gauss-Newton on the shared landmarks.
 
@@ -303,21 +334,37 @@ def _align_pairs(
         landmarks_a: (k, 9, M_a) shared landmarks, with `present_a` (k, M_a); those of b in the same order.
         from_a: (c,) particle of a in each pair; `from_b` likewise.
         initial: (3,) where to start.
+        extra: tau^2, added to the variances of all differences [m^2].
 
     Returns:
         Motions (c, 3), information matrices (c, 3, 3), chi^2 (c,), sums of log|2 pi S| (c,), and how many landmarks
         both particles of a pair hold (c,).
     """
+    starts, widened = np.tile(initial, (len(from_a), 1)), np.full(len(from_a), extra)
+    return _fit_pairs(landmarks_a, present_a, landmarks_b, present_b, from_a, from_b, starts, widened, 3)[:5]
+
+
+def _fit_pairs(
+    landmarks_a: FloatArray, present_a: BoolArray, landmarks_b: FloatArray, present_b: BoolArray,
+    from_a: IntArray, from_b: IntArray, starts: FloatArray, extra: FloatArray, iterations: int,
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, IntArray, FloatArray]:
+    """Fit motions (c, 3) from `starts`, with variances widened by `extra` (c,).
+
+    Returns:
+        As `_align_pairs`, and by how much chi^2 (c,) falls with tau^2, motions held [1/m^2].
+    """
     a, b = landmarks_a[:, :, from_a], landmarks_b[:, :, from_b]
     both = present_a[:, from_a] & present_b[:, from_b]
     shared = np.count_nonzero(both, axis=0)
     enough = np.flatnonzero(shared >= MIN_PAIRS)
-    motions = np.tile(initial, (len(from_a), 1))
-    for iteration in range(4):
+    motions = starts.copy()
+    for iteration in range(iterations + 1):
         moved = b.copy()
         _move_landmarks(moved, motions)
         residual = a[:, :3] - moved[:, :3]
-        information, log_det = _inverse(np.where(both[:, None], a[:, 3:] + moved[:, 3:], _UNIT))
+        spread = np.where(both[:, None], a[:, 3:] + moved[:, 3:], _UNIT)
+        spread[:, DIAGONAL - 3] += extra
+        information, log_det = _inverse(spread)
         information *= both[:, None]
         jacobian = np.stack([motions[:, 1] - moved[:, 1], moved[:, 0] - motions[:, 0]])  # dR/dtheta p_b
         xx, xy, xz, yy, yz, zz = information.transpose(1, 0, 2)
@@ -327,11 +374,11 @@ def _align_pairs(
         turned = np.stack([xx * jacobian[0] + xy * jacobian[1], xy * jacobian[0] + yy * jacobian[1]])
         rows = [xx, xy, turned[0], yy, turned[1], jacobian[0] * turned[0] + jacobian[1] * turned[1]]
         normal = np.array([row.sum(axis=0) for row in rows]).T[:, UNPACK]
-        if iteration < 3:
+        if iteration < iterations:
             gradient = np.stack([weighted[0], weighted[1], np.sum(jacobian * weighted[:2], axis=0)]).sum(axis=1).T
             motions[enough] += np.linalg.solve(normal[enough], gradient[enough][..., None])[..., 0]
     log_dets = np.sum(both * (log_det + 3.0 * math.log(2.0 * math.pi)), axis=0)
-    return motions, normal, chi2, log_dets, shared
+    return motions, normal, chi2, log_dets, shared, np.sum(weighted * weighted, axis=(0, 1))
 
 
 def _inverse(packed: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -7,13 +7,14 @@ from mapped_once import (
     LANDMARKS,
     NAMES_A,
     NAMES_B,
+    PAIRS,
     common_landmarks,
     known_alignment,
     map_once,
     names_of,
     starts_of,
 )
-from scipy import integrate, stats
+from scipy import integrate, optimize, stats
 
 from slam_backend.alignment import Alignment
 from slam_backend.errors import FloatArray, IntArray
@@ -81,6 +82,12 @@ def filters(seed: int, num_particles: int, moves: int) -> tuple[FastSlam, FastSl
     return a, map_once(NAMES_B, A_FROM_B, SIGMA, rng, num_particles, moves), rng
 
 
+def contradicting(sigma: float, claimed: float, rng: np.random.Generator) -> tuple[FastSlam, FastSlam]:
+    """Return two filters that stand at their starts and claim another noise than they have."""
+    a = map_once(NAMES_A, np.zeros(3), sigma, rng, claimed_sigma=claimed)
+    return a, map_once(NAMES_B, A_FROM_B, sigma, rng, claimed_sigma=claimed)
+
+
 @pytest.mark.slow
 def test_a_particle_level_merge_keeps_the_path_uncertainty_and_a_naive_one_loses_it() -> None:
     """NEES of b's start and of b's landmarks in a's frame is near its dimension; fusing best particles' maps is not.
@@ -116,8 +123,8 @@ def test_maps_that_can_bend_do_not_make_a_merge_over_confident() -> None:
 
 
 @pytest.mark.parametrize("understated", [1.0, 2.0])
-def test_contradicting_maps_widen_the_joint_map_by_the_birge_ratio(understated: float) -> None:
-    """Covariances grow by phi = max(1, chi^2 / 12): 1.2 on average for honest maps, more for over-confident ones.
+def test_contradicting_maps_are_widened_by_what_their_covariances_do_not_explain(understated: float) -> None:
+    """Where all noise is claimed alike, covariances grow by max(1, chi^2 / 12): what is added makes chi^2 its freedom.
 
     Five common landmarks and three unknowns leave 12 degrees of freedom. The mean over 80 merges lies within four
     standard errors of the expected one; false alarm below 1e-4.
@@ -125,9 +132,8 @@ def test_contradicting_maps_widen_the_joint_map_by_the_birge_ratio(understated: 
     rng = np.random.default_rng(3)
     scales = []
     for _ in range(80):
-        a = map_once(NAMES_A, np.zeros(3), SIGMA, rng, claimed_sigma=SIGMA / understated)
-        b = map_once(NAMES_B, A_FROM_B, SIGMA, rng, claimed_sigma=SIGMA / understated)
-        joint, _ = merge_filters(a, b, known_alignment(), common_landmarks(a, b), rng)
+        a, b = contradicting(0.02, 0.02 / understated, rng)
+        joint, _ = merge_filters(a, b, known_alignment(), PAIRS, rng)
         scales.append(joint.map().covariances[5, 2, 2] / a.map().covariances[5, 2, 2])  # of a landmark of a alone
 
     def moment(power: int) -> float:
@@ -139,3 +145,33 @@ def test_contradicting_maps_widen_the_joint_map_by_the_birge_ratio(understated: 
     deviation = np.sqrt((moment(2) - moment(1) ** 2) / len(scales))
     assert min(scales) >= 1.0 - 1e-12
     assert abs(np.mean(scales) - moment(1)) < 4.0 * deviation
+
+
+@pytest.mark.parametrize(("sigma", "claimed"), [(0.02, 0.004), (0.3, 0.01)])
+def test_what_maps_contradict_each_other_by_is_added_first_and_scales_only_beyond(sigma: float, claimed: float) -> None:
+    """A landmark known thirty times worse is widened by the same variance, up to 2 x (5 cm / 2)^2, and not by its own.
+
+    The added variance solves chi^2(tau^2) = 12, found here by bracketing with the motion fitted anew by a general
+    optimiser; where tau^2 would exceed (5 cm)^2, chi^2 / 12 at that value scales all covariances.
+    """
+    rng = np.random.default_rng(5)
+    a, b = contradicting(sigma, claimed, rng)
+    a._maps.blocks[a._maps.row_of[5], :, 3:] *= 900.0  # a's own landmark 5
+    map_a, map_b = a.map(), b.map()
+    joint, _ = merge_filters(a, b, known_alignment(), PAIRS, rng)
+    rows_a, rows_b = PAIRS.T
+
+    def least(extra: float) -> float:
+        def chi2(motion: FloatArray) -> float:
+            away = map_a.means[rows_a] - transform_points(motion, map_b.means[rows_b])
+            spread = map_a.covariances[rows_a] + rotate_covariances(motion[2], map_b.covariances[rows_b])
+            spread = spread + extra * np.eye(3)
+            return float(np.einsum("ki,ki->", away, np.linalg.solve(spread, away[..., None])[..., 0]))
+
+        return float(optimize.minimize(chi2, A_FROM_B, tol=1e-10).fun)
+
+    beyond = least(0.05**2) > 12.0
+    assert beyond == (sigma > 0.1)
+    extra = 0.05**2 if beyond else optimize.brentq(lambda value: least(value) - 12.0, 0.0, 0.05**2, xtol=1e-12)
+    expected = (map_a.covariances[[5, 6]] + 0.5 * extra * np.eye(3)) * (least(extra) / 12.0 if beyond else 1.0)
+    np.testing.assert_allclose(joint.map().covariances[[5, 6]], expected, rtol=2e-3, atol=1e-9)

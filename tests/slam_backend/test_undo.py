@@ -86,11 +86,11 @@ def test_after_an_undo_it_is_as_if_the_merge_had_never_been() -> None:
 
 def test_a_merge_on_top_of_a_false_one_goes_with_it() -> None:
     """Of two merges in the window the first was false: both are undone, the last first; the false pair is barred."""
-    simulation = SimulatedTeam(num_robots=3, seed=103)
+    simulation = SimulatedTeam(num_robots=3, seed=104)
     team = simulation.build(attempts=NEVER)
     simulation.run(team, 80)
     other, twin = copy.deepcopy(simulation), simulation.build(attempts=NEVER)
-    SimulatedTeam(num_robots=3, seed=103).run(twin, 80)
+    SimulatedTeam(num_robots=3, seed=104).run(twin, 80)
     team.merge(0, 1, false_alignment(simulation, team, FAR))
     simulation.run(team, 3)
     other.run(twin, 3)
@@ -242,7 +242,7 @@ def test_only_what_moves_among_the_others_has_moved() -> None:
 
 def test_a_team_goes_on_from_a_snapshot_bit_for_bit_through_an_undo() -> None:
     """A team restored while two merges are in doubt, one of them false, does the same as the one that went on."""
-    simulation = SimulatedTeam(num_robots=3, seed=103)
+    simulation = SimulatedTeam(num_robots=3, seed=104)
     team = simulation.build(attempts=NEVER)
     simulation.run(team, 80)
     team.merge(0, 1, false_alignment(simulation, team, FAR))
