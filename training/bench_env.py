@@ -18,6 +18,7 @@ from training.env_timing import (
 )
 from training.machine_rates import describe_machine
 from training.plain_config import PlainConfig, check_each_once
+from training.timed_bench import goal, run_in_turn
 from vslam_env import vslam_v0
 from vslam_env.config import MAX_ROBOTS, EnvConfig
 
@@ -138,14 +139,14 @@ class EnvBenchResult:
         """Return goals with what was measured."""
         found = []
         if self.rows:
-            found.append(_goal("env.step, per second", self.rows[0].times.per_second, GOALS["env.step"], True))
+            found.append(goal("env.step, per second", self.rows[0].times.per_second, GOALS["env.step"], True))
         if self.simulator is not None:
-            found.append(_goal("simulator only, per second", self.simulator.per_second, GOALS["simulator"], True))
+            found.append(goal("simulator only, per second", self.simulator.per_second, GOALS["simulator"], True))
         if self.reset is not None:
-            found.append(_goal("reset, ms", self.reset.median_us / 1e3, GOAL_RESET_MS, False))
+            found.append(goal("reset, ms", self.reset.median_us / 1e3, GOAL_RESET_MS))
         for name in ("get_state", "set_state, same episode"):
             if name in self.snapshots:
-                found.append(_goal(f"{name}, ms", self.snapshots[name].median_us / 1e3, GOAL_STATE_MS, False))
+                found.append(goal(f"{name}, ms", self.snapshots[name].median_us / 1e3, GOAL_STATE_MS))
         return found
 
     def to_mapping(self) -> dict[str, Any]:
@@ -207,13 +208,7 @@ def run_bench(
     begun, often = min(300, steps), min(60, 4 + steps)
     snapshots = keep("snapshots", lambda: time_snapshots(vslam_v0.parallel_env(config=base), seed, begun, often))
     trials.insert(5, ("snapshots", snapshots))
-    done = 0
-    for name, trial in trials:
-        if should_stop():
-            break
-        on_trial(name)
-        trial()
-        done += 1
+    complete = run_in_turn(trials, on_trial, should_stop)
     return EnvBenchResult(
         machine=describe_machine(),
         rows=tuple(rows),
@@ -222,7 +217,7 @@ def run_bench(
         reset=results["reset"],
         snapshots=results["snapshots"],
         peer=results["peer"],
-        complete=done == len(trials),
+        complete=complete,
     )
 
 
@@ -233,8 +228,3 @@ def count_trials(config: EnvBenchConfig) -> int:
 
 def _title(load: EnvLoad) -> str:
     return f"{load.robots} robots, {load.particles} particles, {load.world}, {load.mode}"
-
-
-def _goal(name: str, measured: float, goal: float, at_least: bool) -> dict[str, Any]:
-    met = measured >= goal if at_least else measured <= goal
-    return {"name": name, "measured": measured, "goal": goal, "at_least": at_least, "met": bool(met)}

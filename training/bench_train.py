@@ -18,6 +18,7 @@ from training.learn_config import SPLIT_TRAIN, TrainConfig
 from training.learn_network import GoalPolicy
 from training.machine_rates import describe_machine
 from training.plain_config import PlainConfig
+from training.timed_bench import goal, run_in_turn
 from training.vec_env import ExplorationVecEnv, make_vec_env
 from vslam_env import vslam_v0
 from vslam_env.config import EnvConfig
@@ -100,14 +101,10 @@ class TrainBenchResult:
         found = []
         for part in self.parts:
             if part.name == "adapter":
-                found.append({"name": "adapter, us per decision", "measured": part.median_us,
-                              "goal": GOAL_ADAPTER_US, "at_least": False,
-                              "met": part.median_us <= GOAL_ADAPTER_US})  # fmt: skip
+                found.append(goal("adapter, us per decision", part.median_us, GOAL_ADAPTER_US))
         rates = {row.workers: row.per_second for row in self.workers}
         if 2 in rates and 1 in rates:
-            gain = rates[2] / rates[1]
-            found.append({"name": "two workers over one", "measured": gain, "goal": GOAL_TWO_WORKERS,
-                          "at_least": True, "met": gain >= GOAL_TWO_WORKERS})  # fmt: skip
+            found.append(goal("two workers over one", rates[2] / rates[1], GOAL_TWO_WORKERS, at_least=True))
         return found
 
     def to_mapping(self) -> dict[str, Any]:
@@ -177,17 +174,11 @@ def run_bench(
         ("learner", lambda: parts.extend(time_learner(config))),
     ]
     trials += [(f"{n} workers", lambda n=n: rows.append(time_workers(config, n))) for n in config.workers]  # type: ignore[misc]
-    done = 0
-    for name, trial in trials:
-        if should_stop():
-            break
-        on_trial(name)
-        trial()
-        done += 1
+    complete = run_in_turn(trials, on_trial, should_stop)
     for row in rows:
         if row.workers == 0:
             parts.insert(0, Part("environment", 1e6 / row.per_second, 1e6 / row.best_per_second))
-    return TrainBenchResult(describe_machine(), tuple(parts), tuple(rows), done == len(trials))
+    return TrainBenchResult(describe_machine(), tuple(parts), tuple(rows), complete)
 
 
 def count_trials(config: TrainBenchConfig) -> int:

@@ -57,7 +57,7 @@ def _print(console: Console, result: "TrainBenchResult") -> None:
     """Print both tables and the goals."""
     from rich.table import Table
 
-    from training.filter_tables import BUSY
+    from training.timed_bench import print_caveats, print_goals
 
     table = Table("part", title="A decision of a robot, in one process", title_justify="left")
     for column in ("median us", "least us", "share"):
@@ -74,12 +74,5 @@ def _print(console: Console, result: "TrainBenchResult") -> None:
     for row in result.workers:
         table.add_row(str(row.workers), f"{row.per_second:,.0f}", f"{row.best_per_second:,.0f}")
     console.print(table)
-    for goal in result.goals():
-        sign = ">=" if goal["at_least"] else "<="
-        verdict = f"goal {sign} {goal['goal']:g}: {'met' if goal['met'] else 'missed'}"
-        console.print(f"{goal['name']}: {goal['measured']:.3g}, {verdict}", highlight=False)
-    load = result.machine["load_before"]
-    if load is not None and load > BUSY:
-        console.print(f"The machine was busy (load {load:.1f}): times may be too long.", highlight=False)
-    if not result.complete:
-        console.print("Stopped early: the tables hold what was timed until then.", highlight=False)
+    print_goals(console, result.goals())
+    print_caveats(console, result.machine, result.complete)

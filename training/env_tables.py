@@ -5,7 +5,7 @@ from rich.table import Table
 
 from training.bench_env import EnvBenchResult
 from training.env_timing import PEER, StepTimes
-from training.filter_tables import BUSY
+from training.timed_bench import print_caveats, print_goals
 
 
 def print_env_result(console: Console, result: EnvBenchResult, asked_peer: bool) -> None:
@@ -43,15 +43,8 @@ def print_env_result(console: Console, result: EnvBenchResult, asked_peer: bool)
     console.print(table)
     if asked_peer and result.peer is None and result.complete:
         console.print(f"{PEER} is not installed: no peer was timed (pip install {PEER}).", highlight=False)
-    for goal in result.goals():
-        sign = ">=" if goal["at_least"] else "<="
-        verdict = f"goal {sign} {goal['goal']:g}: {'met' if goal['met'] else 'missed'}"
-        console.print(f"{goal['name']}: {goal['measured']:.4g}, {verdict}", highlight=False)
-    load = result.machine["load_before"]
-    if load is not None and load > BUSY:
-        console.print(f"The machine was busy (load {load:.1f}): times may be too long.", highlight=False)
-    if not result.complete:
-        console.print("Stopped early: the tables hold what was timed until then.", highlight=False)
+    print_goals(console, result.goals())
+    print_caveats(console, result.machine, result.complete)
 
 
 def _times(times: StepTimes) -> tuple[str, str, str, str]:

@@ -10,8 +10,7 @@ from training.bench_filter import BenchResult
 from training.filter_bounds import MULTIPLY_ADDS
 from training.filter_goals import Goal
 from training.filter_trials import PLAIN_PARTICLES, Row
-
-BUSY = 1.2  # load of the last minute above which another process was running
+from training.timed_bench import print_caveats
 
 
 def print_result(console: Console, result: BenchResult, goals: Sequence[Goal]) -> None:
@@ -53,12 +52,7 @@ def print_result(console: Console, result: BenchResult, goals: Sequence[Goal]) -
             f"import {cached['import_s']:.1f} s.",
             highlight=False,
         )
-    if machine["load_before"] is not None and machine["load_before"] > BUSY:
-        console.print(
-            f"The machine was busy (load {machine['load_before']:.1f}): times may be too long.", highlight=False
-        )
-    if not result.complete:
-        console.print("Stopped early; the rest was not measured.")
+    print_caveats(console, machine, result.complete)
 
 
 def _rows(result: BenchResult, proposal: str) -> Table:

@@ -1,0 +1,51 @@
+"""What benches of times have in common: trials one after the other until Ctrl-C, and goals that are met or missed."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from rich.console import Console
+
+BUSY = 1.2  # load of the last minute above which another process was running
+
+
+def run_in_turn(
+    trials: Sequence[tuple[str, Callable[[], object]]],
+    on_trial: Callable[[str], None],
+    should_stop: Callable[[], bool],
+) -> bool:
+    """Run named trials until all are done or the user stops; return whether all are done.
+
+    Args:
+        trials: Names and what runs under them.
+        on_trial: Called with the name of each trial before it begins.
+        should_stop: Asked before each trial.
+    """
+    for name, trial in trials:
+        if should_stop():
+            return False
+        on_trial(name)
+        trial()
+    return True
+
+
+def goal(name: str, measured: float, limit: float, at_least: bool = False) -> dict[str, Any]:
+    """Return a goal with what was measured: at most `limit`, or at least."""
+    met = measured >= limit if at_least else measured <= limit
+    return {"name": name, "measured": measured, "goal": limit, "at_least": at_least, "met": bool(met)}
+
+
+def print_goals(console: Console, goals: Sequence[Mapping[str, Any]]) -> None:
+    """Print a line for each goal."""
+    for each in goals:
+        sign = ">=" if each["at_least"] else "<="
+        verdict = f"goal {sign} {each['goal']:g}: {'met' if each['met'] else 'missed'}"
+        console.print(f"{each['name']}: {each['measured']:.4g}, {verdict}", highlight=False)
+
+
+def print_caveats(console: Console, machine: Mapping[str, Any], complete: bool) -> None:
+    """Say if the machine was busy, and if the user stopped the bench."""
+    load = machine["load_before"]
+    if load is not None and load > BUSY:
+        console.print(f"The machine was busy (load {load:.1f}): times may be too long.", highlight=False)
+    if not complete:
+        console.print("Stopped early: the tables hold what was timed until then.", highlight=False)
