@@ -1,13 +1,13 @@
 """One trial of the accuracy bench: a simulated run, one method, and how far its answer is from the truth."""
 
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from typing import Any, Literal
 
 import numpy as np
 
-from slam_backend.errors import FloatArray, IntArray, check_choice, check_int
+from slam_backend.errors import FloatArray, IntArray, check_choice, check_float, check_int
 from slam_backend.existence import ExistenceModel
 from slam_backend.filter import FastSlam
 from slam_backend.geometry import transform_points, wrap_angle
@@ -37,6 +37,8 @@ class Trial:
         method: One of `METHODS`.
         particles: M of a filter, 0 of the others.
         seed: Of the run, and of the filter's draws.
+        noise_factor: What a filter multiplies the true variance of the measurements by.
+        landmark_noise: Of a filter [m], see `FilterOptions`.
     """
 
     preset: str
@@ -46,8 +48,11 @@ class Trial:
     method: str
     particles: int
     seed: int
+    noise_factor: float = 1.0
+    landmark_noise: float | None = None
 
     def __post_init__(self) -> None:
+        check_float("noise_factor", self.noise_factor, "Use 1 for the noise as it is.", above=0.0)
         check_choice("method", self.method, METHODS)
         least = 1 if self.method in FILTERS else 0
         check_int("particles", self.particles, least, "Use at least one particle; 100 is a good start.")
@@ -114,7 +119,11 @@ def _build_filter(run: StereoRun, trial: Trial) -> FastSlam:
     "+existence": with the default model of existence; "+rejuvenation": every `REJUVENATE_EVERY` steps.
     """
     proposal, _, extra = trial.method.partition("+")
-    options: dict[str, Any] = {}
+    camera, factor = run.spec.noise.camera, float(np.sqrt(trial.noise_factor))
+    options: dict[str, Any] = {"landmark_noise": trial.landmark_noise}
+    options["camera"] = replace(
+        camera, sigma_px=factor * camera.sigma_px, sigma_disparity_px=factor * camera.sigma_disparity_px
+    )
     if extra == "existence":
         options["existence"] = ExistenceModel(frame_limit=run.spec.measurements // run.spec.robots)
     elif extra == "rejuvenation":

@@ -23,6 +23,8 @@ class AccuracyConfig(PlainConfig):
         particles: Numbers of particles of the filters.
         seeds: How many.
         seed: The first of them.
+        noise_factor: What filters multiply the true variance of the measurements by.
+        landmark_noise: Of filters [m], see `FilterOptions`.
     """
 
     presets: tuple[str, ...] = ("good",)
@@ -33,6 +35,8 @@ class AccuracyConfig(PlainConfig):
     particles: tuple[int, ...] = (10, 30, 100, 300, 1000)
     seeds: int = 16
     seed: int = 0
+    noise_factor: float = 1.0
+    landmark_noise: float | None = None
 
     def __post_init__(self) -> None:
         check_int("seeds", self.seeds, 1, "Run at least one seed.")
@@ -46,7 +50,8 @@ class AccuracyConfig(PlainConfig):
         return [
             Trial(
                 preset=preset, association=association, robots=robots, length=float(length), method=method,  # type: ignore[arg-type]
-                particles=particles, seed=seed,
+                particles=particles, seed=seed, noise_factor=float(self.noise_factor),
+                landmark_noise=self.landmark_noise,
             )
             for seed in range(self.seed, self.seed + self.seeds)
             for preset in self.presets

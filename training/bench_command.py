@@ -28,6 +28,13 @@ def bench_accuracy(
         ),
     ] = None,
     particles: Annotated[str | None, typer.Option(help="Per filter.", show_default="10,30,100,300,1000")] = None,
+    noise_factor: Annotated[
+        float | None, typer.Option(help="Times the true variance of the measurements, to filters.", show_default="1")
+    ] = None,
+    landmark_noise: Annotated[
+        float | None,
+        typer.Option(help="Metres by which landmarks may walk.", show_default="0, if rejuvenated 0.005"),
+    ] = None,
     processes: Processes = 1,
     check: Check = False,
     out: OutToGoOn = None,
@@ -57,6 +64,8 @@ def bench_accuracy(
         "particles": numbers("particles", particles),
         "seeds": seeds,
         "seed": first_seed,
+        "noise_factor": noise_factor,
+        "landmark_noise": landmark_noise,
     }
     chosen = choose(AccuracyConfig, COMMAND, given, config=config, json=json, out=out)
     console, folder = begin(COMMAND, chosen, out, goes_on=True)

@@ -31,7 +31,8 @@ def open_folder(out: Path | None, command: str, config: Mapping[str, Any], seed:
     if out is None or not (out / CONFIG_FILE).is_file():
         return RunFolder.create(out, command, config, seed)
     values, kept_seed = read_config(out, command)
-    if (values, kept_seed) != (plain(config), seed):
+    asked = {name: value for name, value in plain(config).items() if value is not None}  # TOML knows no None
+    if (values, kept_seed) != (asked, seed):
         cure = f"Repeat the options in {str(out / CONFIG_FILE)!r}, or choose another folder."
         expected = f"a folder of this very {command.split()[0]}"
         raise bad_argument("out", expected, "a folder of one with other options", cure)

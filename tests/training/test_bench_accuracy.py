@@ -136,6 +136,20 @@ def test_rejuvenation_is_a_method_of_its_own() -> None:
     assert row["pose_rms_m"] != plain_row["pose_rms_m"]
 
 
+def test_filters_that_assume_more_noise_claim_less() -> None:
+    """More noise of the measurements, or landmarks that walk, make them less sure; the run and the peers stay."""
+    trial = Trial(
+        preset="good", association="known", robots=1, length=12.0, method="fastslam2", particles=20, seed=30
+    )
+    as_it_is = play(trial)["nees_median"]
+    assert play(replace(trial, noise_factor=9.0))["nees_median"] < 0.5 * as_it_is
+    assert play(replace(trial, landmark_noise=0.03))["nees_median"] < 0.9 * as_it_is
+    peer = replace(trial, method="batch_ml", particles=0)
+    assert play(peer)["pose_rms_m"] == play(replace(peer, noise_factor=9.0))["pose_rms_m"]
+    with pytest.raises(ValueError, match="noise_factor: expected a finite number > 0"):
+        replace(trial, noise_factor=0.0)
+
+
 def test_summary_and_intervals(rows: list[dict[str, Any]]) -> None:
     """One line per condition, method and M; the mean is that of the rows and lies in its interval."""
     lines = summarise(rows)
