@@ -13,7 +13,7 @@ from vslam_env.navigation import follow_path, plan_path
 from vslam_env.observation import NUM_ACTIONS
 
 MAX_SPEED, MAX_REVERSE, MAX_TURN = 1.0, 0.3, 1.5  # [m/s], [m/s], [rad/s]
-DISCRETE_COMMANDS = np.array([[0.0, 0.0], [MAX_SPEED, 0.0], [0.0, MAX_TURN], [0.0, -MAX_TURN]])  # stay ahead left right
+DISCRETE_COMMANDS = ((0.0, 0.0), (MAX_SPEED, 0.0), (0.0, MAX_TURN), (0.0, -MAX_TURN))  # stay ahead left right
 
 
 def action_space(action_type: str) -> spaces.Space[Any]:
@@ -32,53 +32,56 @@ def checked_actions(actions: Any, agents: Sequence[str], action_type: str) -> li
         action_type: Of all of them.
 
     Returns:
-        (2,) float64 arrays in [-1, 1], or ints.
+        Pairs of floats in [-1, 1], or ints.
 
     Raises:
         ValueError: If an agent is unknown or missing, or an action is outside its space.
     """
     if not isinstance(actions, Mapping):
         raise bad_argument("actions", "a dict from agent to action", actions, "Pass {agent: action}.")
-    unknown = [agent for agent in actions if agent not in agents]
-    if unknown:
-        raise bad_argument("actions", f"actions of {list(agents)}", unknown[0], "Drop agents that are not there.")
-    missing = [agent for agent in agents if agent not in actions]
-    if missing:
-        raise bad_argument("actions", f"an action of {missing[0]!r}", f"no {missing[0]!r}", "All agents act at once.")
-    check = _checked_box if action_type == "continuous" else _checked_index
+    if len(actions) != len(agents) or not all(agent in actions for agent in agents):
+        unknown = [agent for agent in actions if agent not in agents]
+        if unknown:
+            raise bad_argument("actions", f"actions of {list(agents)}", unknown[0], "Drop agents that are not there.")
+        gone = next(agent for agent in agents if agent not in actions)
+        raise bad_argument("actions", f"an action of {gone!r}", f"no {gone!r}", "All agents act at once.")
+    if action_type == "continuous":
+        return [_checked_pair(agent, actions[agent]) for agent in agents]
     limit = len(DISCRETE_COMMANDS) if action_type == "discrete" else NUM_ACTIONS
-    return [check(f"actions[{agent!r}]", actions[agent], limit) for agent in agents]
+    return [_checked_index(agent, actions[agent], limit) for agent in agents]
 
 
-def _checked_box(name: str, action: Any, _limit: int) -> FloatArray:
-    cure = "Give (speed, turn) in [-1, 1]."
+def _checked_pair(agent: str, action: Any) -> tuple[float, float]:
+    name, cure = "actions[%r]", "Give (speed, turn) in [-1, 1]."
     try:
-        array = np.array(action, dtype=np.float64)
+        array = np.asarray(action, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise bad_argument(name, "an array of shape (2,)", action, cure) from error
+        raise bad_argument(name % agent, "an array of shape (2,)", action, cure) from error
     if array.shape != (2,):
-        raise bad_argument(name, "an array of shape (2,)", f"shape {array.shape}", cure)
-    if not (np.abs(array) <= 1.0).all():  # false for NaN
-        raise bad_argument(name, "two numbers in [-1, 1]", array.tolist(), cure)
-    return array
+        raise bad_argument(name % agent, "an array of shape (2,)", f"shape {array.shape}", cure)
+    speed, turn = array.tolist()
+    if not (abs(speed) <= 1.0 and abs(turn) <= 1.0):  # false for NaN
+        raise bad_argument(name % agent, "two numbers in [-1, 1]", [speed, turn], cure)
+    return speed, turn
 
 
-def _checked_index(name: str, action: Any, limit: int) -> int:
+def _checked_index(agent: str, action: Any, limit: int) -> int:
     value = action.item() if isinstance(action, (np.generic, np.ndarray)) and np.size(action) == 1 else action
     if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < limit:
-        raise bad_argument(name, f"an int from 0 to {limit - 1}", action, "Sample from env.action_space(agent).")
+        cure = "Sample from env.action_space(agent)."
+        raise bad_argument(f"actions[{agent!r}]", f"an int from 0 to {limit - 1}", action, cure)
     return value
 
 
-def command_of(action_type: str, action: Any) -> FloatArray:
-    """Return the velocity command (2,) [m/s, rad/s] of a continuous or discrete action.
+def command_of(action_type: str, action: Any) -> tuple[float, float]:
+    """Return the velocity command [m/s, rad/s] of a continuous or discrete action.
 
     Continuous actions are scaled to the limits of either direction, so that zeros stand still.
     """
     if action_type == "discrete":
-        return np.array(DISCRETE_COMMANDS[action])
+        return DISCRETE_COMMANDS[action]
     speed, turn = action
-    return np.array([speed * (MAX_SPEED if speed > 0.0 else MAX_REVERSE), turn * MAX_TURN])
+    return speed * (MAX_SPEED if speed > 0.0 else MAX_REVERSE), turn * MAX_TURN
 
 
 class GoalDriver:

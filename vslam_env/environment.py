@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping
+from functools import reduce
 from typing import Any, ClassVar
 
 import numpy as np
@@ -79,6 +80,7 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         self.action_spaces = {agent: action_space(config.action_type) for agent in self.possible_agents}
         size = STATE_PER_ROBOT * config.num_robots + 2
         self.state_space = spaces.Box(-np.inf, np.inf, (size,), np.float32)
+        self._nothing = np.zeros(config.num_robots)
         self._root: np.random.SeedSequence | None = None
         self._episode: Episode | None = None
         self._cycle = 0
@@ -135,8 +137,8 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         self._cycle = 0
         self._drivers = [GoalDriver() for _ in self.agents]
         self._take_stock()
-        nothing = np.zeros(len(self.agents))
-        return self._observations(), self._infos({term.name: nothing for term in self._terms}, [0] * len(self.agents))
+        nothing = dict.fromkeys((term.name for term in self._terms), self._nothing)
+        return self._observations(), self._infos(nothing, [0] * len(self.agents))
 
     def step(
         self, actions: Mapping[AgentID, Any]
@@ -170,13 +172,13 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         self._cycle += 1
 
         terms = evaluate(self._terms, before, self._standing, self.config.shared_reward)
-        rewards = np.sum(list(terms.values()), axis=0)
+        rewards = reduce(np.add, terms.values())
         goal = self.config.stop_at_recall
         terminated = goal is not None and bool(self._standing.map_recalls.min() >= goal)
         truncated = not terminated and self._cycle >= self.max_cycles
         results = (
             self._observations(),
-            {agent: float(reward) for agent, reward in zip(agents, rewards, strict=True)},
+            dict(zip(agents, rewards.tolist(), strict=True)),
             dict.fromkeys(agents, terminated),
             dict.fromkeys(agents, truncated),
             self._infos(terms, invalid),
@@ -402,6 +404,9 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         `collisions` (ticks), `distance` [m], `bytes_sent` and `merges` count since the reset.
         """
         standing, belief = self._standing, self._running_episode("step").belief
+        pose_errors, collisions = self._pose_errors.tolist(), standing.collisions.tolist()
+        distances, bytes_sent = standing.distances.tolist(), standing.bytes_sent.tolist()
+        paid = {f"reward/{name}": values.tolist() for name, values in terms.items()}
         infos: dict[AgentID, dict[str, Any]] = {}
         for robot, agent in enumerate(self.agents):
             scores, group = self._scores[robot], belief.group(robot)
@@ -410,18 +415,18 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
                 "map_rmse": scores.rmse,
                 "map_recall": scores.recall,
                 "map_precision": scores.precision,
-                "pose_error": float(self._pose_errors[robot, 0]),
-                "heading_error": float(self._pose_errors[robot, 1]),
+                "pose_error": pose_errors[robot][0],
+                "heading_error": pose_errors[robot][1],
                 "coverage": standing.coverage,
                 "group": group[0],
                 "group_size": len(group),
                 "merges": standing.merges,
-                "collisions": int(standing.collisions[robot]),
-                "distance": float(standing.distances[robot]),
-                "bytes_sent": int(standing.bytes_sent[robot]),
+                "collisions": collisions[robot],
+                "distance": distances[robot],
+                "bytes_sent": bytes_sent[robot],
                 "invalid_action": invalid[robot],
+                **{name: values[robot] for name, values in paid.items()},
             }
-            infos[agent] |= {f"reward/{name}": float(values[robot]) for name, values in terms.items()}
         return infos
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend._jit import jit
-from vslam_env.navigation import CELL, FREE, GRID_SIZE, OCCUPIED
+from vslam_env.navigation import CELL, FREE, GRID_SIZE, OCCUPIED, UNKNOWN
 from vslam_env.robot_belief import Glimpse
 
 SIZE = 48
@@ -16,23 +16,30 @@ MARK = 255
 
 
 @jit
-def _paint(cells: Any, pose: Any, start_from_group: Any, means: Any) -> Any:
-    """Sample the seen grid at the centres of the local cells, and mark the cells that hold landmarks."""
-    local = np.zeros((3, SIZE, SIZE), np.uint8)
+def _paint(cells: Any, pose: Any, start_from_group: Any, means: Any, local: Any) -> None:
+    """Sample the seen grid at the centres of the local cells, and mark the cells that hold landmarks.
+
+    Each row of `local` (3, 48, 48) is written in two loops without branches: what a cell holds cannot be foreseen, and
+    a wrong guess costs more than the arithmetic.
+    """
     x, y = pose[0], pose[1]
     c, s = math.cos(pose[2]), math.sin(pose[2])
     middle = 0.5 * SIZE
+    flat = cells.ravel()
+    place = np.empty(SIZE, np.int32)
     for row in range(SIZE):
         ahead = (middle - 0.5 - row) * CELL
         for col in range(SIZE):
             left = (middle - 0.5 - col) * CELL
-            i = math.floor((y + s * ahead + c * left) / CELL + 0.5 * GRID_SIZE)
-            j = math.floor((x + c * ahead - s * left) / CELL + 0.5 * GRID_SIZE)
-            if 0 <= i < GRID_SIZE and 0 <= j < GRID_SIZE:
-                if cells[i, j] == FREE:
-                    local[0, row, col] = MARK
-                elif cells[i, j] == OCCUPIED:
-                    local[1, row, col] = MARK
+            i = (y + s * ahead + c * left) / CELL + 0.5 * GRID_SIZE
+            j = (x + c * ahead - s * left) / CELL + 0.5 * GRID_SIZE
+            inside = (i >= 0.0) & (i < GRID_SIZE) & (j >= 0.0) & (j < GRID_SIZE)
+            place[col] = np.int32(i) * GRID_SIZE + np.int32(j) if inside else -1
+        for col in range(SIZE):
+            verdict = flat[max(place[col], 0)] if place[col] >= 0 else UNKNOWN
+            local[0, row, col] = MARK * (verdict == FREE)
+            local[1, row, col] = MARK * (verdict == OCCUPIED)
+            local[2, row, col] = 0
     start_c, start_s = math.cos(start_from_group[2]), math.sin(start_from_group[2])
     for k in range(len(means)):
         dx = start_from_group[0] + start_c * means[k, 0] - start_s * means[k, 1] - x
@@ -41,7 +48,6 @@ def _paint(cells: Any, pose: Any, start_from_group: Any, means: Any) -> Any:
         col = math.floor(middle - (c * dy - s * dx) / CELL)
         if 0 <= row < SIZE and 0 <= col < SIZE:
             local[2, row, col] = MARK
-    return local
 
 
 def local_grid(glimpse: Glimpse) -> NDArray[np.uint8]:
@@ -51,5 +57,6 @@ def local_grid(glimpse: Glimpse) -> NDArray[np.uint8]:
         (3, 48, 48) uint8, robot frame, cells of 0.2 m that are 0 or 255. Channels free, occupied, landmarks. Rows go
         from 4.8 m ahead to 4.8 m behind, columns from 4.8 m to the left to 4.8 m to the right. A fresh array.
     """
-    grid: NDArray[np.uint8] = _paint(glimpse.cells, glimpse.pose, glimpse.start_from_group, glimpse.outline.means)
-    return grid
+    local = np.empty((len(CHANNELS), SIZE, SIZE), np.uint8)
+    _paint(glimpse.cells, glimpse.pose, glimpse.start_from_group, glimpse.outline.means, local)
+    return local

@@ -1,12 +1,14 @@
+import dataclasses
 from typing import Any
 
 import numpy as np
 import pytest
 from small_env import MEETING, small_env, turning, wander
 
-from slam_backend.geometry import between
+from slam_backend.geometry import between, inverse, transform_points
 from vslam_env import ExplorationEnv
-from vslam_env.belief import TeamBelief
+from vslam_env.belief import Belief, TeamBelief
+from vslam_env.navigation import CELL, FREE, GRID_SIZE, OCCUPIED, UNKNOWN, cell_of
 from vslam_env.observation import flatten, observe
 from vslam_env.readings import Readings
 
@@ -126,6 +128,39 @@ def test_local_grid_is_ego_centred() -> None:
     columns = np.flatnonzero(occupied[23:25, :24].any(axis=0))
     assert len(columns)
     assert np.abs(columns - (23.5 - 3.0 / 0.2)).min() <= 2.0
+
+
+def _plain_local_grid(belief: Belief) -> np.ndarray:
+    """Return what `local_grid` returns, looked up cell by cell and landmark by landmark, without a compiled loop."""
+    steps = (23.5 - np.arange(48)) * CELL
+    ahead, left = np.meshgrid(steps, steps, indexing="ij")
+    centres = transform_points(belief.pose, np.stack([ahead, left], axis=-1))
+    rows, cols = np.moveaxis(cell_of(centres), -1, 0)
+    inside = (rows >= 0) & (rows < GRID_SIZE) & (cols >= 0) & (cols < GRID_SIZE)
+    seen = np.where(inside, belief.grid.cells[np.where(inside, rows, 0), np.where(inside, cols, 0)], UNKNOWN)
+    picture = np.zeros((3, 48, 48), np.uint8)
+    picture[0], picture[1] = 255 * (seen == FREE), 255 * (seen == OCCUPIED)
+    places = transform_points(inverse(belief.pose), belief.map.means[:, :2])
+    for row, col in np.floor(24.0 - places / CELL).astype(int):
+        if 0 <= row < 48 and 0 <= col < 48:
+            picture[2, row, col] = 255
+    return picture
+
+
+def test_local_grid_agrees_with_a_plain_one() -> None:
+    """Wherever the robot believes to be, at the rim of its grid and beyond as well."""
+    env = small_env(max_cycles=60)
+    env.reset(seed=2)
+    rng = np.random.default_rng(3)
+    for _ in range(60):
+        env.step(wander(env, rng))
+    belief = env.belief("robot_0")
+    assert len(belief.map) > 3
+    for spread in (2.0, 31.0):
+        for _ in range(30):
+            moved = dataclasses.replace(belief, pose=np.append(rng.uniform(-spread, spread, 2), rng.uniform(-3.0, 3.0)))
+            picture, expected = observe(moved, env.readings[0].scan, False)["local_grid"], _plain_local_grid(moved)
+            assert (picture != expected).mean() < 1e-3  # a centre on the border of two cells may fall to either side
 
 
 def test_mask_is_what_the_belief_offers() -> None:

@@ -113,7 +113,10 @@ class LandmarkSensor:
         visible = self.visible(poses)
         num_false = np.minimum(rng.poisson(config.false_points, robots), most)
         keys = rng.random(visible.shape)
-        ids, counts, points, descriptors = _choose_and_see(
+        ids, points = np.empty(robots * most, np.int64), np.empty((robots * most, 3))
+        descriptors: NDArray[Any] = np.empty((robots * most, self._descriptors.shape[1]))
+        counts = np.zeros(robots, np.int64)
+        total = _choose_and_see(
             visible,
             keys,
             config.detection_probability,
@@ -122,8 +125,13 @@ class LandmarkSensor:
             self._descriptors,
             poses,
             self._mount,
+            ids,
+            counts,
+            points,
+            descriptors,
         )
-        if num_false.any():
+        ids, points, descriptors = ids[:total], points[:total], descriptors[:total]
+        if any(num_false.tolist()):
             at = np.repeat(np.cumsum(counts), num_false)
             ids = np.insert(ids, at, -1)
             points = np.insert(points, at, self._false_points(len(at), rng), axis=0)
@@ -132,8 +140,8 @@ class LandmarkSensor:
             order = np.lexsort((rng.random(len(ids)), np.repeat(np.arange(robots), counts)))
             ids, points, descriptors = ids[order], points[order], descriptors[order]
         noise = rng.standard_normal((len(ids), 3 + descriptors.shape[1]))
-        sharp = _add_noise(points, descriptors, noise, self._stereo, config.descriptor_noise)
-        if not sharp.all():
+        sharp = np.empty(len(ids), np.bool_)
+        if _add_noise(points, descriptors, noise, self._stereo, config.descriptor_noise, sharp) < len(ids):
             counts = np.bincount(np.repeat(np.arange(robots), counts)[sharp], minlength=robots)
             ids, points, descriptors = ids[sharp], points[sharp], descriptors[sharp]
         frames, begin = [], 0
@@ -163,10 +171,9 @@ class LandmarkSensor:
 
 @jit
 def _seen_from(
-    positions: FloatArray, ids: IntArray, counts: IntArray, poses: FloatArray, mount: FloatArray
-) -> FloatArray:
-    """Return landmarks `ids` (n,), `counts` (K,) for each robot in turn, in the robots' camera frames (n, 3) [m]."""
-    points = np.empty((len(ids), 3))
+    positions: FloatArray, ids: IntArray, counts: IntArray, poses: FloatArray, mount: FloatArray, points: FloatArray
+) -> None:
+    """Write landmarks `ids`, `counts` (K,) of each robot in turn, as points in the camera frames (n, 3) [m]."""
     i = 0
     for k in range(len(poses)):
         c, s = np.cos(poses[k, 2]), np.sin(poses[k, 2])
@@ -176,13 +183,17 @@ def _seen_from(
             points[i, 1] = mount[2] - positions[ids[i], 2]
             points[i, 2] = c * dx + s * dy - mount[0]
             i += 1
-    return points
 
 
 @jit
 def _add_noise(
-    points: FloatArray, descriptors: FloatArray, noise: FloatArray, stereo: FloatArray, descriptor_noise: float
-) -> BoolArray:
+    points: FloatArray,
+    descriptors: FloatArray,
+    noise: FloatArray,
+    stereo: FloatArray,
+    descriptor_noise: float,
+    sharp: BoolArray,
+) -> int:
     """Replace true points and descriptors, in place, by measured ones.
 
     Points are projected, their image coordinates and disparities disturbed, and triangulated again.
@@ -193,18 +204,20 @@ def _add_noise(
         noise: (n, 3 + d) float64, standard normal.
         stereo: (4,) float64. Focal length [px], baseline [m], sigmas of image coordinates and disparity [px].
         descriptor_noise: Root mean square length of the noise of a descriptor.
+        sharp: (n,) bool. Written to: false where the disparity vanishes in the noise: no matcher reports such a point.
 
     Returns:
-        (n,) bool. False where the disparity vanishes in the noise: no matcher reports such a point.
+        How many are sharp.
     """
     focal, baseline, sigma, sigma_disparity = stereo
     size = descriptors.shape[1]
     each = descriptor_noise / np.sqrt(size)
-    sharp = np.empty(len(points), dtype=np.bool_)
+    count = 0
     for i in range(len(points)):
         scale = focal / points[i, 2]
         disparity = baseline * scale + sigma_disparity * noise[i, 2]
         sharp[i] = disparity > 0.0
+        count += sharp[i]
         if sharp[i]:
             points[i, 0] = (points[i, 0] * scale + sigma * noise[i, 0]) * baseline / disparity
             points[i, 1] = (points[i, 1] * scale + sigma * noise[i, 1]) * baseline / disparity
@@ -216,13 +229,18 @@ def _add_noise(
         length = np.sqrt(square)
         for j in range(size):
             descriptors[i, j] /= length
-    return sharp
+    return count
 
 
 @jit
 def _choose(
-    visible: BoolArray, keys: FloatArray, detection_probability: float, places: IntArray
-) -> tuple[IntArray, IntArray]:
+    visible: BoolArray,
+    keys: FloatArray,
+    detection_probability: float,
+    places: IntArray,
+    chosen: IntArray,
+    counts: IntArray,
+) -> int:
     """Detect landmarks and choose among the detected ones.
 
     A landmark with a uniform key in [0, 1) is detected if the key is below the probability. The detected ones with the
@@ -233,12 +251,12 @@ def _choose(
         keys: (K, N) float64, uniform.
         detection_probability: Of a visible landmark.
         places: (K,) int64. At most so many are chosen for each robot.
+        chosen: (n,) int64. Written to: the chosen landmarks of all robots one after the other.
+        counts: (K,) int64, zeros before. Written to: the number for each robot.
 
     Returns:
-        The chosen landmarks of all robots one after the other, and the number (K,) for each robot.
+        How many are chosen.
     """
-    chosen = np.empty(places.sum(), dtype=np.int64)
-    counts = np.zeros(len(visible), dtype=np.int64)
     total = 0
     for k in range(len(visible)):
         begin = total
@@ -257,7 +275,7 @@ def _choose(
                 chosen[at] = chosen[at - 1]
                 at -= 1
             chosen[at] = n
-    return chosen[:total], counts
+    return total
 
 
 @jit
@@ -270,10 +288,14 @@ def _choose_and_see(
     descriptors: FloatArray,
     poses: FloatArray,
     mount: FloatArray,
-) -> tuple[IntArray, IntArray, FloatArray, NDArray[Any]]:
-    """Return the landmarks that `_choose` chooses, how many for each robot, their points and true descriptors."""
-    ids, counts = _choose(visible, keys, detection_probability, places)
-    looks = np.empty((len(ids), descriptors.shape[1]))
-    for i in range(len(ids)):
+    ids: IntArray,
+    counts: IntArray,
+    points: FloatArray,
+    looks: FloatArray,
+) -> int:
+    """Do what `_choose` and `_seen_from` do, and write true descriptors (n, d) as well; return how many are chosen."""
+    total = _choose(visible, keys, detection_probability, places, ids, counts)
+    for i in range(total):
         looks[i] = descriptors[ids[i]]
-    return ids, counts, _seen_from(positions, ids, counts, poses, mount), looks
+    _seen_from(positions, ids, counts, poses, mount, points)
+    return total

@@ -1,5 +1,6 @@
 """The one owner of the pymunk space: robots drive as commanded until walls or other robots stop them."""
 
+import math
 from typing import Any
 
 import numpy as np
@@ -45,6 +46,13 @@ def _drive_freely(
             gap = (poses[k, 0] - poses[j, 0]) ** 2 + (poses[k, 1] - poses[j, 1]) ** 2
             clear &= gap > (reach[k] + reach[j]) ** 2
     return goals, clear
+
+
+def _are_velocities(commands: Any, robots: int) -> bool:
+    """Tell whether commands are surely what they should be: a sum is finite only if all its parts are."""
+    if type(commands) is not np.ndarray or commands.dtype != np.float64 or commands.shape != (robots, 2):
+        return False
+    return commands.flags.c_contiguous and math.isfinite(sum(commands.ravel().tolist()))
 
 
 class Simulator:
@@ -102,7 +110,8 @@ class Simulator:
         Raises:
             ValueError: If the shape is wrong or a number is not finite.
         """
-        commands = check_array("commands", commands, (len(self._bodies), 2), "Give (v, omega) for each robot.")
+        if not _are_velocities(commands, len(self._bodies)):
+            commands = check_array("commands", commands, (len(self._bodies), 2), "Give (v, omega) for each robot.")
         goals, clear = _drive_freely(self._poses, commands, self.tick, self._walls, self.radius + SKIN)
         if clear:
             self._bumped = np.zeros(len(goals), dtype=np.bool_)
