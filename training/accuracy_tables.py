@@ -3,12 +3,10 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
 from training.accuracy_summary import CONDITION
+from training.text_tables import console_table, markdown_table
 
 NAMES = {
     "dead_reckoning": "dead reckoning", "batch_ml": "batch ML", "ideal_online": "ideal online",
@@ -82,9 +80,9 @@ def print_tables(console: Console, lines: Sequence[Mapping[str, Any]], goals: Se
         for part, columns in PARTS.items():
             headings, rows = table_rows(own, columns)
             if rows:
-                console.print(_table(f"{title}, {seeds} seeds: {part}", headings, rows))
+                console.print(console_table(f"{title}, {seeds} seeds: {part}", headings, rows))
     if goals:
-        console.print(_table("Goals", *goal_rows(goals)))
+        console.print(console_table("Goals", *goal_rows(goals)))
 
 
 def markdown(lines: Sequence[Mapping[str, Any]], goals: Sequence[Mapping[str, Any]]) -> str:
@@ -95,9 +93,9 @@ def markdown(lines: Sequence[Mapping[str, Any]], goals: Sequence[Mapping[str, An
         for columns in PARTS.values():
             headings, rows = table_rows(own, columns)
             if rows:
-                parts.append(_markdown(headings, rows))
+                parts.append(markdown_table(headings, rows))
     if goals:
-        parts += ["### Goals\n", _markdown(*goal_rows(goals))]
+        parts += ["### Goals\n", markdown_table(*goal_rows(goals))]
     return "\n".join(parts)
 
 
@@ -127,19 +125,3 @@ def _cell(
 def _number(value: float, digits: int) -> str:
     """Show a number with fixed digits, a large one with an exponent."""
     return f"{value:.{digits}f}" if abs(value) < 1e5 else f"{value:.0e}"
-
-
-def _table(title: str, headings: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
-    """Return a console table, numbers to the right."""
-    table = Table(title=escape(title), box=SIMPLE_HEAD, title_justify="left", padding=(0, 1))
-    for column, heading in enumerate(headings):
-        table.add_column(escape(heading), justify="left" if column == 0 else "right")
-    for row in rows:
-        table.add_row(*map(escape, row))
-    return table
-
-
-def _markdown(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Return a Markdown table."""
-    rule = ["---", *["---:"] * (len(headings) - 1)]
-    return "".join("| " + " | ".join(row) + " |\n" for row in (headings, rule, *rows))

@@ -3,10 +3,9 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
+
+from training.text_tables import console_table, markdown_table
 
 TITLES = {
     "grid": "200 landmarks in each map, 5 cm noise, by share in common and share of wrong look-alikes",
@@ -36,24 +35,13 @@ def markdown(lines: Sequence[Mapping[str, Any]], goals: Sequence[Mapping[str, An
     """Return the same tables as Markdown."""
     parts = [(title, HEADINGS[kind], table_rows(kind, lines)) for kind, title in TITLES.items()]
     parts.append(("Goals", ("goal", "measured", "wanted", ""), _goal_rows(goals)))
-    return "\n".join(_markdown(*part) for part in parts if part[2])
-
-
-def _markdown(title: str, headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Return one table with its title."""
-    lines = [f"**{title}**", "", "| " + " | ".join(headings) + " |", "|" + "---|" * len(headings)]
-    return "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in rows), ""])
+    return "\n".join(f"**{title}**\n\n{markdown_table(headings, rows)}" for title, headings, rows in parts if rows)
 
 
 def _print(console: Console, title: str, headings: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     """Print one table, if it has rows."""
     if rows:
-        table = Table(title=title, box=SIMPLE_HEAD)
-        for heading in headings:
-            table.add_column(escape(heading))
-        for row in rows:
-            table.add_row(*map(escape, row))
-        console.print(table)
+        console.print(console_table(title, headings, rows))
 
 
 def _cells(kind: str, line: Mapping[str, Any]) -> list[str]:

@@ -4,14 +4,12 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.box import SIMPLE_HEAD
-from rich.markup import escape
-from rich.table import Table
 
 from training.command_folder import begin, choose, finish
 from training.command_options import Check, Config, Json, Out, Seed, numbers
 from training.command_progress import share_shown
 from training.replay_command import DATASET
+from training.text_tables import console_table, markdown_table
 
 HEADINGS = (
     "after [s]", "barcodes", "method", "pairs", "aligned", "false", "median [m]", "worst [m]", "median [°]",
@@ -50,17 +48,13 @@ def bench_mrclam(
     with share_shown(console, "robots map alone") as update:
         rows = align_log(chosen, update)
     lines, goals = summarise(rows), check_goals(rows)
-    table = Table(title="Maps of real robots, aligned pairwise", box=SIMPLE_HEAD)
-    for heading in HEADINGS:
-        table.add_column(escape(heading))
-    for line in lines:
-        table.add_row(*cells(line))
-    console.print(table)
+    shown = [cells(line) for line in lines]
+    console.print(console_table("Maps of real robots, aligned pairwise", HEADINGS, shown))
     for goal in goals:
         verdict = "met" if goal["met"] else "missed"
         text = f"{goal['goal']}: {goal['measured']:.3g}, {goal['wanted']}: {verdict}"
         console.print(text, markup=False, highlight=False)
-    folder.write_text("table.md", markdown(lines))
+    folder.write_text("table.md", markdown_table(HEADINGS, shown))
     metrics = folder.write_metrics(plain({"summary": lines, "goals": goals, "pairs": rows}))
     finish(console, folder, metrics, json, check, [goal["met"] for goal in goals])
 
@@ -72,9 +66,3 @@ def cells(line: dict[str, Any]) -> list[str]:
     shown = ["-" if value is None else f"{value:.2f}" for value in errors]
     counts = [str(line[name]) for name in ("pairs", "accepted", "false")]
     return [after, line["barcodes"], line["method"], *counts, *shown]
-
-
-def markdown(lines: list[dict[str, Any]]) -> str:
-    """Return the table as Markdown."""
-    rows = ["| " + " | ".join(row) + " |" for row in (HEADINGS, ["---"] * len(HEADINGS), *map(cells, lines))]
-    return "\n".join([*rows, ""])

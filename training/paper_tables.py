@@ -3,13 +3,12 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
 
 from training.paper_claims import Claim
 from training.paper_regimes import REGIMES
+from training.text_tables import console_table
 
 
 def print_result(
@@ -31,13 +30,13 @@ def print_result(
         _print_points(console, f"{REGIMES[regime].title}, {proposal}", own)
     if ratios:
         few, many = ratios[0]["robots"]
-        table = _table(f"Map error, K={many} over K={few} (95 %)", "regime", "M", "as it is", "aligned")
+        table = console_table(f"Map error, K={many} over K={few} (95 %)", ("regime", "M", "as it is", "aligned"))
         for row in ratios:
             name = f"{REGIMES[row['regime']].title}, {row['proposal']}"
             table.add_row(escape(name), str(row["particles"]), *(_interval(row[key]) for key in ("raw", "aligned")))
         console.print(table)
     if claims:
-        table = _table("The paper's claims", "claim", "ratio (95 %)", "")
+        table = console_table("The paper's claims", ("claim", "ratio (95 %)", ""))
         for claim in claims:
             verdict = "holds" if claim.holds else "[red]does not hold[/]"
             table.add_row(escape(claim.claim), _interval(claim.to_mapping()), verdict)
@@ -50,7 +49,7 @@ def _print_points(console: Console, title: str, lines: Sequence[Mapping[str, Any
     parts = [("map error [m]", "map_rmse_m", 3, 1)] + [("step [ms]", "median_ms", 3, 0)] * any(
         line["median_ms"] is not None for line in lines
     )
-    table = _table(f"{title}, {max(line['seeds'] for line in lines)} seeds", "M")
+    table = console_table(f"{title}, {max(line['seeds'] for line in lines)} seeds", ("M",))
     for name, *_ in parts:
         for k in robots:
             table.add_column(escape(f"{name}\nK={k}"), justify="right")
@@ -76,11 +75,3 @@ def _interval(found: Mapping[str, Any]) -> str:
         return "-"
     ends = "" if found["low"] is None else f" ({found['low']:.2f}-{found['high']:.2f})"
     return f"{found['ratio']:.2f}{ends}"
-
-
-def _table(title: str, *headings: str) -> Table:
-    """Return an empty table, the first column to the left."""
-    table = Table(title=escape(title), box=SIMPLE_HEAD, title_justify="left", padding=(0, 1))
-    for column, heading in enumerate(headings):
-        table.add_column(escape(heading), justify="left" if column == 0 else "right")
-    return table
