@@ -22,7 +22,7 @@ from vslam_env.shared_grids import SharedGrids
 __all__ = ["Belief", "BeliefConfig", "Body", "Candidates", "TeamBelief", "Teammate"]
 
 CANDIDATE_TICKS = 10  # once a second
-NO_POSES = np.empty((0, 3))
+NOBODY, NO_POSES, NO_SIGMAS = np.empty(0, np.int64), np.empty((0, 3)), np.empty(0)
 
 
 class TeamBelief:
@@ -181,25 +181,27 @@ class TeamBelief:
 
     def glimpse(self, robot: int) -> Glimpse:
         """Return the part of a robot's belief that its observation shows; it shares memory with the filters."""
-        own, start, slots = self._estimates[robot], self._starts[robot], self._slots[robot]
-        mates = [mate for mate in self._members[robot] if mate != robot]
-        seen = [self._team.pose(mate, seen_by=robot) for mate in mates]
-        poses = np.array([compose(start, estimate.mean) for estimate in seen]) if mates else NO_POSES
-        squares = [0.5 * (estimate.covariance[0, 0] + estimate.covariance[1, 1]) for estimate in seen]
+        own, start, mates, poses, sigmas = self._estimates[robot], self._starts[robot], NOBODY, NO_POSES, NO_SIGMAS
+        if len(self._members[robot]) > 1:
+            mates = np.array([mate for mate in self._members[robot] if mate != robot])
+            seen = [self._team.pose(mate, seen_by=robot) for mate in mates.tolist()]
+            poses = compose(start, np.array([estimate.mean for estimate in seen]))
+            sigmas = np.sqrt([0.5 * (estimate.covariance[0, 0] + estimate.covariance[1, 1]) for estimate in seen])
+        features, valid = self._slots[robot].described(own.mean, poses)
         return Glimpse(
             robot=robot,
-            group_size=1 + len(mates),
+            group_size=len(self._members[robot]),
             pose=own.mean,
             covariance=own.covariance,
             ess=self._team.ess(robot) / self._team.num_particles(robot),
             start_from_group=start,
             outline=self.outline(robot),
             cells=self._grids[robot].cells,
-            features=slots.features(own.mean, poses[:, :2]),
-            valid=slots.valid,
-            mates=np.array(mates, np.int64),
+            features=features,
+            valid=valid,
+            mates=mates,
             mate_poses=poses,
-            mate_sigmas=np.sqrt(np.array(squares)),
+            mate_sigmas=sigmas,
         )
 
     def get_state(self) -> dict[str, Any]:

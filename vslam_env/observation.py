@@ -24,7 +24,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from slam_backend._jit import jit
-from slam_backend.errors import BoolArray, FloatArray
+from slam_backend.errors import FloatArray
 from vslam_env.local_grid import CHANNELS, MARK, SIZE, local_grid
 from vslam_env.navigation.frontiers import NUM_SLOTS
 from vslam_env.robot_belief import Belief, Glimpse
@@ -54,7 +54,7 @@ def observe(belief: Belief, scan: FloatArray, goal_actions: bool) -> Observation
 
 def observe_glimpse(glimpse: Glimpse, scan: FloatArray, goal_actions: bool) -> Observation:
     """Return what `observe` returns, from the part of the belief that it shows."""
-    numbers, candidates = np.empty(12, np.float32), np.empty((NUM_SLOTS, 5), np.float32)
+    numbers, candidates = np.empty(12, np.float32), glimpse.features
     teammates, present = np.zeros((MOST_TEAMMATES, 5), np.float32), np.zeros(MOST_TEAMMATES, np.int8)
     _fill(
         glimpse.pose,
@@ -63,7 +63,6 @@ def observe_glimpse(glimpse: Glimpse, scan: FloatArray, goal_actions: bool) -> O
         glimpse.outline.counts,
         glimpse.ess,
         glimpse.group_size,
-        glimpse.features,
         glimpse.robot,
         glimpse.mates,
         glimpse.mate_poses,
@@ -88,7 +87,7 @@ def observe_glimpse(glimpse: Glimpse, scan: FloatArray, goal_actions: bool) -> O
     return observation
 
 
-def action_mask(valid: BoolArray) -> NDArray[np.int8]:
+def action_mask(valid: NDArray[np.int8]) -> NDArray[np.int8]:
     """Return which `goal` actions are valid (17,) int8: staying always is, the others where `valid` (16,) says so."""
     mask = np.ones(NUM_ACTIONS, np.int8)
     mask[1:] = valid
@@ -150,7 +149,6 @@ def _fill(
     counts: Any,
     ess: float,
     group_size: int,
-    features: Any,
     robot: int,
     mates: Any,
     mate_poses: Any,
@@ -169,13 +167,12 @@ def _fill(
         counts: (N,) int64.
         ess: The same.
         group_size: The same.
-        features: The same.
         robot: The same.
         mates: The same.
         mate_poses: The same.
         mate_sigmas: The same.
         numbers: (12,) float32: `pose`, `pose_std`, `map_stats`. Written to, as all that follow.
-        candidates: (16, 5) float32.
+        candidates: (16, 5) float32, as they are without bounds.
         teammates: (7, 5) float32, zeros before.
         present: (7,) int8, zeros before.
     """
@@ -194,9 +191,9 @@ def _fill(
     numbers[9] = _clip(seen, 0.0, MAP_STATS_LIMIT[3])
     numbers[10] = _clip(ess, 0.0, MAP_STATS_LIMIT[4])
     numbers[11] = _clip(group_size, 0.0, MAP_STATS_LIMIT[5])
-    for i in range(len(features)):
+    for i in range(len(candidates)):
         for j in range(5):
-            candidates[i, j] = _clip(features[i, j], -FAR, FAR)
+            candidates[i, j] = _clip(candidates[i, j], -FAR, FAR)
     c, s = math.cos(pose[2]), math.sin(pose[2])
     for m in range(len(mates)):
         row = mates[m] - (mates[m] > robot)

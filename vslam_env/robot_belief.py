@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass, field, fields
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -161,8 +161,7 @@ class Belief:
         return self.group_map.moved(self.start_from_group)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Glimpse:
+class Glimpse(NamedTuple):
     """The part of a belief that an observation shows, gathered without copies: read it before the next step.
 
     Attributes:
@@ -174,8 +173,8 @@ class Glimpse:
         start_from_group: (3,) float64 [m, m, rad]. Moves the group's map frame to the own start frame.
         outline: Of the confirmed landmarks in the group's frame.
         cells: (300, 300) uint8. Of the seen grid.
-        features: (16, 5) float32 [m], robot frame. Of the candidates.
-        valid: (16,) bool. Which candidates there are.
+        features: (16, 5) float32 [m], robot frame. Of the candidates; the reader's own.
+        valid: (16,) int8. Which candidates there are.
         mates: (m,) int64. The other robots of the group.
         mate_poses: (m, 3) float64 [m, m, rad], start frame.
         mate_sigmas: (m,) float64 [m]. One sigma of their positions, averaged over directions.
@@ -190,7 +189,7 @@ class Glimpse:
     outline: MapOutline
     cells: NDArray[np.uint8]
     features: NDArray[np.float32]
-    valid: BoolArray
+    valid: NDArray[np.int8]
     mates: IntArray
     mate_poses: FloatArray
     mate_sigmas: FloatArray
@@ -208,8 +207,8 @@ class Glimpse:
             start_from_group=belief.start_from_group,
             outline=belief.group_map.outline,
             cells=belief.grid.cells,
-            features=belief.candidates.features,
-            valid=belief.candidates.valid,
+            features=belief.candidates.features.copy(),
+            valid=belief.candidates.valid.astype(np.int8),
             mates=np.array([mate.robot for mate in mates], np.int64),
             mate_poses=np.array([mate.pose for mate in mates]).reshape(-1, 3),
             mate_sigmas=np.array([mate.position_sigma for mate in mates]),

@@ -122,21 +122,20 @@ def _refill(costs: Any, slots: Any, sources: Any, found: Any, visits: Any) -> tu
 
 
 @jit
-def _features(slots: Any, x: float, y: float, theta: float, teammates: Any) -> Any:
-    """Compute `CandidateSlots.features` from the rows of the slots."""
-    features = np.zeros((NUM_SLOTS, 5), np.float32)
-    distances = _distances(slots, teammates)
-    c, s = math.cos(theta), math.sin(theta)
+def _describe(slots: Any, pose: Any, teammates: Any, features: Any, valid: Any) -> None:
+    """Write `CandidateSlots.features` (16, 5) and `valid` (16,) of the rows of the slots."""
+    c, s = math.cos(pose[2]), math.sin(pose[2])
     for i in range(NUM_SLOTS):
-        if np.isnan(slots[i, 0]):
+        valid[i] = not np.isnan(slots[i, 0])
+        if not valid[i]:
+            features[i] = 0.0
             continue
-        u, v = slots[i, 0] - x, slots[i, 1] - y
+        u, v = slots[i, 0] - pose[0], slots[i, 1] - pose[1]
         nearest = NO_TEAMMATE
         for k in range(len(teammates)):
-            nearest = min(nearest, distances[i, k])
+            nearest = min(nearest, np.hypot(slots[i, 0] - teammates[k, 0], slots[i, 1] - teammates[k, 1]))
         features[i, 0], features[i, 1] = c * u + s * v, c * v - s * u
         features[i, 2], features[i, 3], features[i, 4] = slots[i, LENGTH], slots[i, SIZE], nearest
-    return features
 
 
 class CandidateSlots:
@@ -224,9 +223,19 @@ class CandidateSlots:
             size of the frontier, and distance from the goal to the nearest teammate, 60 if there is none. Zeros in
             empty slots.
         """
-        x, y, theta = pose_floats(pose)
-        features: NDArray[np.float32] = _features(self._rows, x, y, theta, positions_array(teammates, "teammates"))
-        return features
+        place = np.array(pose_floats(pose))
+        return self.described(place, positions_array(teammates, "teammates"))[0]
+
+    def described(self, pose: FloatArray, teammates: FloatArray) -> tuple[NDArray[np.float32], NDArray[np.int8]]:
+        """Return `features`, and as (16,) int8 which slots hold a candidate; for arrays that need no checks.
+
+        Args:
+            pose: (3,) float64 [m, m, rad], start frame.
+            teammates: (k, 2 or more) float64 [m], start frame.
+        """
+        features, valid = np.empty((NUM_SLOTS, 5), np.float32), np.empty(NUM_SLOTS, np.int8)
+        _describe(self._rows, pose, teammates, features, valid)
+        return features, valid
 
     def get_state(self) -> dict[str, Any]:
         """Return a copy of all that `set_state` needs to continue bit by bit."""

@@ -1,7 +1,6 @@
 """The landmark sensor: true poses become noisy measurements of the landmarks that each camera sees."""
 
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -114,7 +113,7 @@ class LandmarkSensor:
         num_false = np.minimum(rng.poisson(config.false_points, robots), most)
         keys = rng.random(visible.shape)
         ids, points = np.empty(robots * most, np.int64), np.empty((robots * most, 3))
-        descriptors: NDArray[Any] = np.empty((robots * most, self._descriptors.shape[1]))
+        descriptors = np.empty((robots * most, self._descriptors.shape[1]))
         counts = np.zeros(robots, np.int64)
         total = _choose_and_see(
             visible,
@@ -140,15 +139,15 @@ class LandmarkSensor:
             order = np.lexsort((rng.random(len(ids)), np.repeat(np.arange(robots), counts)))
             ids, points, descriptors = ids[order], points[order], descriptors[order]
         noise = rng.standard_normal((len(ids), 3 + descriptors.shape[1]))
-        sharp = np.empty(len(ids), np.bool_)
-        if _add_noise(points, descriptors, noise, self._stereo, config.descriptor_noise, sharp) < len(ids):
+        sharp, looks = np.empty(len(ids), np.bool_), np.empty(descriptors.shape, np.float32)
+        if _add_noise(points, descriptors, noise, self._stereo, config.descriptor_noise, sharp, looks) < len(ids):
             counts = np.bincount(np.repeat(np.arange(robots), counts)[sharp], minlength=robots)
-            ids, points, descriptors = ids[sharp], points[sharp], descriptors[sharp]
+            ids, points, looks = ids[sharp], points[sharp], looks[sharp]
         frames, begin = [], 0
         for count in counts.tolist():
             end = begin + count
             rows = slice(begin, end)
-            frames.append(Frame(Measurements._trusted(points[rows], descriptors[rows]), ids[rows].copy()))
+            frames.append(Frame(Measurements._trusted(points[rows], looks[rows]), ids[rows].copy()))
             begin = end
         return frames
 
@@ -193,18 +192,20 @@ def _add_noise(
     stereo: FloatArray,
     descriptor_noise: float,
     sharp: BoolArray,
+    looks: NDArray[np.float32],
 ) -> int:
-    """Replace true points and descriptors, in place, by measured ones.
+    """Replace true points, in place, by measured ones, and write measured descriptors.
 
     Points are projected, their image coordinates and disparities disturbed, and triangulated again.
 
     Args:
         points: (n, 3) float64 [m], camera frame.
-        descriptors: (n, d) float64, unit vectors.
+        descriptors: (n, d) float64, unit vectors, true; they are disturbed in place.
         noise: (n, 3 + d) float64, standard normal.
         stereo: (4,) float64. Focal length [px], baseline [m], sigmas of image coordinates and disparity [px].
         descriptor_noise: Root mean square length of the noise of a descriptor.
         sharp: (n,) bool. Written to: false where the disparity vanishes in the noise: no matcher reports such a point.
+        looks: (n, d) float32, unit vectors. Written to: the measured descriptors.
 
     Returns:
         How many are sharp.
@@ -228,7 +229,7 @@ def _add_noise(
             square += descriptors[i, j] ** 2
         length = np.sqrt(square)
         for j in range(size):
-            descriptors[i, j] /= length
+            looks[i, j] = descriptors[i, j] / length
     return count
 
 
