@@ -168,6 +168,8 @@ class TeamReport:
         entries: All that happened to maps in this step, in order, replays and `created` included: whoever keeps books
             on landmarks goes by these.
         oldest_step: Steps from this one on may still be taken in again; 1 + `step` if none.
+        rejuvenations: For each filter of which something is to be told the robots that go by it, and what came of
+            drawing its particles anew in this step, or what its smoother could not make sense of.
     """
 
     step: int
@@ -179,3 +181,4 @@ class TeamReport:
     maps: tuple[int, ...]
     entries: tuple[MapEntry, ...]
     oldest_step: int
+    rejuvenations: tuple[tuple[tuple[int, ...], RejuvenationReport], ...] = ()

@@ -32,7 +32,7 @@ from slam_backend.measurements import Measurements
 from slam_backend.merge_options import MergeOptions
 from slam_backend.merging import inverse_alignment
 from slam_backend.records import Records
-from slam_backend.reports import MapDropped, MergeEvent, Renaming, TeamReport
+from slam_backend.reports import MapDropped, MergeEvent, RejuvenationReport, Renaming, TeamReport
 from slam_backend.team_knowledge import TeamKnowledge
 
 
@@ -133,10 +133,13 @@ class TeamSlam(TeamKnowledge):
         self._places = []
         associations: list[IntArray] = [np.empty(0, np.int64)] * self._num_robots
         created = list(associations)
+        rejuvenations: list[tuple[tuple[int, ...], RejuvenationReport]] = []
         for group in self._groups:
             for branch in group.branches:
                 self._advance(branch, inputs)
                 if branch.report is not None:
+                    if branch.report.rejuvenation is not None:
+                        rejuvenations.append((branch.live, branch.report.rejuvenation))
                     for index, robot in enumerate(branch.robots):
                         if robot in branch.live:
                             associations[robot] = branch.report.associations[index]
@@ -154,6 +157,7 @@ class TeamSlam(TeamKnowledge):
             maps=self.maps,
             entries=(*records.entries, *self._dropped()),
             oldest_step=oldest,
+            rejuvenations=tuple(rejuvenations),
         )
         records.entries.clear()
         self._step += 1

@@ -280,8 +280,9 @@ def _part(
         if log.kinds[t] == EXACT:
             raise bad_argument("logs", "odometry", "a pose that was given as exact", "There is nothing to smooth.")
         if log.kinds[t] == ODOMETRY:
-            chain, noise = chained(chain, noise, log.motions[t], np.diag(motion.sigmas(log.motions[t]) ** 2))
-            pose = compose(pose, log.motions[t])
+            step, step_noise = log.motions[t], np.diag(motion.sigmas(log.motions[t]) ** 2)
+            chain, noise = chained(chain, noise, step, step_noise) if moved else (step, step_noise)
+            pose = compose(pose, step)
             moved = True
         pose = guesses.get(int(log.steps[t]), pose)
         taken = log.starts[t] + np.flatnonzero(log.ids[log.starts[t] : log.starts[t + 1]] != REJECTED)

@@ -24,13 +24,6 @@ def build(simulation, every=20, slice_keys=None):
     )  # fmt: skip
 
 
-def rejuvenations(team):
-    """Return the last step's reports of the filters of all groups, with the number of their robots."""
-    branches = [branch for group in team._groups for branch in group.branches]
-    reports = [(len(b.robots), b.report.rejuvenation) for b in branches if b.report is not None]
-    return [(robots, report) for robots, report in reports if report is not None]
-
-
 @pytest.mark.parametrize("slice_keys", [None, 24])
 def test_a_merged_team_is_rejuvenated_and_knows_where_it_started(slice_keys):
     """Soon after a merge the joint filter is smoothed, at once or in slices; the other starts are then known."""
@@ -38,8 +31,8 @@ def test_a_merged_team_is_rejuvenated_and_knows_where_it_started(slice_keys):
     team = build(simulation, slice_keys=slice_keys)
     joint = []
     for _ in range(100):
-        team.step(*simulation.read())
-        joint += [report.reason for robots, report in rejuvenations(team) if robots == 3]
+        told = team.step(*simulation.read()).rejuvenations
+        joint += [report.reason for robots, report in told if robots == (0, 1, 2)]
     assert team.groups == ((0, 1, 2),)
     assert len(joint) >= 1
     assert set(joint) == {""}
