@@ -1,4 +1,4 @@
-"""The commands `vslam bench ...`: how good, and how fast, the filter is."""
+"""The command `vslam bench accuracy`, and the group `vslam bench`."""
 
 from typing import Annotated, Any
 
@@ -8,7 +8,7 @@ from training.command_folder import begin, choose, finish
 from training.command_options import Check, Config, FirstSeed, Json, OutToGoOn, Processes, numbers, words
 from training.command_progress import KeptPart, play_kept
 
-bench = typer.Typer(help="Measure the backend.", no_args_is_help=True)
+bench = typer.Typer(help="Measure how good and how fast filters, environments and trainings are.", no_args_is_help=True)
 
 
 @bench.command("accuracy")

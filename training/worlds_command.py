@@ -10,8 +10,8 @@ from rich.console import Console
 worlds = typer.Typer(help="List, preview, check and import worlds.", no_args_is_help=True)
 
 Source = Annotated[str, typer.Argument(help="A family, or the path of a floor plan, ROS map, .json file or folder.")]
-FirstSeed = Annotated[int, typer.Option(help="First world seed.")]
-Count = Annotated[int, typer.Option(help="How many seeds.")]
+FirstSeed = Annotated[int, typer.Option(help="The first world seed.")]
+Seeds = Annotated[int, typer.Option(help="How many world seeds.")]
 Robots = Annotated[int, typer.Option(help="How many robots start.")]
 
 
@@ -50,8 +50,8 @@ def list_worlds(
 def preview(
     world: Source,
     out: Annotated[Path, typer.Option(help="PNG file to write.")] = Path("worlds.png"),
-    seed: FirstSeed = 0,
-    count: Count = 4,
+    first_seed: FirstSeed = 0,
+    seeds: Seeds = 4,
     robots: Robots = 3,
 ) -> None:
     """Draw worlds of some seeds, with landmarks and start poses, into one picture."""
@@ -63,7 +63,7 @@ def preview(
 
     check_writable(out, "out")
     with compilation_shown(Console(stderr=True)):
-        picture = contact_sheet(world, seed, count, robots)
+        picture = contact_sheet(world, first_seed, seeds, robots)
     imageio.imwrite(out, picture)
     Console().print(f"Picture: {out}", soft_wrap=True, highlight=False)
 
@@ -71,8 +71,8 @@ def preview(
 @worlds.command("validate")
 def validate(
     world: Source,
-    seed: FirstSeed = 0,
-    count: Count = 20,
+    first_seed: FirstSeed = 0,
+    seeds: Seeds = 20,
     robots: Robots = 3,
 ) -> None:
     """Build worlds of some seeds and start robots in them; a world in which that fails ends with exit status 2."""
@@ -81,9 +81,9 @@ def validate(
     from slam_backend.errors import check_int
     from training.worlds_survey import survey
 
-    check_int("count", count, 1, "Check one world or more.")
-    found = [survey(world, each, robots) for each in range(seed, seed + count)]
-    table = Table("figure", "least", "most", title=f"{found[0].name}: {count} of {count} worlds are sound")
+    check_int("seeds", seeds, 1, "Check one world or more.")
+    found = [survey(world, seed, robots) for seed in range(first_seed, first_seed + seeds)]
+    table = Table("figure", "least", "most", title=f"{found[0].name}: {seeds} of {seeds} worlds are sound")
     for title, values in (
         ("walls", [float(each.walls) for each in found]),
         ("landmarks that can be seen", [float(each.landmarks) for each in found]),

@@ -70,8 +70,8 @@ def contact_sheet(world: str, first_seed: int, count: int, robots: int) -> NDArr
     Raises:
         ValueError: If an argument is bad or a world cannot be built.
     """
-    check_int("count", count, 1, "Draw one world or more.")
-    check_int("seed", first_seed, 0, "Use 0 or a positive number.")
+    check_int("seeds", count, 1, "Draw one world or more.")
+    check_int("first_seed", first_seed, 0, "Use 0 or a positive number.")
     env = vslam_v0.parallel_env(world=world, num_robots=robots)
     tiles: list[Any] = []
     for seed in range(first_seed, first_seed + count):

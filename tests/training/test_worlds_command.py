@@ -38,7 +38,7 @@ def test_preview_draws_one_tile_a_seed(tmp_path: Path) -> None:
     assert (sheet[480:, 640:] == 255).all()
     assert sheet[:480, :640].std() > 5.0
     out = tmp_path / "worlds.png"
-    result = runner.invoke(app, ["worlds", "preview", "fig5", "--seed", "3", "--count", "3", "--robots", "2",
+    result = runner.invoke(app, ["worlds", "preview", "fig5", "--first-seed", "3", "--seeds", "3", "--robots", "2",
                                  "--out", str(out)])  # fmt: skip
     assert result.exit_code == 0
     np.testing.assert_array_equal(cv2.imread(str(out))[:, :, ::-1], sheet)
@@ -55,7 +55,7 @@ def test_import_and_validate(tmp_path: Path) -> None:
     found = survey(str(out), 0, 2)
     assert found.start_gap_m >= 5.0
     assert found.floor_m2 == pytest.approx(16.0 * 12.0, rel=0.05)
-    result = runner.invoke(app, ["worlds", "validate", str(out), "--count", "2", "--robots", "2"])
+    result = runner.invoke(app, ["worlds", "validate", str(out), "--seeds", "2", "--robots", "2"])
     assert result.exit_code == 0
     assert "2 of 2 worlds are sound" in result.output
 
@@ -65,7 +65,7 @@ def test_import_and_validate(tmp_path: Path) -> None:
     [
         (["validate", "castle"], "world: expected one of 'office'"),
         (["validate", "fig5", "--robots", "40"], "num_robots"),
-        (["validate", "fig5", "--count", "0"], "count: expected an int >= 1"),
+        (["validate", "fig5", "--seeds", "0"], "seeds: expected an int >= 1"),
         (["list", "--seeds", "0"], "seeds: expected an int >= 1"),
         (["import", "PLAN", "plan.txt"], "out: expected a name that ends in .json"),
         (["import", "gone.png", "plan.json"], "world: expected a file"),
