@@ -12,6 +12,8 @@ from slam_backend.landmark_map import LandmarkMap, MapOutline
 from slam_backend.records import Records
 from slam_backend.reports import MergeEvent, PoseEstimate
 
+FROM_ORIGIN = inverse(np.zeros(3))  # what `start_from_group` is where the start frame is the map frame
+
 
 class Standpoint(NamedTuple):
     """What a robot goes by, as the methods of `TeamKnowledge` tell it one by one.
@@ -175,7 +177,9 @@ class TeamKnowledge:
         branch, index = self._find(robot)
         own_pose, start = branch.filter._seen_from_start(index)
         pose = branch.filter.pose(index)
-        return Standpoint(branch.robots, branch.live, branch.number, pose, own_pose, inverse(start))
+        # Most often the robot's start frame is the map frame.
+        start_from_group = inverse(start) if any(start.tolist()) else FROM_ORIGIN.copy()
+        return Standpoint(branch.robots, branch.live, branch.number, pose, own_pose, start_from_group)
 
     def _group_of(self, robot: int) -> Group:
         return self._place(robot)[0]

@@ -110,7 +110,8 @@ class Episode:
         self._simulator.step(commands)
         after = self._simulator.poses
         self.tick += 1
-        self._distances += np.hypot(*(after - before)[:, :2].T)
+        way = after - before
+        self._distances += np.hypot(way[:, 0], way[:, 1])
         self._collisions += self._simulator.bumped
         noise, stream = self._config.odometry, self._streams["odometry"]
         self._perceive(read_odometry(before, after, self.setting.bias, noise, stream))

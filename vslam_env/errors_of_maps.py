@@ -88,7 +88,7 @@ class ClaimLedger:
         self._claim_of = np.where(countable, np.cumsum(countable) - 1, UNCOUNTED)
         self._claims: dict[int, IntArray] = {number: np.empty(0, np.int64) for number in range(num_robots)}
         self._map_of = list(range(num_robots))
-        self._seen: dict[tuple[int, int], IntArray] = {}  # (step, robot): claims of what it measured then
+        self._seen: dict[tuple[int, int], IntArray] = {}  # (step, robot): true ids of what it measured then
 
     def record(self, report: TeamReport, true_ids: Sequence[IntArray]) -> None:
         """Enter all that a step did to maps.
@@ -98,12 +98,11 @@ class ClaimLedger:
             true_ids: Per robot (n_i,) int64. The landmark behind each measurement; -1 for a false point.
         """
         for robot, ids in enumerate(true_ids):
-            if len(ids):
-                self._seen[report.step, robot] = self._claims_from(ids)
+            self._seen[report.step, robot] = ids
         for entry in report.entries:
             if isinstance(entry, LandmarksCreated):
                 new = entry.ids >= 0
-                self._enter(entry.number, entry.ids[new], self._seen[entry.step, entry.robot][new])
+                self._enter(entry.number, entry.ids[new], self._claims_from(self._seen[entry.step, entry.robot][new]))
             elif isinstance(entry, MapCopied):
                 self._claims[entry.copy] = self._claims[entry.source].copy()
             elif isinstance(entry, MapDropped):
@@ -111,7 +110,10 @@ class ClaimLedger:
             elif isinstance(entry, Renaming):
                 self.rename(entry)
         self._map_of = list(report.maps)
-        self._seen = {key: claims for key, claims in self._seen.items() if key[0] >= report.oldest_step}
+        if report.oldest_step > report.step:
+            self._seen.clear()
+        else:
+            self._seen = {key: ids for key, ids in self._seen.items() if key[0] >= report.oldest_step}
 
     def rename(self, renaming: Renaming) -> None:
         """Join the books of two groups: landmarks of a keep their claims, those of b bring theirs.
