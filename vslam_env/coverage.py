@@ -13,7 +13,9 @@ from vslam_env.navigation import FREE, GRID_SIZE, SeenGrid, cell_of
 
 
 @jit
-def _recount(changes: Any, cells: Any, places: Any, floor: Any, seen: Any, seers: Any) -> int:
+def _recount(
+    changes: Any, cells: Any, places: Any, floor: Any, seen: Any, seers: Any, ever: Any, fresh: Any
+) -> int:
     """Bring up to date what one robot sees of the floor.
 
     Args:
@@ -23,6 +25,8 @@ def _recount(changes: Any, cells: Any, places: Any, floor: Any, seen: Any, seers
         floor: (n,) int32. These floor cells.
         seen: (n,) bool. Whether the robot saw them; changed.
         seers: (N,) int64. How many robots see each floor cell; changed.
+        ever: (N,) bool. Floor cells that are known to have been found.
+        fresh: (1 + N,) int32. How many others have come to be seen, then which; -1: any of them. Added to.
 
     Returns:
         How many more floor cells are seen by some robot than before.
@@ -40,9 +44,13 @@ def _recount(changes: Any, cells: Any, places: Any, floor: Any, seen: Any, seers
             if now != seen[i]:
                 seen[i] = now
                 seers[floor[i]] += 1 if now else -1
-                if now:
-                    more += seers[floor[i]] == 1
-                else:
+                if now and seers[floor[i]] == 1:
+                    more += 1
+                    if not ever[floor[i]] and fresh[0] >= 0:
+                        fresh[0] = fresh[0] + 1 if fresh[0] < len(ever) else -1
+                        if fresh[0] > 0:
+                            fresh[fresh[0]] = floor[i]
+                elif not now:
                     more -= seers[floor[i]] == 0
     return more
 
@@ -79,6 +87,7 @@ class Coverage:
         self._covered = 0
         self._began = False
         self._ever = np.zeros(meter.count, np.bool_)
+        self._fresh = np.zeros(1 + meter.count, np.int32)
         self._found = np.zeros(len(meter.places), np.int64)
 
     def share(self, grids: Sequence[SeenGrid]) -> float:
@@ -87,7 +96,9 @@ class Coverage:
             changes = grid.take_changes()
             if not self._began:
                 changes[0] = -1
-            self._covered += _recount(changes, grid.cells.ravel(), places, floor, seen, self._seers)
+            self._covered += _recount(
+                changes, grid.cells.ravel(), places, floor, seen, self._seers, self._ever, self._fresh
+            )
         self._began = True
         return self._covered / max(self._meter.count, 1)
 
@@ -100,8 +111,11 @@ class Coverage:
         Args:
             positions: (K, 2) float64 [m], world frame. True positions of the robots.
         """
-        fresh = np.flatnonzero((self._seers > 0) & ~self._ever)
-        if len(fresh):
+        count = int(self._fresh[0])
+        if count:
+            fresh = np.arange(self._meter.count) if count < 0 else np.unique(self._fresh[1 : 1 + count])
+            fresh = fresh[(self._seers[fresh] > 0) & ~self._ever[fresh]]
+            self._fresh[0] = 0
             self._ever[fresh] = True
             gaps = ((self._meter.cells[fresh, None] - positions) ** 2).sum(axis=-1)
             self._found += np.bincount(gaps.argmin(axis=1), minlength=len(positions))
@@ -114,6 +128,7 @@ class Coverage:
     def set_state(self, state: Mapping[str, Any]) -> None:
         """Go on with what `get_state` returned; the grids are asked for their changes as ever."""
         self._ever, self._found = state["ever"].copy(), state["found"].copy()
+        self._fresh[0] = -1
 
 
 def _flat_cells(points: FloatArray) -> tuple[NDArray[np.int32], NDArray[np.int32]]:

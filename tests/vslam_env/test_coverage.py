@@ -29,6 +29,28 @@ def test_floor_is_found_once_by_the_nearest() -> None:
     np.testing.assert_allclose(_looked(coverage, grids, robot=0, x=5.0), [first[0], first[0]], rtol=0.2)
 
 
+def test_finds_are_those_of_a_plain_count() -> None:
+    """However grids change, each cell counts once for the nearest robot, as a look at all cells every time says."""
+    rng = np.random.default_rng(2)
+    starts = rng.uniform(0.0, 6.0, (3, 3))
+    coverage, grids = Coverage(CoverageMeter(SQUARES, starts)), [SeenGrid() for _ in starts]
+    ever, found, angles = np.zeros(len(SQUARES), np.bool_), np.zeros(3), np.linspace(-0.6, 0.6, 32)
+    for turn in range(60):
+        for grid in grids:
+            pose = np.append(rng.uniform(-3.0, 3.0, 2), rng.uniform(-3.0, 3.0))
+            grid.paint_reading(pose, rng.uniform(0.5, 3.0, 32), angles, 8.0, 0.2, False)
+        if turn == 30:
+            coverage.set_state(coverage.get_state())
+        positions = rng.uniform(0.0, 8.0, (3, 2))
+        coverage.share(grids)
+        fresh = (coverage._seers > 0) & ~ever
+        nearest = np.hypot(*np.moveaxis(SQUARES[:, None] - positions, -1, 0)).argmin(axis=1)
+        found += np.bincount(nearest[fresh], minlength=3) / len(SQUARES)
+        ever |= fresh
+        np.testing.assert_allclose(coverage.found(positions), found)
+    assert ever.mean() > 0.5
+
+
 def test_parts_sum_up_and_snapshots_keep_them() -> None:
     """Own coverage is never negative, sums over the robots to all that was covered, and goes on after a restore."""
     weights = {"own_coverage": 1.0, "coverage": 1.0}
