@@ -58,6 +58,25 @@ def _inverse(a: FloatArray, out: FloatArray) -> float:
 
 
 @jit
+def invert(matrices: FloatArray, out: FloatArray) -> bool:
+    """Write the inverses of symmetric matrices (n, 3, 3); return whether all of these are positive definite."""
+    upper, inverse = np.empty(6), np.empty(6)
+    for n in range(len(matrices)):
+        a = matrices[n]
+        upper[0], upper[1], upper[2], upper[3], upper[4], upper[5] = (
+            a[0, 0], a[0, 1], a[0, 2], a[1, 1], a[1, 2], a[2, 2],
+        )  # fmt: skip
+        minor = upper[0] * upper[3] - upper[1] * upper[1]
+        if not (upper[0] > 0.0 and minor > 0.0 and _inverse(upper, inverse) > 0.0):
+            return False
+        b = out[n]
+        b[0, 0], b[1, 1], b[2, 2] = inverse[0], inverse[3], inverse[5]
+        b[0, 1], b[0, 2], b[1, 2] = inverse[1], inverse[2], inverse[4]
+        b[1, 0], b[2, 0], b[2, 1] = inverse[1], inverse[2], inverse[4]
+    return True
+
+
+@jit
 def linearise(
     point: FloatArray, noise: FloatArray, given: bool, camera: FloatArray, e: FloatArray, y: FloatArray,
     info: FloatArray,

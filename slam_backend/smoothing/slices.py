@@ -19,6 +19,7 @@ from slam_backend.smoothing.options import SmoothingOptions
 from slam_backend.smoothing.rejuvenation import Looks, Rejuvenation, drawn, settled
 from slam_backend.smoothing.solving import Mode, find_mode
 
+NEAR = 10.0  # times the tolerance: between draws a descent may end so much sooner
 LAST_STEPS = 3  # of Gauss and Newton in the slice that draws: the graph was at its mode but for the last few keys
 
 
@@ -62,7 +63,8 @@ class Smoother:
 
     def descend(self, draft: Draft) -> PathGraph | Draft | str:
         """Do one step; return the graph if that ended the descent, how it now stands if not, or what is wrong."""
-        mode = find_mode(draft.graph, self.camera, self.options, 1, draft.damping)
+        near = replace(self.options, tolerance=NEAR * self.options.tolerance)
+        mode = find_mode(draft.graph, self.camera, near, 1, draft.damping)
         return self._after(draft, mode)
 
     def draw(

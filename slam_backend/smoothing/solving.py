@@ -83,9 +83,9 @@ def find_mode(
     if not size:
         return given_up("no pose to seek")
     noises = graph.noises[sought]
-    if not (np.linalg.eigvalsh(noises)[:, 0] > 0.0).all():
+    if not _kernels.invert(noises, of_sought := np.empty_like(noises)):
         return given_up("odometry without noise")
-    informations[sought] = np.linalg.inv(noises)
+    informations[sought] = of_sought
     system = _System(graph, columns, size, informations, sightings, camera, options)
     cost = system.form(poses, landmarks)
     for iteration in range(1, most + 1):

@@ -12,6 +12,7 @@ from small_problems import (
 from slam_backend.camera import StereoCamera
 from slam_backend.motion import OdometryModel
 from slam_backend.run_log import RobotLog
+from slam_backend.smoothing._kernels import invert
 from slam_backend.smoothing.graph import PathGraph, extended
 from slam_backend.smoothing.options import SmoothingOptions
 from slam_backend.smoothing.solving import find_mode
@@ -145,6 +146,19 @@ def test_a_robot_that_has_not_moved_has_no_pose_to_seek():
     """A start is given: with it alone there is nothing to smooth, and the mode says so."""
     mode = find_mode(PathGraph.at_starts(np.zeros((2, 3))), camera_of(small_run()), TIGHT)
     assert mode.reason == "no pose to seek"
+
+
+def test_small_matrices_are_inverted_as_by_lapack():
+    """The kernel's inverses of 3 x 3 covariances are numpy's; one that is not positive definite is told."""
+    rng = np.random.default_rng(5)
+    roots = rng.normal(size=(50, 3, 3)) * [1e-3, 1e-2, 1.0]
+    matrices = roots @ roots.transpose(0, 2, 1) + 1e-4 * np.eye(3)
+    found = np.empty_like(matrices)
+    assert invert(matrices, found)
+    np.testing.assert_allclose(found, np.linalg.inv(matrices), rtol=1e-7, atol=1e-7)
+    for bad in (np.zeros((3, 3)), np.diag([1.0, -1.0, -1.0]), np.diag([-1.0, 1.0, 1.0])):
+        matrices[7] = bad
+        assert not invert(matrices, found)
 
 
 def test_odometry_without_noise_is_refused_with_a_reason():
