@@ -17,7 +17,7 @@ from training.paper_regimes import REGIMES
 from vslam_env.rendering.palette import robot_colour
 
 MARKERS = ("o", "s", "^")  # of one, two and three robots, as in the paper
-STYLES = {"fastslam1": "-", "fastslam2": "--"}
+STYLES = {"fastslam1": "-", "fastslam2": "--", "fastslam2+rejuvenation": ":"}
 Lines = Sequence[Mapping[str, Any]]
 
 

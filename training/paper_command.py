@@ -45,10 +45,10 @@ def fig6(
     """Fig. 6: time of a step, and map error, of one to three robots that share B measurements.
 
     The filter is the paper's (`fastslam1`, unknown association, resampling at random at every step), the noise large
-    against the odometry; beside it look-alikes with false points, and good stereo with both proposals, for
-    M = 10, 100, 1000. Map errors come from --processes at a time, times from one alone. The paper's claims are asked
-    of the data. Ctrl-C finishes the trial under way and sums up what there is; the same command with --out FOLDER
-    goes on from there.
+    against the odometry; beside it look-alikes with false points, and good stereo with both proposals and with
+    rejuvenation, for M = 10, 100, 1000. Map errors come from --processes at a time, times from one alone. The paper's
+    claims are asked of the data. Ctrl-C finishes the trial under way and sums up what there is; the same command with
+    --out FOLDER goes on from there.
     """
     from slam_backend.errors import check_int
     from training.figures_fig6 import draw_fig6

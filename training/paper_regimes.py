@@ -3,15 +3,18 @@
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from training.accuracy_trials import REJUVENATE_EVERY
 from training.stereo_runs import RunSpec
 
-Proposal = Literal["fastslam1", "fastslam2"]
+Proposal = Literal["fastslam1", "fastslam2", "fastslam2+rejuvenation"]
 
 FEW = (10, 100, 1000)  # particles, beside the paper's eleven numbers
-# Algorithm 1, l. 10: drawn at random in proportion to the weights, at every step. fastslam2 keeps the defaults.
+# Algorithm 1, l. 10: drawn at random in proportion to the weights, at every step. fastslam2 keeps the defaults, and
+# "+rejuvenation" draws all particles anew from smoothed paths every so many steps.
 FILTER_OPTIONS: dict[Proposal, dict[str, Any]] = {
     "fastslam1": {"resample_threshold": 1.0, "resampling": "multinomial"},
     "fastslam2": {},
+    "fastslam2+rejuvenation": {"rejuvenate_every": REJUVENATE_EVERY},
 }
 
 
@@ -52,6 +55,7 @@ REGIMES = {
         few=True,
     ),
     "good": Regime(
-        title="good stereo", preset="good", looks=DISTINCT, proposals=("fastslam1", "fastslam2"), few=True
+        title="good stereo", preset="good", looks=DISTINCT,
+        proposals=("fastslam1", "fastslam2", "fastslam2+rejuvenation"), few=True,
     ),
 }  # fmt: skip

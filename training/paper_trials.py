@@ -160,7 +160,8 @@ def _measured(run: StereoRun) -> FloatArray:
 
 def _build(run: StereoRun, proposal: Proposal, particles: int, seed: int) -> FastSlam:
     """Return a filter of this figure."""
-    return run.build_filter(particles, proposal, seed=seed, **FILTER_OPTIONS[proposal])
+    options = FILTER_OPTIONS[proposal]
+    return run.build_filter(particles, "fastslam1" if proposal == "fastslam1" else "fastslam2", seed=seed, **options)
 
 
 @lru_cache(maxsize=3)
