@@ -55,6 +55,31 @@ def _recount(
     return more
 
 
+@jit
+def _find(fresh: Any, seers: Any, cells: Any, positions: Any, ever: Any, found: Any) -> None:
+    """Count floor cells that are seen for the first time for the robot nearest to them.
+
+    Args:
+        fresh: (1 + N,) int32. Which may be, as `_recount` leaves them; none afterwards.
+        seers: (N,) int64. How many robots see each floor cell.
+        cells: (N, 2) float64 [m], world frame.
+        positions: (K, 2) float64 [m], world frame.
+        ever: (N,) bool. Cells that were found before; changed.
+        found: (K,) int64. How many each robot has found; changed.
+    """
+    for k in range(len(ever) if fresh[0] < 0 else fresh[0]):
+        i = k if fresh[0] < 0 else fresh[1 + k]
+        if seers[i] > 0 and not ever[i]:
+            ever[i] = True
+            nearest, least = 0, np.inf
+            for robot in range(len(positions)):
+                gap = (cells[i, 0] - positions[robot, 0]) ** 2 + (cells[i, 1] - positions[robot, 1]) ** 2
+                if gap < least:
+                    nearest, least = robot, gap
+            found[nearest] += 1
+    fresh[0] = 0
+
+
 class CoverageMeter:
     """Where the cells of the free floor lie in each robot's grid, laid at its true start pose; it never changes.
 
@@ -68,7 +93,7 @@ class CoverageMeter:
             _flat_cells(transform_points(inverse(start), free_area_cells)) for start in np.asarray(true_starts)
         )
         self.count = len(free_area_cells)
-        self.cells = free_area_cells
+        self.cells = np.ascontiguousarray(free_area_cells)
 
 
 class Coverage:
@@ -109,16 +134,9 @@ class Coverage:
         the coverage unless floor has been lost again.
 
         Args:
-            positions: (K, 2) float64 [m], world frame. True positions of the robots.
+            positions: (K, 2 or 3) float64 [m], world frame. True positions of the robots.
         """
-        count = int(self._fresh[0])
-        if count:
-            fresh = np.arange(self._meter.count) if count < 0 else np.unique(self._fresh[1 : 1 + count])
-            fresh = fresh[(self._seers[fresh] > 0) & ~self._ever[fresh]]
-            self._fresh[0] = 0
-            self._ever[fresh] = True
-            gaps = ((self._meter.cells[fresh, None] - positions) ** 2).sum(axis=-1)
-            self._found += np.bincount(gaps.argmin(axis=1), minlength=len(positions))
+        _find(self._fresh, self._seers, self._meter.cells, positions, self._ever, self._found)
         return self._found / max(self._meter.count, 1)
 
     def get_state(self) -> dict[str, Any]:

@@ -141,7 +141,7 @@ class Episode:
             pose_errors=pose_errors[:, 0],
             pose_sigmas=self.belief.position_sigmas,
             coverage=self._coverage.share(self.belief.grids),
-            found=self._coverage.found(self._simulator.poses[:, :2]),
+            found=self._coverage.found(self._simulator.poses),
             collisions=self._collisions.copy(),
             distances=self._distances.copy(),
             bytes_sent=self.belief.bytes_sent,
