@@ -2,7 +2,6 @@
 
 import io
 import json
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ import pytest
 from rich.console import Console
 
 from slam_backend.geometry import compose, transform_points
-from training import accuracy_trials, cli
+from training import accuracy_trials
 from training.accuracy_summary import FIGURES, GOALS, check_goals, describe, interval, summarise
 from training.accuracy_tables import markdown, print_tables
 from training.accuracy_trials import FALSE_POINT, Answer, Trial, play, score
@@ -267,19 +266,15 @@ def test_tables_and_figure(tmp_path: Path, rows: list[dict[str, Any]]) -> None:
     assert (tmp_path / "accuracy.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_the_command_from_end_to_end(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_the_command_from_end_to_end(vslam: Any, tmp_path: Path) -> None:
     """The command prints its tables, writes JSON, Markdown and figure, and goes on where it is called again."""
     out = tmp_path / "bench"
-    arguments = ["vslam", "bench", "accuracy", "--seeds", "1", "--first-seed", "40", "--length", "3,5", "--methods"]
+    arguments = ["bench", "accuracy", "--seeds", "1", "--first-seed", "40", "--length", "3,5", "--methods"]
     arguments += ["dead_reckoning,fastslam2", "--particles", "7", "--out", str(out), "--json", str(out / "copy.json")]
-    monkeypatch.setattr(sys, "argv", arguments)
     for _ in range(2):
-        with pytest.raises(SystemExit) as end:
-            cli.main()
-        assert not end.value.code
-    assert "fastslam2, 7" in capsys.readouterr().out
+        said = vslam(*arguments)
+        assert said.status == 0
+        assert "fastslam2, 7" in said.out
     content = json.loads((out / "copy.json").read_text())
     assert [line["length"] for line in content["summary"]] == [3.0, 3.0, 5.0, 5.0]
     assert len(content["trials"]) == len((out / TRIALS_FILE).read_text().splitlines()) == 4
@@ -304,14 +299,6 @@ def test_the_command_from_end_to_end(
         (("--config", "/nowhere"), "config: expected the config.toml of an earlier run, got no such file."),
     ],
 )
-def test_bad_options_are_one_line_and_status_2(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], message: str
-) -> None:
+def test_bad_options_are_one_line_and_status_2(refusal: Any, arguments: tuple[str, ...], message: str) -> None:
     """Argument, what was expected, what came and the cure on one line of stderr; no folder is made."""
-    monkeypatch.setattr(sys, "argv", ["vslam", "bench", "accuracy", *arguments])
-    with pytest.raises(SystemExit) as end:
-        cli.main()
-    assert end.value.code == 2
-    shown = capsys.readouterr()
-    assert shown.err.startswith(f"error {message}")
-    assert shown.err.count("\n") == 1
+    assert refusal("bench", "accuracy", *arguments).startswith(f"error {message}")

@@ -1,5 +1,4 @@
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +7,6 @@ import pytest
 
 from slam_backend.alignment import AlignmentOptions, align_maps, candidate_matches
 from slam_backend.geometry import transform_points
-from training import cli
 from training.alignment_pairs import (
     IDENTIFIABLE,
     LANDMARKS,
@@ -22,14 +20,6 @@ from training.alignment_pairs import (
 from training.alignment_summary import check_goals, summarise
 from training.alignment_trials import Trial, play
 from training.bench_alignment import COMMAND, GRID, AlignmentBenchConfig
-
-
-def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
-    """Run the command line; return its exit status."""
-    monkeypatch.setattr(sys, "argv", ["vslam", "bench", "alignment", *arguments])
-    with pytest.raises(SystemExit) as end:
-        cli.main()
-    return int(end.value.code or 0)
 
 
 @pytest.mark.parametrize(("overlap", "outliers"), GRID)
@@ -172,14 +162,13 @@ def test_bad_configs_are_refused(changed: dict[str, Any], message: str) -> None:
         AlignmentBenchConfig.from_mapping(changed)
 
 
-def test_the_command_leaves_tables_a_figure_and_every_trial(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_the_command_leaves_tables_a_figure_and_every_trial(vslam: Any, tmp_path: Path) -> None:
     """A small bench ends with its goals; begun again in the same folder, nothing is run twice."""
     out, copy = tmp_path / "bench", tmp_path / "copy.json"
     options = ("--methods", "ransac,gnc", "--seeds", "1", "--hard", "9", "--first-seed", "100", "--out", str(out))
-    assert run(monkeypatch, *options, "--json", str(copy)) == 0
-    assert "I: share accepted" in capsys.readouterr().out
+    said = vslam("bench", "alignment", *options, "--json", str(copy))
+    assert said.status == 0
+    assert "I: share accepted" in said.out
     metrics = json.loads((out / "metrics.json").read_text())
     assert metrics == json.loads(copy.read_text())
     assert metrics["goals_of"] == "ransac"
@@ -187,8 +176,8 @@ def test_the_command_leaves_tables_a_figure_and_every_trial(
     assert "| 10 % | 90 % | ransac | 100.0 |" in (out / "tables.md").read_text()
     trials = (out / "trials.jsonl").read_text()
     assert len(trials.splitlines()) == 2 * (len(GRID) + 18)
-    assert run(monkeypatch, *options) == 0
+    assert vslam("bench", "alignment", *options).status == 0
     assert (out / "trials.jsonl").read_text() == trials
     poor = ("--methods", "svd", "--seeds", "1", "--hard", "0", "--check", "--out", str(tmp_path / "b"))
-    assert run(monkeypatch, *poor) == 1
+    assert vslam("bench", "alignment", *poor).status == 1
     assert COMMAND in (out / "config.toml").read_text()

@@ -1,6 +1,5 @@
 import gc
 import json
-import sys
 import tomllib
 from dataclasses import replace
 from io import StringIO
@@ -11,7 +10,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from training import cli, compile_timing
+from training import compile_timing
 from training.bench_filter import BenchConfig, BenchResult, count_trials, run_bench
 from training.filter_bounds import arithmetic_bound_ms, bytes_moved, copy_bound_ms, map_bytes
 from training.filter_goals import goals_of
@@ -22,13 +21,6 @@ from training.machine_rates import copy_rate, multiply_add_rate, processor
 from training.step_timing import Timing, time_calls
 
 TINY = ("--particles", "5,9", "--landmarks", "40", "--measurements", "3", "--robots", "1,2", "--steps", "4")
-
-
-def _run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
-    monkeypatch.setattr(sys, "argv", ["vslam", "bench", "filter", *arguments])
-    with pytest.raises(SystemExit) as end:
-        cli.main()
-    return int(end.value.code or 0)
 
 
 def _result(milliseconds: Any, loads: list[FilterLoad], plain: tuple[PlainRow, ...] = ()) -> BenchResult:
@@ -48,13 +40,11 @@ def _result(milliseconds: Any, loads: list[FilterLoad], plain: tuple[PlainRow, .
     return BenchResult(machine, tuple(rows), plain, state, None, complete=False)
 
 
-def test_a_bench_leaves_a_folder_that_repeats_it(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_a_bench_leaves_a_folder_that_repeats_it(vslam: Any, tmp_path: Path) -> None:
     """One row for each combination, in table, metrics.json and the copy; the config repeats them all."""
     first, second, copy = tmp_path / "first", tmp_path / "second", tmp_path / "copy.json"
-    assert _run(monkeypatch, *TINY, "--out", str(first), "--json", str(copy)) == 0
-    shown = capsys.readouterr().out
+    status, shown, _ = vslam("bench", "filter", *TINY, "--out", str(first), "--json", str(copy))
+    assert status == 0
     assert all(word in shown for word in ("K=2", "fastslam1", "fastslam2", "get_state", "bytes per particle"))
     metrics = json.loads((first / "metrics.json").read_text())
     assert metrics == json.loads(copy.read_text())
@@ -69,7 +59,7 @@ def test_a_bench_leaves_a_folder_that_repeats_it(
         assert row["bytes_per_landmark"] >= 76.0
     assert [row["plain_ms"] is None for row in metrics["rows"]] == [False, True] * 4  # with one robot only
     assert (first / "speed.png").read_bytes().startswith(b"\x89PNG")
-    assert _run(monkeypatch, "--config", str(first), "--out", str(second), "--no-plain") == 0
+    assert vslam("bench", "filter", "--config", str(first), "--out", str(second), "--no-plain").status == 0
     configs = [tomllib.loads((folder / "config.toml").read_text())["config"] for folder in (first, second)]
     assert configs[1] == configs[0] | {"plain": False}
 
@@ -85,14 +75,9 @@ def test_a_bench_leaves_a_folder_that_repeats_it(
         (("--config", "/nowhere"), "config: expected the config.toml of an earlier run, got no such file."),
     ],
 )
-def test_bad_input_is_one_line_and_status_2(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], message: str
-) -> None:
+def test_bad_input_is_one_line_and_status_2(refusal: Any, arguments: tuple[str, ...], message: str) -> None:
     """Refused before anything is timed or written."""
-    assert _run(monkeypatch, *arguments) == 2
-    shown = capsys.readouterr()
-    assert shown.err.startswith(f"error {message}")
-    assert shown.err.count("\n") == 1
+    assert refusal("bench", "filter", *arguments).startswith(f"error {message}")
 
 
 def test_unknown_names_in_a_config_are_refused() -> None:
@@ -220,14 +205,13 @@ def test_compilation_is_timed_in_a_cache_of_its_own(monkeypatch: pytest.MonkeyPa
     assert not Path(times["cold"]["folder"]).exists()
 
 
-def test_a_bench_tells_what_compiling_costs(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_a_bench_tells_what_compiling_costs(monkeypatch: pytest.MonkeyPatch, vslam: Any, tmp_path: Path) -> None:
     """With --compile one line says how long compiling takes, and the cache after it; the JSON holds both processes."""
     monkeypatch.setattr(compile_timing, "WARM_UP", FAKE_WARM_UP)
     least = ("--particles", "3", "--landmarks", "30", "--measurements", "2", "--robots", "1", "--steps", "2")
-    assert _run(monkeypatch, *least, "--no-plain", "--compile", "--out", str(tmp_path / "bench")) == 0
-    shown = " ".join(capsys.readouterr().out.split())  # lines may be broken anywhere
+    said = vslam("bench", "filter", *least, "--no-plain", "--compile", "--out", str(tmp_path / "bench"))
+    assert said.status == 0
+    shown = " ".join(said.out.split())  # lines may be broken anywhere
     assert "Kernels: compiled in 41 s, once; taken from the cache (0.3 MB) in 0.3 s; import 1.2 s." in shown
     told = json.loads((tmp_path / "bench" / "metrics.json").read_text())["compilation"]
     assert (told["cold"]["compile_s"], told["cached"]["compile_s"]) == (41.0, 0.0)

@@ -1,17 +1,11 @@
 import subprocess
 import sys
+from typing import Any
 
 import pytest
 
 from training import cli
 from training.command_options import numbers, words
-
-
-def _run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
-    monkeypatch.setattr(sys, "argv", ["vslam", *arguments])
-    with pytest.raises(SystemExit) as end:
-        cli.main()
-    return int(end.value.code or 0)
 
 
 @pytest.mark.parametrize(
@@ -21,12 +15,11 @@ def _run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
         ("bench", "filter"), ("bench", "train"), ("train",), ("evaluate",),
     ],
 )  # fmt: skip
-def test_every_command_explains_itself(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], command: tuple[str, ...]
-) -> None:
+def test_every_command_explains_itself(vslam: Any, command: tuple[str, ...]) -> None:
     """`--help` works at every level and leaves with status 0."""
-    assert _run(monkeypatch, *command, "--help") == 0
-    assert "Usage: vslam" in capsys.readouterr().out
+    said = vslam(*command, "--help")
+    assert said.status == 0
+    assert "Usage: vslam" in said.out
 
 
 @pytest.mark.parametrize(
@@ -45,18 +38,11 @@ def test_every_command_explains_itself(
     ],
 )
 def test_bad_input_is_one_line_and_status_2(
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    arguments: tuple[str, ...],
-    message: str,
+    monkeypatch: pytest.MonkeyPatch, refusal: Any, arguments: tuple[str, ...], message: str
 ) -> None:
     """Argument, what was expected, what came and the cure on one line of stderr, without a traceback."""
     monkeypatch.delenv("VSLAM_DATA", raising=False)
-    assert _run(monkeypatch, "replay", "mrclam", *arguments) == 2
-    shown = capsys.readouterr()
-    assert shown.err.startswith(f"error {message}")
-    assert shown.err.count("\n") == 1
-    assert not shown.out
+    assert refusal("replay", "mrclam", *arguments).startswith(f"error {message}")
 
 
 def test_a_fault_of_the_program_keeps_its_traceback(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,7 +1,6 @@
 """Pairs of real maps: how they are aligned and scored."""
 
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,6 @@ import pytest
 from small_logs import write_log
 
 from slam_backend.readers.mrclam import load_mrclam
-from training import cli
 from training.mrclam_pairs import MrclamPairsConfig, align_log, align_pairs, check_goals, summarise
 from training.replay_mrclam import ReplayConfig, replay
 
@@ -71,18 +69,14 @@ def test_bad_configs_are_refused(changed: dict[str, Any], message: str) -> None:
         MrclamPairsConfig.from_mapping({"path": "log"} | changed)
 
 
-def test_the_command_leaves_a_table(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_the_command_leaves_a_table(vslam: Any, tmp_path: Path) -> None:
     """One line per duration, barcodes and method, on the console, as Markdown and in metrics.json."""
     write_log(tmp_path, noise=1.0)
     out = tmp_path / "run"
     options = ("--path", str(tmp_path), "--durations", "30,0", "--particles", "10", "--out", str(out))
-    monkeypatch.setattr(sys, "argv", ["vslam", "bench", "mrclam", *options])
-    with pytest.raises(SystemExit) as end:
-        cli.main()
-    assert not end.value.code
-    assert "share aligned" in capsys.readouterr().out
+    said = vslam("bench", "mrclam", *options)
+    assert said.status == 0
+    assert "share aligned" in said.out
     assert len((out / "table.md").read_text().splitlines()) == 2 + 8
     metrics = json.loads((out / "metrics.json").read_text())
     assert [line["duration_s"] for line in metrics["summary"]] == [30.0] * 4 + [None] * 4

@@ -2,7 +2,6 @@
 
 import csv
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,6 @@ import numpy as np
 import pytest
 
 from slam_backend.geometry import transform_points
-from training import cli
 from training.paper_fig2 import (
     ENOUGH_SHARED,
     METHODS,
@@ -26,14 +24,6 @@ from training.paper_pairs import map_alone, simulate_pair, true_motion
 from training.stereo_runs import FALSE_POINT
 
 SMALL = Fig2Config(length=30.0, every=10.0, particles=30, seeds=2, seed=100)
-
-
-def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
-    """Run the command line; return its exit status."""
-    monkeypatch.setattr(sys, "argv", ["vslam", "paper", *arguments])
-    with pytest.raises(SystemExit) as end:
-        cli.main()
-    return int(end.value.code or 0)
 
 
 @pytest.fixture(scope="module")
@@ -134,27 +124,25 @@ def test_fused_ellipses_are_smaller_than_both(pair: AlignedPair) -> None:
     assert (np.linalg.det(both) < np.minimum(np.linalg.det(one), np.linalg.det(two))).all()
 
 
-def test_maps_that_cannot_be_aligned_leave_nothing_behind(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_maps_that_cannot_be_aligned_leave_nothing_behind(refusal: Any, tmp_path: Path) -> None:
     """Robots that have hardly moved share nothing: one line, status 2, no folder."""
     out = tmp_path / "figure"
-    assert run(monkeypatch, "fig3", "--length", "1", "--particles", "5", "--seed", "101", "--out", str(out)) == 2
-    assert "length: expected maps that can be aligned, got a refusal: too few" in capsys.readouterr().err
+    shown = refusal("paper", "fig3", "--length", "1", "--particles", "5", "--seed", "101", "--out", str(out))
+    assert "length: expected maps that can be aligned, got a refusal: too few" in shown
     assert not out.exists()
 
 
-def test_the_commands_write_pictures_and_tables(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_the_commands_write_pictures_and_tables(vslam: Any, tmp_path: Path) -> None:
     """Each figure ends as PNG, CSV and metrics.json; fig2 begun again in its folder runs nothing twice."""
     options = ("--seeds", "1", "--first-seed", "100", "--length", "10", "--every", "10", "--particles", "20")
     for _ in range(2):
-        assert run(monkeypatch, "fig2", *options, "--out", str(tmp_path / "fig2")) == 0
+        said = vslam("paper", "fig2", *options, "--out", str(tmp_path / "fig2"))
+        assert said.status == 0
+        assert "RANSAC, median translation [m], worst size" in said.out
         assert len((tmp_path / "fig2" / "runs.jsonl").read_text().splitlines()) == 1
     for name in ("fig3", "fig4"):
         few = ("--seed", "100", "--length", "20", "--particles", "20")
-        assert run(monkeypatch, name, *few, "--out", str(tmp_path / name)) == 0
+        assert vslam("paper", name, *few, "--out", str(tmp_path / name)).status == 0
     for name, head in (("fig2", "seed"), ("fig3", "true_a"), ("fig4", "landmark")):
         folder = tmp_path / name
         with (folder / f"{name}.csv").open() as file:
@@ -163,7 +151,6 @@ def test_the_commands_write_pictures_and_tables(
         assert len(table) > 5
         assert (folder / f"{name}.png").stat().st_size > 10_000
         assert "config" in json.loads((folder / "metrics.json").read_text())
-    assert "RANSAC, median translation [m], worst size" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

@@ -1,13 +1,12 @@
 """Fig. 1: clouds start as points, spread as the motion model says, and shrink where landmarks are seen."""
 
 import json
-import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from training import cli
 from training.paper_fig1 import Clouds, Fig1Config, draw_clouds, figures_of, simulate_fig1
 from training.paper_regimes import FILTER_OPTIONS
 from training.stereo_runs import PRESETS, STEP, StereoRun
@@ -73,22 +72,18 @@ def test_one_step_spreads_as_the_motion_model_says() -> None:
     assert spread**2 == pytest.approx(along**2 + across**2, rel=4.0 * np.sqrt(2.0 / 4000))
 
 
-def test_the_command_leaves_picture_and_figures(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_leaves_picture_and_figures(vslam: Any, tmp_path: Path) -> None:
     """A PNG file, the figures of each robot as JSON, and the same again from the config."""
     first, again = tmp_path / "first", tmp_path / "again"
     arguments = ["paper", "fig1", "--length", "6", "--particles", "30", "--every", "2", "--seed", "62"]
     for rest in ([*arguments, "--out", str(first)], ["paper", "fig1", "--config", str(first), "--out", str(again)]):
-        monkeypatch.setattr(sys, "argv", ["vslam", *rest])
-        with pytest.raises(SystemExit) as end:
-            cli.main()
-        assert not end.value.code
+        said = vslam(*rest)
+        assert said.status == 0
+        assert "robot 3, measurements: path RMS" in said.out
     assert (first / "fig1.png").read_bytes().startswith(b"\x89PNG")
     found = [json.loads((out / "metrics.json").read_text()) for out in (first, again)]
     assert found[0] == found[1]
     assert len(found[0]["measurements"]) == len(found[0]["odometry"]) == 3
-    assert "robot 3, measurements: path RMS" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -100,17 +95,6 @@ def test_the_command_leaves_picture_and_figures(
         (("--seed", "-1"), "seed: expected an int >= 0, got -1."),
     ],
 )
-def test_bad_options_are_one_line_and_status_2(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...],
-    message: str,
-) -> None:  # fmt: skip
+def test_bad_options_are_one_line_and_status_2(refusal: Any, arguments: tuple[str, ...], message: str) -> None:
     """Argument, what was expected, what came and the cure on one line of stderr; no folder is made."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["vslam", "paper", "fig1", *arguments])
-    with pytest.raises(SystemExit) as end:
-        cli.main()
-    assert end.value.code == 2
-    shown = capsys.readouterr()
-    assert shown.err.startswith(f"error {message}")
-    assert shown.err.count("\n") == 1
-    assert not any(tmp_path.iterdir())
+    assert refusal("paper", "fig1", *arguments).startswith(f"error {message}")

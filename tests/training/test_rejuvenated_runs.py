@@ -1,7 +1,6 @@
 """`--rejuvenate-every`: it reaches the filters of each command, and config.toml repeats it."""
 
 import json
-import sys
 import tomllib
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -11,7 +10,6 @@ import pytest
 from small_logs import write_drive, write_log, write_park
 
 from slam_backend import _rejuvenation_step
-from training import cli
 from training.replay_images import ImagesConfig
 from training.run_config import RunConfig
 from vslam_env.config import EnvConfig, preset_config
@@ -23,14 +21,6 @@ WRITERS: Mapping[str, Callable[[Path], None]] = {
 }
 
 PARTICLES = 20
-
-
-def vslam(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
-    """Run the command line; return its exit status."""
-    monkeypatch.setattr(sys, "argv", ["vslam", *arguments])
-    with pytest.raises(SystemExit) as end:
-        cli.main()
-    return int(end.value.code or 0)
 
 
 def estimates(folder: Path) -> list[bytes]:
@@ -56,7 +46,7 @@ def reasons(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 @pytest.mark.parametrize("command", WRITERS)
 def test_a_replay_is_rejuvenated_and_repeats_itself(
-    command: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, reasons: list[str]
+    command: str, vslam: Any, tmp_path: Path, reasons: list[str]
 ) -> None:
     """Most attempts succeed, the estimates change, the option stands in config.toml, which repeats the paths."""
     log, plain, one, two = (tmp_path / name for name in ("log", "plain", "one", "two"))
@@ -64,11 +54,11 @@ def test_a_replay_is_rejuvenated_and_repeats_itself(
     WRITERS[command](log)
     options = ("replay", command, "--path", str(log), "--duration", "8", "--seed", "104")
     options += ("--particles", str(PARTICLES))
-    assert vslam(monkeypatch, *options, "--out", str(plain)) == 0
+    assert vslam(*options, "--out", str(plain)).status == 0
     assert not reasons
-    assert vslam(monkeypatch, *options, "--rejuvenate-every", "8", "--out", str(one)) == 0
+    assert vslam(*options, "--rejuvenate-every", "8", "--out", str(one)).status == 0
     assert reasons.count("") > 0.5 * len(reasons) > 0.0
-    assert vslam(monkeypatch, "replay", command, "--config", str(one), "--out", str(two)) == 0
+    assert vslam("replay", command, "--config", str(one), "--out", str(two)).status == 0
     assert "rejuvenate_every = 8" in (one / "config.toml").read_text()
     assert "rejuvenate_every" not in (plain / "config.toml").read_text()
     assert estimates(one) == estimates(two)
@@ -89,13 +79,13 @@ def test_the_filters_of_a_run_are_told(sensor: str) -> None:
 
 
 @pytest.mark.slow
-def test_a_run_is_rejuvenated_and_repeats_itself(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_run_is_rejuvenated_and_repeats_itself(vslam: Any, tmp_path: Path) -> None:
     """Of three runs of the command, that without differs from that with, and that from its config does not."""
     plain, one, two = (tmp_path / name for name in ("plain", "one", "two"))
     options = ("--robots", "2", "--particles", "11", "--max-cycles", "40", "--world", "fig5", "--seed", "104")
     with_it = (*options, "--rejuvenate-every", "10")
     for folder, extra in ((plain, options), (one, with_it), (two, ("--config", str(one)))):
-        assert vslam(monkeypatch, "run", *extra, "--no-video", "--out", str(folder)) == 0
+        assert vslam("run", *extra, "--no-video", "--out", str(folder)).status == 0
     assert tomllib.loads((one / "config.toml").read_text())["config"]["rejuvenate_every"] == 10
     assert EnvConfig.from_toml(one / "environment.toml").belief.filter.rejuvenate_every == 10
     assert estimates(one) == estimates(two)
@@ -103,13 +93,11 @@ def test_a_run_is_rejuvenated_and_repeats_itself(monkeypatch: pytest.MonkeyPatch
 
 
 @pytest.mark.parametrize("command", [("replay", "mrclam"), ("replay", "victoria"), ("replay", "kitti"), ("run",)])
-def test_no_steps_between_are_refused(
-    command: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_no_steps_between_are_refused(command: tuple[str, ...], refusal: Any) -> None:
     """Every zero steps is no interval: one line, status 2."""
     path = ("--path", "none") if command[0] == "replay" else ()
-    assert vslam(monkeypatch, *command, *path, "--rejuvenate-every", "0") == 2
-    assert capsys.readouterr().err.startswith("error rejuvenate_every: expected an int >= 1, got 0. Give a number,")
+    shown = refusal(*command, *path, "--rejuvenate-every", "0")
+    assert shown.startswith("error rejuvenate_every: expected an int >= 1, got 0. Give a number,")
 
 
 def test_a_replay_of_images_takes_it_too() -> None:

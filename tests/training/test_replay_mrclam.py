@@ -1,7 +1,7 @@
 import dataclasses
 import json
-import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +14,6 @@ from slam_backend.motion import OdometryModel
 from slam_backend.readers.mrclam import load_mrclam
 from slam_backend.readers.mrclam_steps import Drive, SightingNoise
 from slam_backend.trajectory import Trajectory
-from training import cli
 from training.replay_mrclam import MOTION, ReplayConfig, replay
 from training.replay_scores import align_to_truth, score_path, summarise
 
@@ -62,7 +61,7 @@ def test_noise_is_removed_that_dead_reckoning_keeps(tmp_path: Path) -> None:
 
 
 def test_a_run_is_written_and_repeats_itself(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, vslam: Any
 ) -> None:
     """The command leaves a complete folder, and run again from its config the same metrics to the last digit."""
     log, first, second = (tmp_path / name for name in ("log", "first", "second"))
@@ -75,12 +74,10 @@ def test_a_run_is_written_and_repeats_itself(
         (*options, "--out", str(first), "--json", str(tmp_path / "copy.json")),
         ("--config", str(first), "--out", str(second)),
     ):
-        monkeypatch.setattr(sys, "argv", ["vslam", "replay", "mrclam", *arguments])
-        with pytest.raises(SystemExit) as end:
-            cli.main()
-        assert not end.value.code
+        said = vslam("replay", "mrclam", *arguments)
+        assert said.status == 0
         monkeypatch.chdir(first)  # the config works from any folder
-    assert "odometry" in capsys.readouterr().out
+    assert "odometry" in said.out
     names = {f"robot{n}_{kind}.tum" for n in (2, 5) for kind in ("estimate", "dead_reckoning", "truth")}
     assert {file.name for file in first.iterdir()} == {
         "config.toml", "metrics.json", "replay.png", "joint_map_2-5.png", "timing.json", *names

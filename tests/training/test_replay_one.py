@@ -1,6 +1,6 @@
 import json
-import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +12,6 @@ from slam_backend.readers.velocities import integrate_commands
 from slam_backend.readers.victoria import load_victoria
 from slam_backend.readers.victoria_steps import axle_velocities, steps
 from slam_backend.trajectory import Trajectory
-from training import cli
 from training.replay_kitti import KittiConfig, find_loop
 from training.replay_kitti import replay as replay_kitti
 from training.replay_kitti import score as score_kitti
@@ -129,7 +128,7 @@ def test_positions_are_scored_before_and_after_the_fit() -> None:
 
 @pytest.mark.parametrize("command", ["victoria", "kitti"])
 def test_a_run_is_written_and_repeats_itself(
-    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, vslam: Any
 ) -> None:
     """The command leaves a complete folder, and run again from its config the same metrics to the last digit."""
     log, first, second = (tmp_path / name for name in ("log", "first", "second"))
@@ -141,12 +140,10 @@ def test_a_run_is_written_and_repeats_itself(
         (*options, "--out", str(first), "--json", str(tmp_path / "copy.json")),
         ("--config", str(first), "--out", str(second)),
     ):
-        monkeypatch.setattr(sys, "argv", ["vslam", "replay", command, *arguments])
-        with pytest.raises(SystemExit) as end:
-            cli.main()
-        assert not end.value.code
+        said = vslam("replay", command, *arguments)
+        assert said.status == 0
         monkeypatch.chdir(first)  # the config works from any folder
-    assert "times real time" in capsys.readouterr().out
+    assert "times real time" in said.out
     truth = {"truth.tum"} if command == "kitti" else set()
     assert {file.name for file in first.iterdir()} == truth | {
         "config.toml", "metrics.json", "replay.png", "timing.json", "estimate.tum", "dead_reckoning.tum"
@@ -165,16 +162,12 @@ def test_a_run_is_written_and_repeats_itself(
     ("command", "what"), [("victoria", "the Victoria Park log"), ("kitti", "KITTI features")]
 )
 def test_a_log_that_is_not_named_is_asked_for(
-    command: str, what: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    command: str, what: str, monkeypatch: pytest.MonkeyPatch, refusal: Any
 ) -> None:
     """Without --path and VSLAM_DATA the command ends with one line and status 2."""
     monkeypatch.delenv("VSLAM_DATA", raising=False)
-    monkeypatch.setattr(sys, "argv", ["vslam", "replay", command])
-    with pytest.raises(SystemExit) as end:
-        cli.main()
-    assert end.value.code == 2
     expected = f"error path: expected a folder of {what}, got no --path. Name it, or set VSLAM_DATA.\n"
-    assert capsys.readouterr().err == expected
+    assert refusal("replay", command) == expected
 
 
 @pytest.mark.slow

@@ -1,34 +1,19 @@
 """What `vslam replay` says of logs that are not there, damaged, or whose times go back."""
 
-import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy.io import loadmat, savemat
 from small_logs import write_drive, write_log, write_park
 
-from training import cli
-
 WRITERS: dict[str, Callable[[Path], None]] = {
     "mrclam": lambda folder: write_log(folder, noise=1.0),
     "victoria": write_park,
     "kitti": write_drive,
 }
-
-
-def _refusal(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    """Return the one line that a replay ends with; its status is 2, it prints nothing else and makes no folder."""
-    monkeypatch.setattr(sys, "argv", ["vslam", "replay", *arguments])
-    with pytest.raises(SystemExit) as end:
-        cli.main()
-    shown = capsys.readouterr()
-    assert end.value.code == 2
-    assert not shown.out
-    assert shown.err.count("\n") == 1
-    assert not Path("runs").exists()
-    return shown.err
 
 
 def _turn_back(command: str, log: Path) -> None:
@@ -60,11 +45,10 @@ def _turn_back(command: str, log: Path) -> None:
     ],
 )
 def test_a_log_that_is_not_there_is_told_so(
-    command: str, message: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+    command: str, message: str, refusal: Any, tmp_path: Path
 ) -> None:
     """A path that leads nowhere is named."""
-    monkeypatch.chdir(tmp_path)
-    assert _refusal(monkeypatch, capsys, command, "--path", "none").startswith(f"error {message}")
+    assert refusal("replay", command, "--path", "none").startswith(f"error {message}")
 
 
 @pytest.mark.parametrize(
@@ -76,17 +60,15 @@ def test_a_log_that_is_not_there_is_told_so(
     ],
 )
 def test_a_file_that_was_cut_is_named(
-    command: str, file: str, message: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
-    tmp_path: Path,
+    command: str, file: str, message: str, refusal: Any, tmp_path: Path,
 ) -> None:  # fmt: skip
     """Half of a download is refused with the name of the file, before anything is computed."""
-    monkeypatch.chdir(tmp_path)
     log = tmp_path / "log"
     log.mkdir()
     WRITERS[command](log)
     whole = (log / file).read_bytes()
     (log / file).write_bytes(whole[: len(whole) // 2])
-    shown = _refusal(monkeypatch, capsys, command, "--path", "log")
+    shown = refusal("replay", command, "--path", "log")
     assert shown.startswith(f"error {message}")
     assert file in shown
 
@@ -100,27 +82,25 @@ def test_a_file_that_was_cut_is_named(
     ],
 )
 def test_time_that_goes_back_is_refused(
-    command: str, message: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+    command: str, message: str, refusal: Any, tmp_path: Path
 ) -> None:
     """Two readings in the wrong order end the replay before it begins."""
-    monkeypatch.chdir(tmp_path)
     log = tmp_path / "log"
     log.mkdir()
     WRITERS[command](log)
     _turn_back(command, log)
-    assert _refusal(monkeypatch, capsys, command, "--path", "log").startswith(f"error {message}")
+    assert refusal("replay", command, "--path", "log").startswith(f"error {message}")
 
 
 @pytest.mark.parametrize("command", WRITERS)
 def test_a_folder_with_files_is_never_written_to(
-    command: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+    command: str, refusal: Any, tmp_path: Path
 ) -> None:
     """The run folder is a new or an empty one; whatever another one holds stays."""
-    monkeypatch.chdir(tmp_path)
     for name in ("log", "full"):
         (tmp_path / name).mkdir()
     WRITERS[command](tmp_path / "log")
     (tmp_path / "full" / "file").touch()
-    shown = _refusal(monkeypatch, capsys, command, "--path", "log", "--out", "full")
+    shown = refusal("replay", command, "--path", "log", "--out", "full")
     assert shown.startswith("error out: expected a new or empty folder, got")
     assert [file.name for file in (tmp_path / "full").iterdir()] == ["file"]

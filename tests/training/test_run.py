@@ -1,9 +1,9 @@
 import json
 import signal
-import sys
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +11,6 @@ from rich.console import Console
 
 from slam_backend.geometry import between, compose
 from slam_backend.trajectory import Trajectory
-from training import cli
 from training.episode import EpisodeRecord, MergeRecord, Progress, run_episode
 from training.episode_scores import score_episode
 from training.figures import draw_errors, draw_maps
@@ -218,23 +217,15 @@ def test_the_first_interrupt_asks_and_the_second_insists() -> None:
     assert signal.getsignal(signal.SIGINT) is usual
 
 
-def _vslam(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
-    """Run the command line; return its exit status."""
-    monkeypatch.setattr(sys, "argv", ["vslam", *arguments])
-    with pytest.raises(SystemExit) as end:
-        cli.main()
-    return int(end.value.code or 0)
-
-
 SHORT = ("--robots", "2", "--particles", "11", "--max-cycles", "23", "--world", "fig5")
 
 
 @pytest.mark.slow
-def test_a_run_folder_repeats_itself(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_run_folder_repeats_itself(vslam: Any, tmp_path: Path) -> None:
     """A run leaves all promised files, and its own config repeats its paths byte by byte and its metrics exactly."""
     one, two, copy = tmp_path / "one", tmp_path / "two", tmp_path / "copy.json"
-    assert _vslam(monkeypatch, "run", *SHORT, "--seed", "5", "--out", str(one), "--json", str(copy)) == 0
-    assert _vslam(monkeypatch, "run", "--config", str(one / "config.toml"), "--no-video", "--out", str(two)) == 0
+    assert vslam("run", *SHORT, "--seed", "5", "--out", str(one), "--json", str(copy)).status == 0
+    assert vslam("run", "--config", str(one / "config.toml"), "--no-video", "--out", str(two)).status == 0
     names = {file.name for file in one.iterdir()}
     paths = {f"robot{k}_{kind}.tum" for k in range(2) for kind in ("estimate", "dead_reckoning", "truth")}
     assert names == paths | {"config.toml", "environment.toml", "metrics.json", "map.png", "error.png", "video.mp4"}
@@ -251,7 +242,7 @@ def test_a_run_folder_repeats_itself(monkeypatch: pytest.MonkeyPatch, tmp_path: 
 
 
 @pytest.mark.slow
-def test_an_interrupted_run_writes_what_it_has(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_an_interrupted_run_writes_what_it_has(monkeypatch: pytest.MonkeyPatch, vslam: Any, tmp_path: Path) -> None:
     """Ctrl-C after seven steps leaves a whole folder about these seven steps."""
     usual: Callable[[LiveProgress, Progress], None] = LiveProgress.show
 
@@ -261,7 +252,7 @@ def test_an_interrupted_run_writes_what_it_has(monkeypatch: pytest.MonkeyPatch, 
             signal.raise_signal(signal.SIGINT)
 
     monkeypatch.setattr(LiveProgress, "show", show)
-    assert _vslam(monkeypatch, "run", *SHORT, "--out", str(tmp_path / "run")) == 0
+    assert vslam("run", *SHORT, "--out", str(tmp_path / "run")).status == 0
     metrics: Mapping[str, object] = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert metrics["complete"] is False
     assert metrics["duration_s"] == pytest.approx(0.7)
@@ -292,27 +283,13 @@ def test_an_interrupted_run_writes_what_it_has(monkeypatch: pytest.MonkeyPatch, 
     ],
 )
 def test_bad_input_is_one_line_and_status_2(
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    tmp_path: Path,
-    arguments: tuple[str, ...],
-    message: str,
+    refusal: Any, tmp_path: Path, arguments: tuple[str, ...], message: str
 ) -> None:
-    """What is wrong is said on one line of stderr, and no run folder is left behind.
-
-    Whoever comes first with an empty cache has waited for the compiler before, and was told so on lines of its own.
-    """
-    monkeypatch.chdir(tmp_path)
+    """What is wrong is said on one line of stderr, and no run folder is left behind."""
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "file").touch()
     (tmp_path / "broken.json").write_text("{walls: [1, 2")
-    assert _vslam(monkeypatch, "run", *arguments) == 2
-    shown = capsys.readouterr()
-    lines = [line for line in shown.err.splitlines() if not line.startswith(("Compiling the kernels", "Compiled in"))]
-    assert len(lines) == 1
-    assert lines[0].startswith(f"error {message}")
-    assert not shown.out
-    assert not (tmp_path / "runs").exists()
+    assert refusal("run", *arguments).startswith(f"error {message}")
 
 
 def test_a_config_file_with_an_unknown_name_is_refused() -> None:
