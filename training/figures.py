@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from slam_backend.errors import FloatArray
 from slam_backend.geometry import compose, rotate_covariances, transform_points
 from training.episode import EpisodeRecord
+from training.png import save_png
 from vslam_env.rendering import Scene
 from vslam_env.rendering.canvas import CHI_SQUARE_95
 from vslam_env.rendering.palette import FAINT_INK, INK, PAPER, TRUE_LANDMARK, WALL, Colour, robot_colour
@@ -63,7 +64,7 @@ def draw_maps(record: EpisodeRecord, path: Path) -> None:
         color=_rgb(INK),
     )
     main.set_xlabel(LEGEND, fontsize=8, color=_rgb(FAINT_INK))
-    figure.savefig(path, dpi=150)
+    save_png(figure, path, 150)
 
 
 def draw_errors(record: EpisodeRecord, path: Path) -> None:
@@ -98,7 +99,7 @@ def draw_errors(record: EpisodeRecord, path: Path) -> None:
     bottom.set_ylabel("floor seen [%]")
     bottom.set_xlabel("time [s]")
     bottom.set_xlim(0.0, max(float(record.times[-1]), 1e-3))
-    figure.savefig(path, dpi=150)
+    save_png(figure, path, 150)
 
 
 def _rgb(colour: Colour) -> tuple[float, float, float]:

@@ -7,12 +7,12 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, LogLocator, NullFormatter, NullLocator, StrMethodFormatter
 
 from training.accuracy_tables import NAMES, conditions
 from training.accuracy_trials import FILTERS
+from training.png import save_png
 
 PANELS = (
     ("pose_rms_m", "online pose error, RMS [m]"), ("map_rmse_m", "map error, RMS [m]"), ("anees", "ANEES (ideal: 1)")
@@ -34,7 +34,6 @@ def draw_accuracy(file: Path, lines: Sequence[Mapping[str, Any]]) -> None:
     groups = conditions(lines)
     with mpl.rc_context({"font.size": 9, "axes.titlesize": 9}):
         figure = Figure(figsize=(12.0, 3.6 * len(groups)), layout="constrained")
-        FigureCanvasAgg(figure)
         axes = figure.subplots(len(groups), len(PANELS), squeeze=False)
         for row, (title, own) in zip(axes, groups.items(), strict=True):
             for panel, (key, label) in zip(row, PANELS, strict=True):
@@ -42,7 +41,7 @@ def draw_accuracy(file: Path, lines: Sequence[Mapping[str, Any]]) -> None:
             row[0].set_title(title, loc="left")
         handles, labels = axes[0][0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), frameon=False)
-        figure.savefig(file, dpi=110)
+        save_png(figure, file, 110)
 
 
 def _draw_panel(ax: Axes, lines: Sequence[Mapping[str, Any]], key: str, label: str) -> None:

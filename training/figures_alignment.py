@@ -6,9 +6,10 @@ from typing import Any
 
 import matplotlib as mpl
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+
+from training.png import save_png
 
 # Told apart by colour-blind eyes too.
 COLOURS = {
@@ -34,7 +35,6 @@ def draw_alignment(file: Path, lines: Sequence[Mapping[str, Any]]) -> None:
         return
     with mpl.rc_context({"font.size": 9, "axes.titlesize": 9}):
         figure = Figure(figsize=(12.0, 2.7 * len(overlaps) + 0.4), layout="constrained")
-        FigureCanvasAgg(figure)
         axes = figure.subplots(len(overlaps), len(PANELS), squeeze=False, sharex=True)
         for row, overlap in zip(axes, overlaps, strict=True):
             for panel, (key, label) in zip(row, PANELS, strict=True):
@@ -45,7 +45,7 @@ def draw_alignment(file: Path, lines: Sequence[Mapping[str, Any]]) -> None:
             panel.set_xlabel("wrong look-alikes [%]")
         handles, labels = axes[0][0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), frameon=False)
-        figure.savefig(file, dpi=110)
+        save_png(figure, file, 110)
 
 
 def _draw_panel(ax: Axes, lines: Sequence[Mapping[str, Any]], key: str) -> None:

@@ -6,7 +6,6 @@ from pathlib import Path
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
@@ -15,6 +14,7 @@ from matplotlib.patches import Rectangle
 
 from slam_backend.errors import FloatArray
 from training.paper_fig1 import Clouds
+from training.png import save_png
 from training.stereo_office import Office
 from training.stereo_runs import StereoRun
 from vslam_env.rendering.palette import FAINT_INK, TRUE_LANDMARK, WALL, Colour, robot_colour
@@ -37,7 +37,6 @@ def draw_fig1(file: Path, run: StereoRun, panels: Sequence[tuple[str, str, Cloud
     with mpl.rc_context({"font.size": 7, "axes.titlesize": 7.5, "axes.linewidth": 0.6}):
         layout = ConstrainedLayoutEngine(h_pad=0.02, hspace=0.0)
         figure = Figure(figsize=(WIDTH, len(panels) * (0.95 * WIDTH * ratio + 0.17) + 0.65), layout=layout)
-        FigureCanvasAgg(figure)
         axes = figure.subplots(len(panels), 1, squeeze=False, sharex=True).ravel()
         for letter, ax, (title, dashed, clouds) in zip("abcd", axes, panels, strict=False):
             _draw_office(ax, run.office)
@@ -51,7 +50,7 @@ def draw_fig1(file: Path, run: StereoRun, panels: Sequence[tuple[str, str, Cloud
             handles=_legend(len(run.true_paths)), loc="outside lower center", ncols=3, frameon=False, columnspacing=1.2,
             handlelength=1.6, borderpad=0.0,
         )  # fmt: skip
-        figure.savefig(file, dpi=270)
+        save_png(figure, file, 270)
 
 
 def _draw_office(ax: Axes, office: Office) -> None:

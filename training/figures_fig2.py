@@ -5,10 +5,10 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from training.paper_fig2 import LABELS, METHODS, OURS
+from training.png import save_png
 
 COLOURS = {"svd": "#7f7f7f", "icp": "#D55E00", "impicp": "#E69F00", "ransac": "#0072B2", OURS: "#009E73"}
 MARKERS = {"svd": "x", "icp": "v", "impicp": "D", "ransac": "o", OURS: "s"}
@@ -24,7 +24,6 @@ def draw_fig2(file: Path, lines: Sequence[Mapping[str, Any]]) -> None:
     """
     with mpl.rc_context({"font.size": 9}):
         figure = Figure(figsize=(10.0, 4.0), layout="constrained")
-        FigureCanvasAgg(figure)
         panels = figure.subplots(1, 2)
         for letter, axes, (name, label) in zip("ab", panels, LABELS.items(), strict=True):
             for place, method in enumerate(METHODS):
@@ -45,4 +44,4 @@ def draw_fig2(file: Path, lines: Sequence[Mapping[str, Any]]) -> None:
             axes.grid(alpha=0.2, which="both")
         handles, labels = panels[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), frameon=False)
-        figure.savefig(file, dpi=120)
+        save_png(figure, file, 120)

@@ -5,7 +5,6 @@ from pathlib import Path
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
@@ -13,6 +12,7 @@ from matplotlib.patches import Ellipse
 from slam_backend.errors import FloatArray
 from slam_backend.geometry import transform_points
 from training.paper_fig3 import AlignedPair, FusedLandmarks
+from training.png import save_png
 
 CHI_SQUARE_95 = 5.991  # two degrees of freedom
 COLOURS = {"map 1": "#0072B2", "map 2": "#D55E00", "fused": "#009E73"}
@@ -26,7 +26,6 @@ def draw_fig3(file: Path, pair: AlignedPair) -> None:
     rows_a, rows_b = pair.alignment.inliers.T
     with mpl.rc_context({"font.size": 9}):
         figure = Figure(figsize=(12.0, 6.0), layout="constrained")
-        FigureCanvasAgg(figure)
         left, right = figure.subplots(1, 2)
         ends = np.stack([map_a.means[rows_a, :2], map_b.means[rows_b, :2] + offset], axis=1)
         left.add_collection(LineCollection(list(ends), colors="0.65", lw=0.5, zorder=1))
@@ -53,7 +52,7 @@ def draw_fig3(file: Path, pair: AlignedPair) -> None:
             axes.set_ylabel("y [m]")
             axes.grid(alpha=0.2)
         right.legend(loc="best", fontsize=8)
-        figure.savefig(file, dpi=120)
+        save_png(figure, file, 120)
 
 
 def draw_fig4(file: Path, fused: FusedLandmarks) -> None:
@@ -61,7 +60,6 @@ def draw_fig4(file: Path, fused: FusedLandmarks) -> None:
     count = len(fused.names)
     with mpl.rc_context({"font.size": 9}):
         figure = Figure(figsize=(3.6 * count, 7.2), layout="constrained")
-        FigureCanvasAgg(figure)
         panels = figure.subplots(2, count, squeeze=False)
         for row, names, title in zip(
             panels, (("map 1", "map 2"), ("map 1", "map 2", "fused")), ("(a) aligned", "(b) fused"), strict=True
@@ -89,7 +87,7 @@ def draw_fig4(file: Path, fused: FusedLandmarks) -> None:
         for handle in legend.legend_handles:
             if handle is not None:
                 handle.set_alpha(1.0)
-        figure.savefig(file, dpi=120)
+        save_png(figure, file, 120)
 
 
 def _dots(axes: Axes, points: FloatArray, name: str) -> None:

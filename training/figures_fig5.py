@@ -3,13 +3,13 @@
 from pathlib import Path
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Wedge
 
 from training.paper_fig5 import Fig5
+from training.png import save_png
 from vslam_env.rendering.palette import robot_colour
 
 WIDTH = 7.0  # [in]
@@ -22,7 +22,6 @@ def draw_fig5(file: Path, found: Fig5) -> None:
     low, high = found.walls.reshape(-1, 2).min(axis=0), found.walls.reshape(-1, 2).max(axis=0)
     ratio = (high[1] - low[1]) / (high[0] - low[0])
     figure = Figure(figsize=(WIDTH, WIDTH * ratio + 0.6), layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.subplots()
     axes.add_collection(LineCollection(found.walls.reshape(-1, 2, 2).tolist(), colors=INK, linewidths=1.6))
     axes.plot(*found.landmarks[:, :2].T, "o", color="0.62", markersize=2.2, zorder=3)
@@ -54,4 +53,4 @@ def draw_fig5(file: Path, found: Fig5) -> None:
     axes.set_xlabel("x [m]", fontsize=7)
     axes.set_ylabel("y [m]", fontsize=7)
     axes.tick_params(labelsize=7)
-    figure.savefig(file, dpi=150)
+    save_png(figure, file, 150)

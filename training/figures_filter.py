@@ -14,6 +14,7 @@ from slam_backend.errors import FloatArray
 from training.bench_filter import BenchResult
 from training.filter_goals import COMMON, STEP_MS
 from training.filter_trials import Row
+from training.png import save_png
 
 COLOURS = {"fastslam1": "#0072B2", "fastslam2": "#D55E00"}
 INK = "0.35"
@@ -50,7 +51,7 @@ def draw_speed(file: Path, result: BenchResult) -> None:
         ax.spines[["top", "right"]].set_visible(False)
     panels[0].set_ylabel("time of a step [ms]")
     figure.legend(handles=LEGEND, loc="outside lower center", ncols=3, frameon=False, fontsize=9)
-    figure.savefig(file, dpi=120)
+    save_png(figure, file, 120)
 
 
 def _draw_panel(ax: Axes, rows: Sequence[Row], name: str) -> None:

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from slam_backend.errors import FloatArray
+from training.png import save_png
 
 PANELS = (
     ("return", "return of an episode"),
@@ -29,7 +29,6 @@ def draw_learning(file: Path, rows: Sequence[Mapping[str, float]]) -> None:
     steps = np.array([row["steps"] for row in rows])
     with mpl.rc_context({"font.size": 9}):
         figure = Figure(figsize=(10.0, 5.6), layout="constrained")
-        FigureCanvasAgg(figure)
         for axes, (name, label) in zip(figure.subplots(2, 2, sharex=True).flat, PANELS, strict=True):
             values = np.array([row[name] for row in rows])
             axes.plot(steps, values, ".", color=COLOUR, alpha=0.35, markersize=4, label="each rollout")
@@ -40,7 +39,7 @@ def draw_learning(file: Path, rows: Sequence[Mapping[str, float]]) -> None:
             if axes.get_subplotspec().is_last_row():
                 axes.set_xlabel("decisions of all robots")
         figure.axes[0].legend(loc="lower right")
-        figure.savefig(file, dpi=120)
+        save_png(figure, file, 120)
 
 
 def running_mean(values: FloatArray, window: int) -> FloatArray:

@@ -6,7 +6,6 @@ from pathlib import Path
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
@@ -14,6 +13,7 @@ from slam_backend.errors import FloatArray
 from slam_backend.geometry import compose, inverse, transform_points
 from slam_backend.landmark_map import LandmarkMap
 from slam_backend.readers.mrclam import MrclamLog
+from training.png import save_png
 from training.replay_mrclam import Replay
 from training.replay_scores import PathScore, align_to_truth
 
@@ -37,7 +37,6 @@ def draw_replay(file: Path, log: MrclamLog, replay: Replay, paths: Sequence[Path
     rows = -(-panels // COLUMNS)
     with mpl.rc_context({"font.size": 9, "axes.titlesize": 10}):
         figure = Figure(figsize=(4.6 * COLUMNS, 6.4 * rows), layout="constrained")
-        FigureCanvasAgg(figure)
         axes = figure.subplots(rows, COLUMNS, squeeze=False).ravel()
         for robot, ax in enumerate(axes[: len(log.robots)]):
             _draw_robot(ax, log, replay, paths[robot], robot)
@@ -45,7 +44,7 @@ def draw_replay(file: Path, log: MrclamLog, replay: Replay, paths: Sequence[Path
             _draw_group(ax, log, replay, paths, group)
         for ax in axes[panels:]:
             ax.set_axis_off()
-        figure.savefig(file, dpi=110)
+        save_png(figure, file, 110)
 
 
 def draw_joint_map(
@@ -62,9 +61,8 @@ def draw_joint_map(
     """
     with mpl.rc_context({"font.size": 9, "axes.titlesize": 10}):
         figure = Figure(figsize=(5.2, 7.4), layout="constrained")
-        FigureCanvasAgg(figure)
         _draw_group(figure.subplots(), log, replay, paths, group)
-        figure.savefig(file, dpi=110)
+        save_png(figure, file, 110)
 
 
 def _draw_robot(ax: Axes, log: MrclamLog, replay: Replay, path: PathScore | None, robot: int) -> None:

@@ -5,12 +5,12 @@ from pathlib import Path
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from slam_backend.errors import FloatArray, IntArray
 from slam_backend.geometry import transform_points
 from training.figures_replay import COLOURS, TRUTH
+from training.png import save_png
 from training.replay_one import OneReplay, PositionScore
 
 MARGIN = 0.06  # of the larger extent, around what the picture must show
@@ -51,7 +51,6 @@ def draw_one(
     with mpl.rc_context({"font.size": 9, "axes.titlesize": 10}):
         ratio = float(np.clip((high - low)[1] / (high - low)[0], 0.4, 1.6))
         figure = Figure(figsize=(WIDTH, 0.93 * WIDTH * ratio + 0.6), layout="constrained")
-        FigureCanvasAgg(figure)
         ax = figure.subplots()
         if truth is not None:
             outside = np.count_nonzero(((truth < low) | (truth > high)).any(axis=1))
@@ -68,7 +67,7 @@ def draw_one(
         ax.set_ylabel("y [m]")
         ax.grid(alpha=0.15)
         ax.legend(fontsize=8, loc="best", framealpha=0.85)
-        figure.savefig(file, dpi=100)
+        save_png(figure, file, 100)
 
 
 def _window(estimate: FloatArray, truth: FloatArray | None) -> tuple[FloatArray, FloatArray]:

@@ -3,9 +3,9 @@
 from pathlib import Path
 from typing import Any
 
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from training.png import save_png
 from training.stereo_tables import NAMES
 
 COLOURS = {"usurf": "#0072B2", "sift": "#D55E00", "orb": "#009E73"}
@@ -14,7 +14,6 @@ COLOURS = {"usurf": "#0072B2", "sift": "#D55E00", "orb": "#009E73"}
 def draw_stereo(file: Path, result: dict[str, Any]) -> None:
     """Draw outliers after each guard, and recall by angle and by distance, into a PNG file."""
     figure = Figure(figsize=(13.0, 4.2), layout="constrained")
-    FigureCanvasAgg(figure)
     guards, angles, ratios = figure.subplots(1, 3)
     for row in result["quality"]:
         names = [entry["name"] for entry in row["guards"]]
@@ -44,4 +43,4 @@ def draw_stereo(file: Path, result: dict[str, Any]) -> None:
         axes.grid(alpha=0.2)
         axes.spines[["top", "right"]].set_visible(False)
         axes.legend(fontsize=8, frameon=False)
-    figure.savefig(file, dpi=120)
+    save_png(figure, file, 120)

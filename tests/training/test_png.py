@@ -1,0 +1,44 @@
+"""Figures are written small, and look as they would without that."""
+
+from pathlib import Path
+
+import imageio.v3 as imageio
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from training.png import save_png
+
+
+def _figure() -> Figure:
+    """A plot with lines of ten colours, error bars, a shaded band and text."""
+    rng = np.random.default_rng(3)
+    figure = Figure(figsize=(6.0, 4.0), layout="constrained")
+    axes = figure.subplots()
+    for row in rng.normal(size=(10, 30)):
+        axes.errorbar(np.arange(30), row.cumsum(), 0.3, alpha=0.7)
+    axes.axhspan(-1.0, 1.0, alpha=0.1)
+    axes.set_xlabel("particles M")
+    return figure
+
+
+def test_a_small_file_shows_the_same_figure(tmp_path: Path) -> None:
+    """The picture has the size asked for, no pixel is far from that of a file with all colours, which is larger."""
+    small, whole = tmp_path / "small.png", tmp_path / "whole.png"
+    save_png(_figure(), small, 120)
+    figure = _figure()
+    FigureCanvasAgg(figure)
+    figure.savefig(whole, dpi=120)
+    shown, expected = (imageio.imread(file)[:, :, :3].astype(int) for file in (small, whole))
+    assert shown.shape == expected.shape == (480, 720, 3)
+    apart = np.abs(shown - expected).max(axis=2)
+    assert apart.mean() < 1.0
+    assert np.quantile(apart, 0.999) <= 24
+    assert small.stat().st_size < 0.5 * whole.stat().st_size
+
+
+def test_the_same_figure_is_the_same_file(tmp_path: Path) -> None:
+    """A picture made twice is the same to the byte."""
+    for name in ("one.png", "two.png"):
+        save_png(_figure(), tmp_path / name, 80)
+    assert (tmp_path / "one.png").read_bytes() == (tmp_path / "two.png").read_bytes()
