@@ -3,7 +3,7 @@
 import numpy as np
 
 from slam_backend.alignment import Alignment, AlignmentOptions
-from slam_backend.branches import Branch, fork, replay
+from slam_backend.branches import Branch, fork
 from slam_backend.fusion import check_inliers
 from slam_backend.groups import Group
 from slam_backend.landmark_map import LandmarkMap
@@ -12,6 +12,7 @@ from slam_backend.merging import merge_filters
 from slam_backend.mixture_merging import merge_mixtures
 from slam_backend.records import Records
 from slam_backend.reports import MergeUndone, Renaming
+from slam_backend.undoing import Undoing
 from slam_backend.watching import Side, Watch, begin_watch
 
 
@@ -88,35 +89,33 @@ def contradicted(trunk: Branch, merging: MergeOptions, options: AlignmentOptions
     return None
 
 
-def undone(group: Group, records: Records, epoch: int) -> tuple[Group, Group]:
-    """Take back the last merge of a group, which is watched: both sides go on as if it had not been.
+def undone(group: Group, undoing: Undoing, records: Records, epoch: int) -> list[Group]:
+    """Take back a merge of a group, and those on top of it: all sides go on as if they had not been.
 
-    Each side's joint filter is taken up again as it was, and takes in what the group's joint filter knows of its
-    robots since, in order of time. Robots out of contact keep their forks until they return.
+    Robots out of contact keep their forks until they return.
 
     Args:
         group: Not to be used any more.
+        undoing: Of it; its sides have caught up with the group's joint filter.
         records: Of the team.
         epoch: Of the restored filters.
     """
     now = group.trunk
-    watch = now.watches[-1]
-    number_a, number_b = (side.trunk["number"] for side in watch.sides)
-    records.entries.append(MergeUndone((number_a, number_b, now.number)))
+    for watch in undoing.merges(now):
+        number_a, number_b = (side.trunk["number"] for side in watch.sides)
+        records.entries.append(MergeUndone((number_a, number_b, watch.number)))
     restored = []
-    for side in watch.sides:
-        trunk = Branch.from_state(side.trunk)
+    for trunk, replayed in zip(undoing.sides, undoing.replayed, strict=True):
         trunk.live, trunk.epoch = tuple(robot for robot in trunk.robots if robot in now.live), epoch
-        wanted = {robot: now.known[robot] for robot in trunk.robots if now.known[robot] > trunk.known[robot]}
-        records.note_replay(trunk, replay(trunk, records.log, wanted, most=None))
+        records.note_replay(trunk, replayed)
         restored.append(Group(trunk))
     for branch in group.branches[1:]:
         _hand_over(branch, restored, records)
-    return restored[0], restored[1]
+    return restored
 
 
 def _hand_over(branch: Branch, restored: list[Group], records: Records) -> None:
-    """Give a fork to the restored group of its robots; one that both need is copied."""
+    """Give a fork to the restored group of its robots; one that several need is copied."""
     homes = [group for group in restored if any(robot in group.robots for robot in branch.live)]
     for group in homes[1:]:
         own = tuple(robot for robot in branch.live if robot in group.robots)

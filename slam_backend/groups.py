@@ -9,6 +9,7 @@ from slam_backend.branches import Branch, fork, landmark_counts, missing, parts,
 from slam_backend.errors import IntArray
 from slam_backend.filter import FastSlam
 from slam_backend.records import Records
+from slam_backend.undoing import Undoing
 from slam_backend.watching import Watch
 
 
@@ -21,10 +22,12 @@ class Group:
 
     Attributes:
         branches: The trunk, then the forks. Each robot goes by exactly one of them.
+        undoing: Of a merge that is being taken back; None: none is.
     """
 
     def __init__(self, trunk: Branch, forks: Sequence[Branch] = ()) -> None:
         self.branches = [trunk, *forks]
+        self.undoing: Undoing | None = None
 
     @property
     def trunk(self) -> Branch:
@@ -107,18 +110,23 @@ class Group:
         watches = [watch for branch in self.branches for watch in branch.watches]
         return {branch.number for branch in self.branches}.union(*map(_numbers, watches))
 
-    def get_state(self) -> tuple[dict[str, Any], ...]:
-        """Return all that decides how the group goes on: the states of its branches."""
-        return tuple(branch.get_state() for branch in self.branches)
+    def get_state(self) -> dict[str, Any]:
+        """Return all that decides how the group goes on."""
+        return {
+            "branches": tuple(branch.get_state() for branch in self.branches),
+            "undoing": None if self.undoing is None else self.undoing.get_state(),
+        }
 
     @classmethod
-    def from_state(
-        cls, state: Sequence[Mapping[str, Any]], at_hand: Mapping[tuple[int, ...], FastSlam] | None = None
-    ) -> "Group":
+    def from_state(cls, state: Mapping[str, Any], at_hand: Mapping[tuple[int, ...], FastSlam] | None = None) -> "Group":
         """Build a group from `get_state`; a filter at hand for the trunk, by its robots, is filled."""
         at_hand = {} if at_hand is None else at_hand
-        trunk = Branch.from_state(state[0], at_hand.get(state[0]["robots"]))
-        return cls(trunk, [Branch.from_state(branch) for branch in state[1:]])
+        trunk, *forks = state["branches"]
+        group = cls(
+            Branch.from_state(trunk, at_hand.get(trunk["robots"])), [Branch.from_state(branch) for branch in forks]
+        )
+        group.undoing = None if state["undoing"] is None else Undoing.from_state(state["undoing"])
+        return group
 
 
 def _oldest_unknown(branch: Branch, now: int) -> int:

@@ -34,6 +34,7 @@ from slam_backend.merging import inverse_alignment
 from slam_backend.records import Records
 from slam_backend.reports import MapDropped, MergeEvent, RejuvenationReport, Renaming, TeamReport
 from slam_backend.team_knowledge import TeamKnowledge
+from slam_backend.undoing import Undoing
 
 
 class TeamSlam(TeamKnowledge):
@@ -218,26 +219,31 @@ class TeamSlam(TeamKnowledge):
         """Weigh the evidence about the merges that can still be undone, and undo what contradicts itself."""
         due = self._step % self._merging.watch_every == 0
         for group in list(self._groups):
-            false = contradicted(group.trunk, self._merging, self._alignment) if due else None
-            if false is not None:
-                self._undo(group, false.number)
+            if due and group.undoing is None:
+                false = contradicted(group.trunk, self._merging, self._alignment)
+                group.undoing = None if false is None else Undoing.of(group.trunk, false.number)
+            if group.undoing is not None:
+                self._undo(group, group.undoing)
                 continue
             for branch in group.branches:
                 while branch.watches and branch.watches[0].steps >= self._merging.watch_steps:
                     branch.watches.pop(0)
 
-    def _undo(self, group: Group, number: int) -> None:
-        """Take back a merge of a group, and first those on top of it, the last one first."""
-        watch, self._epoch = group.trunk.watches[-1], self._epoch + 1
-        pair = (watch.sides[0].robots, watch.sides[1].robots)
-        sides = undone(group, self._records, self._epoch)
-        self._replace([group], sides)
-        self._events.append(MergeEvent(self._step, "undo", *pair, watch.alignment))
-        if watch.number == number:
-            self._schedule.bar(pair, self._step + self._merging.barred_steps)
+    def _undo(self, group: Group, undoing: Undoing) -> None:
+        """Go on with taking back a merge; it is done when all sides have caught up and are in contact."""
+        merges = undoing.merges(group.trunk)
+        if not merges:  # the joint filter is another one now, whose window is over
+            group.undoing = None
             return
-        below = next(side for side in sides if any(older.number == number for older in side.trunk.watches))
-        self._undo(below, number)
+        caught_up = undoing.catch_up(group.trunk, self._records.log)
+        if not caught_up or not all(watch.together(group.trunk.live) for watch in merges):
+            return
+        self._epoch += 1
+        self._replace([group], undone(group, undoing, self._records, self._epoch))
+        for watch in merges:
+            pair = (watch.sides[0].robots, watch.sides[1].robots)
+            self._events.append(MergeEvent(self._step, "undo", *pair, watch.alignment))
+        self._schedule.bar(pair, self._step + self._merging.barred_steps)
 
     def _attempt(self, networks: IntArray) -> tuple[Renaming, ...]:
         """Let the most promising pair of groups try, if it is time."""
@@ -248,6 +254,7 @@ class TeamSlam(TeamKnowledge):
         for i, a in enumerate(self._groups):
             for b in self._groups[i + 1 :]:
                 touch = networks[a.trunk.live[0]] == networks[b.trunk.live[0]]
+                touch &= a.undoing is None and b.undoing is None
                 if touch and self._schedule.may_try((a.robots, b.robots), self._step):
                     pairs[a.robots, b.robots] = (a, b)
                     for group in (a, b):
@@ -313,7 +320,7 @@ class TeamSlam(TeamKnowledge):
         missing = [key for key in self._KEYS if not isinstance(state, Mapping) or key not in state]
         if missing:
             raise bad_argument("state", "a dict from TeamSlam.get_state", f"no {missing[0]!r}", "Pass it unchanged.")
-        count = sum(len(group[0]["robots"]) for group in state["groups"])
+        count = sum(len(group["branches"][0]["robots"]) for group in state["groups"])
         if count != self.num_robots:
             raise bad_argument("state", f"one of {self.num_robots} robots", count, "Build a team of the same size.")
         self._step, self._epoch = state["step"], state["epoch"]

@@ -11,13 +11,16 @@ from merged_pair import NEVER, false_alignment, links, true_alignment
 from same_bits import assert_same
 from simulated_team import SimulatedTeam
 
+from slam_backend import undoing
 from slam_backend.alignment import AlignmentOptions, align_maps
 from slam_backend.attempts import AttemptOptions
+from slam_backend.branches import MOST_REPLAYED
 from slam_backend.geometry import inverse
 from slam_backend.landmark_map import LandmarkMap
 from slam_backend.merge_options import MergeOptions
 from slam_backend.reports import MapDropped, MergeUndone, TeamReport
 from slam_backend.team import TeamSlam
+from slam_backend.undoing import Undoing
 from slam_backend.watching import moved_share
 
 METRE = np.array([1.0, 0.0, 0.0])
@@ -257,3 +260,98 @@ def test_a_team_goes_on_from_a_snapshot_bit_for_bit_through_an_undo() -> None:
     assert kinds(team) == ["merge", "merge", "undo", "undo"]
     assert_same(restored.get_state(), team.get_state())
     assert_same(state, kept)
+
+
+# ---------------------------------------------------------------------- an undo takes its time
+
+
+UNWATCHED = MergeOptions(watch_every=10_000)  # only what a test doubts is undone
+
+
+def doubted(team: TeamSlam) -> None:
+    """Begin to take back the oldest merge of the first group."""
+    group = team._groups[0]
+    group.undoing = Undoing.of(group.trunk, group.trunk.watches[0].number)
+
+
+def taken_in(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Return a list that gets one entry, its step, whenever an undo lets a filter take in a step."""
+    steps: list[int] = []
+    original = undoing.replay
+
+    def counted(*args: Any) -> Any:
+        done = original(*args)
+        steps.extend(one.step for one in done)
+        return done
+
+    monkeypatch.setattr(undoing, "replay", counted)
+    return steps
+
+
+def test_an_undo_takes_in_few_steps_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Twenty in a tick, of both sides together, while the joint filter is in force; then all is as if never merged."""
+    steps = taken_in(monkeypatch)
+    simulation, team = pair_of(101, merging=UNWATCHED)
+    other, twin = pair_of(101, merging=UNWATCHED)
+    team.merge(0, 1, false_alignment(simulation, team, FAR))
+    simulation.run(team, 30)
+    other.run(twin, 30)
+    doubted(team)
+    for tick in range(1, 5):
+        before = len(steps)
+        simulation.run(team, 1)
+        other.run(twin, 1)
+        done = tick == 4  # of each side 30 + tick steps wait, of which ten are taken in
+        assert len(steps) - before == (8 if done else MOST_REPLAYED)
+        assert team.groups == (((0,), (1,)) if done else ((0, 1),))
+    assert kinds(team) == ["merge", "undo"]
+    for robot in range(2):
+        assert_same(contents(team._find(robot)[0].filter), contents(twin._find(robot)[0].filter))
+
+
+def test_an_undo_waits_for_contact_and_goes_on_from_a_snapshot() -> None:
+    """Sides that lose contact while an undo is under way stay as they are until they meet; a restored team likewise."""
+    simulation, team = pair_of(101, merging=UNWATCHED)
+    team.merge(0, 1, false_alignment(simulation, team, FAR))
+    simulation.run(team, 30)
+    doubted(team)
+    simulation.run(team, 1)
+    state, restored, again = pickle.loads(pickle.dumps(team.get_state())), TeamSlam(2), copy.deepcopy(simulation)
+    restored.set_state(state)
+    for cut in (True, False):
+        for _ in range(20 if cut else 8):
+            contacts = links(2) if cut else None
+            assert_same(restored.step(*again.read(), contacts), team.step(*simulation.read(), contacts))
+        assert kinds(team) == (["merge"] if cut else ["merge", "undo"])
+    assert_same(restored.get_state(), team.get_state())
+    assert simulation.position_errors(team).max() < 0.4
+
+
+def test_a_group_in_doubt_does_not_merge() -> None:
+    """While an undo is under way its group makes no attempts; a merge by hand makes a new group, doubted in turn."""
+    simulation = SimulatedTeam(num_robots=3, seed=104)
+    team = simulation.build(attempts=AttemptOptions(every=1), merging=UNWATCHED)
+    simulation.run(team, 80, links(3))
+    team.merge(0, 1, false_alignment(simulation, team, FAR))
+    simulation.run(team, 30, links(3, (0, 1)))
+    doubted(team)
+    simulation.run(team, 2)
+    assert [event.kind for event in team.events] == ["merge"]
+    team.merge(0, 2, true_alignment(simulation, team, 0, 2))
+    assert team._groups[0].undoing is None
+    doubted(team)
+    simulation.run(team, 20)
+    assert kinds(team)[:4] == ["merge", "merge", "undo", "undo"]
+    assert [event.robots_a for event in team.events[:4]] == [(0,), (0, 1), (0, 1), (0,)]
+
+
+def test_a_doubt_ends_with_the_watch_of_the_filter_that_goes_on() -> None:
+    """A joint filter that does not watch the merge any more does not take it back."""
+    simulation, team = pair_of(101, merging=UNWATCHED)
+    team.merge(0, 1, false_alignment(simulation, team, FAR))
+    simulation.run(team, 30)
+    doubted(team)
+    team._groups[0].trunk.watches.clear()
+    simulation.run(team, 1)
+    assert team._groups[0].undoing is None
+    assert kinds(team) == ["merge"]
