@@ -7,13 +7,13 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator
 
 from slam_backend.errors import FloatArray
 from training.paper_regimes import REGIMES
+from training.png import save_png
 from vslam_env.rendering.palette import robot_colour
 
 MARKERS = ("o", "s", "^")  # of one, two and three robots, as in the paper
@@ -37,7 +37,6 @@ def draw_fig6(file: Path, lines: Lines) -> None:
     rows = -(-len(panels) // columns)
     with mpl.rc_context({"font.size": 9, "axes.titlesize": 9.5}):
         figure = Figure(figsize=(4.2 * columns, 3.1 * rows + 0.5), layout="constrained")
-        FigureCanvasAgg(figure)
         axes = figure.subplots(rows, columns, squeeze=False).ravel()
         for letter, ax, title, (label, key, own) in zip("abcd", axes, titles, panels, strict=False):
             _draw_panel(ax, own, key)
@@ -51,7 +50,7 @@ def draw_fig6(file: Path, lines: Lines) -> None:
             handles=_legend(robots, proposals), loc="outside lower center", ncols=len(robots) + len(proposals),
             frameon=False,
         )  # fmt: skip
-        figure.savefig(file, dpi=150)
+        save_png(figure, file, 150)
 
 
 def _draw_panel(ax: Axes, lines: Lines, key: str) -> None:
