@@ -17,6 +17,7 @@ from slam_backend._evidence import (
     one_to_one,
     strongest_rival,
 )
+from slam_backend._recurrence import recurs
 from slam_backend.alignment_types import (
     REASONS,
     RIVAL_ANGLE,
@@ -113,6 +114,10 @@ def align_maps(
     points_b = map_b.means[inliers[:, 1], :2]
     ratio = strongest_rival(table, matches, hypotheses, pose, variance, points_b.mean(axis=0), options)
     if ratio > options.max_ratio:
+        return Alignment.refused("ambiguous", ratio)
+    if options.appearance and any(
+        recurs(landmarks, rows, variance, options) for landmarks, rows in zip((map_a, map_b), inliers.T, strict=True)
+    ):
         return Alignment.refused("ambiguous", ratio)
     if is_mirrored(table, matches, pose, inside, options):
         return Alignment.refused("mirrored", ratio)
