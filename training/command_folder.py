@@ -95,11 +95,13 @@ def begin(
         goes_on: Whether `out` may be the folder of the same run, stopped half-way.
 
     Raises:
-        ValueError: If the folder is not free or cannot be made.
+        ValueError: If the folder is not free or cannot be made; nothing has been compiled then.
     """
     from training.kept_trials import open_folder
-    from training.run_folder import RunFolder
+    from training.run_folder import CONFIG_FILE, RunFolder, check_free
 
+    if out is not None and not (goes_on and (out / CONFIG_FILE).is_file()):
+        check_free(out)  # at once: the compiler may take a minute
     open_or_create = open_folder if goes_on else RunFolder.create
     folders: list[RunFolder] = []
     prepare(*first_steps, lambda: folders.append(open_or_create(out, command, chosen.to_mapping(), chosen.seed)))

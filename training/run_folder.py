@@ -192,18 +192,34 @@ def _drop_none(value: Any) -> Any:
     return value
 
 
-def _claim(folder: Path) -> Path:
-    """Make `folder`, or take it if it is empty."""
+def check_free(folder: Path) -> None:
+    """Refuse a folder that no run can have, before work that takes a while. It is not made.
+
+    Raises:
+        ValueError: If it is a file, holds files, or could not be made or written.
+    """
     cure = f"Choose another than {str(folder)!r}, or leave --out away."
     if folder.is_file():
         raise bad_argument("out", "a new or empty folder", "a file", cure)
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        full = any(folder.iterdir())
+        full = folder.is_dir() and any(folder.iterdir())
+        if not full:
+            there = next(place for place in (folder, *folder.absolute().parents) if place.exists())
+            tempfile.TemporaryFile(dir=there).close()
     except OSError as error:
         raise bad_argument("out", "a folder that can be written", f"no access ({error.strerror})", cure) from error
     if full:
         raise bad_argument("out", "a new or empty folder", "a folder with files", cure)
+
+
+def _claim(folder: Path) -> Path:
+    """Make `folder`, or take it if it is empty."""
+    check_free(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        cure = f"Choose another than {str(folder)!r}, or leave --out away."
+        raise bad_argument("out", "a folder that can be written", f"no access ({error.strerror})", cure) from error
     return folder
 
 

@@ -96,6 +96,16 @@ def test_first_steps_come_before_the_folder(tmp_path: Path) -> None:
         begin("count", Numbers(many=3), out)
 
 
+@pytest.mark.parametrize("below", [False, True])
+def test_a_folder_that_cannot_be_had_is_refused_before_any_work(below: bool, tmp_path: Path) -> None:
+    """Nobody waits for the compiler to read that the folder is a file, or is to stand where a file is."""
+    (tmp_path / "file").write_text("x")
+    out, done = tmp_path / "file" / "run" if below else tmp_path / "file", []
+    with pytest.raises(ValueError, match=r"out: expected a (new or empty folder|folder that can be written), got"):
+        begin("count", Numbers(), out, lambda: done.append(1), goes_on=True)
+    assert done == []
+
+
 @pytest.mark.parametrize(("held", "status"), [([True, True], 0), ([True, False], 1), ([], 1)])
 def test_check_turns_missed_goals_into_status_1(held: list[bool], status: int, tmp_path: Path) -> None:
     """With --check a missed goal, or none at all, is status 1; the metrics are written either way."""
