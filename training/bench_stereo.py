@@ -18,6 +18,7 @@ from training.stereo_scenes import Scene, panel_hall
 from vslam_env.sensors.stereo_textures import STYLES, TextureConfig
 
 BUSY = TextureConfig(polygons=20.0, posters=0.6)  # enough corners for 100 landmarks in an image
+CROWDED = 2  # [px] between corners where more than 100 landmarks are wanted: 4 px leave 270 corners in an image
 WARM_UP = 5  # pairs that are not timed
 WINDOW = 0.6  # [m] of the descriptor window of constant physical size
 
@@ -75,9 +76,9 @@ def speed_row(width: int, landmarks: int, walls: int, descriptor: Any, steps: in
     """
     camera = camera_of(width)
     scene = Scene(panel_hall(walls), camera, seed, BUSY)
-    options = FrontEndOptions(
-        descriptor=descriptor, corners=CornerOptions(most=round(2.6 * landmarks)), max_measurements=landmarks
-    )
+    spacing = CROWDED if landmarks > 100 else CornerOptions().spacing
+    corners = CornerOptions(most=round(2.6 * landmarks), spacing=spacing)
+    options = FrontEndOptions(descriptor=descriptor, corners=corners, max_measurements=landmarks)
     front_end, rng = StereoFrontEnd(camera, options), np.random.default_rng(seed)
     pose = np.array([1.5, 3.0, 0.5])
     view = scene.look(pose, rng)
