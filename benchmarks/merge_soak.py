@@ -3,6 +3,7 @@
     python benchmarks/merge_soak.py --minutes 10 --json merge_soak.json
     python benchmarks/merge_soak.py --minutes 10 --forced
     python benchmarks/merge_soak.py --minutes 10 --kind environment
+    python benchmarks/merge_soak.py --minutes 10 --kind both
 
 Runs are stereo runs through offices of aisles, 100 m per robot, with look-alikes in classes of one to three, false
 points and wrong descriptors; or episodes of the environment in all its families of worlds, up to all landmarks with a
@@ -34,6 +35,7 @@ from slam_backend.attempts import AttemptOptions
 from slam_backend.errors import FloatArray, IntArray, bad_argument, check_choice, check_int
 from slam_backend.geometry import between, inverse, rotation
 from slam_backend.landmark_map import LandmarkMap
+from slam_backend.merge_options import MergeOptions
 from slam_backend.reports import MergeEvent
 from slam_backend.team import TeamSlam
 from training.episode import is_false_merge
@@ -41,7 +43,7 @@ from training.run_folder import check_writable, plain
 from training.stereo_runs import STEP, RunSpec, simulate_run
 from vslam_env import ExplorationEnv, preset_config
 
-KINDS = ("aisles", "environment")
+KINDS = ("aisles", "environment", "both")
 WORLDS = ("office", "loops", "maze", "hall", "fig5")
 REPEATED = (0.0, 0.5, 1.0)  # shares of landmarks that look like another one
 RADIOS: tuple[dict[str, Any], ...] = ({}, {"comm_range": 8.0}, {"comm_line_of_sight": True}, {"comm_loss": 0.2})
@@ -91,7 +93,49 @@ class MergeFate:
         return self.undone_after is None or self.undone_after > WINDOW
 
 
-def make_env(seed: int, cycles: int, forced: bool, rejuvenate_every: int | None) -> ExplorationEnv:
+@dataclass(slots=True)
+class Delay:
+    """An attempt whose maps aligned as they were, but not once they were straight.
+
+    Attributes:
+        seed: Of its run.
+        step: When it was made.
+        reason: Why it was refused.
+        merged_after: Steps until the two groups' first robots shared a map; None: they never did.
+    """
+
+    seed: int
+    step: int
+    reason: str
+    merged_after: int | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Setting:
+    """What the command line decides about each run.
+
+    Attributes:
+        forced: Merge wrongly on purpose.
+        shift: How [m]; None: by the motion that fits best.
+        rejuvenate_every: Of the filters; None: their default.
+        straighten: Maps before a merge.
+    """
+
+    forced: bool = False
+    shift: float | None = None
+    rejuvenate_every: int | None = None
+    straighten: bool = True
+
+    @property
+    def filter(self) -> dict[str, Any]:
+        """Options of the filters that are not their defaults."""
+        return {} if self.rejuvenate_every is None else {"rejuvenate_every": self.rejuvenate_every}
+
+
+Fates = tuple[list[MergeFate], list[Delay]]
+
+
+def make_env(seed: int, cycles: int, setting: Setting) -> ExplorationEnv:
     """Return the environment of an episode: the seed decides about everything."""
     rng = np.random.default_rng([seed, 17])
     config = preset_config("standard").replace(
@@ -99,23 +143,25 @@ def make_env(seed: int, cycles: int, forced: bool, rejuvenate_every: int | None)
         num_robots=int(rng.integers(2, 5)),
         max_cycles=cycles,
         landmarks={"repeated": float(rng.choice(REPEATED))},
-        belief={"attempts": {"enabled": not forced}, "filter": {"rejuvenate_every": rejuvenate_every}},
-        **({} if forced else RADIOS[int(rng.integers(len(RADIOS)))]),
+        belief={
+            "attempts": {"enabled": not setting.forced},
+            "merging": {"straighten": setting.straighten},
+            "filter": setting.filter,
+        },
+        **({} if setting.forced else RADIOS[int(rng.integers(len(RADIOS)))]),
     )
     return ExplorationEnv(config)
 
 
-def play_environment(
-    seed: int, cycles: int, forced: bool, shift: float | None, rejuvenate_every: int | None
-) -> list[MergeFate]:
+def play_environment(seed: int, cycles: int, setting: Setting) -> Fates:
     """Run one episode and return what became of its merges."""
-    env = make_env(seed, cycles, forced, rejuvenate_every)
+    env = make_env(seed, cycles, setting)
     rng = np.random.default_rng([seed, 18])
     policies = [make_policy("frontier", env.config.action_type) for _ in env.possible_agents]
     observations, _ = env.reset(seed=seed)
     while env.agents:
-        if forced and not env.events:
-            force(env, rng, shift)
+        if setting.forced and not env.events:
+            force(env, rng, setting.shift)
         actions = {
             agent: policy.act(observations[agent], env.belief(agent), rng)
             for agent, policy in zip(env.agents, policies, strict=True)
@@ -126,9 +172,7 @@ def play_environment(
     return fates(env.events, env.true_start_poses, placed, seed, env.config.world, alike, env.episode.tick)
 
 
-def play_aisles(
-    seed: int, cycles: int, forced: bool, shift: float | None, rejuvenate_every: int | None
-) -> list[MergeFate]:
+def play_aisles(seed: int, cycles: int, setting: Setting) -> Fates:
     """Let a team live through one stereo run of `cycles` steps and return what became of its merges."""
     rng = np.random.default_rng([seed, 17])
     robots, look_alikes = int(rng.integers(2, 5)), int(rng.integers(1, 4))
@@ -138,21 +182,21 @@ def play_aisles(
     run = simulate_run(spec, seed)
     noise = spec.noise
     camera = replace(noise.camera, sigma_px=2 * noise.sigma_px, sigma_disparity_px=2 * noise.sigma_disparity_px)
-    attempts = AttemptOptions(enabled=not forced)
     team = TeamSlam(
-        robots, seed=seed, attempts=attempts, num_particles=50, camera=camera, motion=noise.motion,
-        rejuvenate_every=rejuvenate_every,
+        robots, seed=seed, attempts=AttemptOptions(enabled=not setting.forced),
+        merging=MergeOptions(straighten=setting.straighten), num_particles=50, camera=camera, motion=noise.motion,
+        **setting.filter,
     )  # fmt: skip
     starts = run.true_paths[:, 0]
-    broken = not forced and rng.random() < 0.5
+    broken = not setting.forced and rng.random() < 0.5
     up = np.ones((robots, robots), dtype=np.bool_)
     for reading in run.readings():
         if broken:
             change = np.triu(np.where(up, rng.random(up.shape) < LOSES, rng.random(up.shape) < FINDS), 1)
             up = up ^ (change | change.T)
         team.step(reading["odometry"], reading["measurements"], up)
-        if forced and not team.events and min(len(team.map(robot)) for robot in range(2)) >= ENOUGH:
-            team.merge(0, 1, forced_alignment(starts, team.map(0), team.map(1), rng, shift))
+        if setting.forced and not team.events and min(len(team.map(robot)) for robot in range(2)) >= ENOUGH:
+            team.merge(0, 1, forced_alignment(starts, team.map(0), team.map(1), rng, setting.shift))
     placed = [inverse(team.start_from_group(robot)) for robot in range(robots)]
     return fates(team.events, starts, placed, seed, "aisles", f"classes of {look_alikes}", run.num_steps)
 
@@ -233,8 +277,8 @@ def off_by(starts: FloatArray, event: MergeEvent, motion: FloatArray) -> tuple[f
 def fates(
     events: Sequence[MergeEvent], starts: FloatArray, placed: Sequence[FloatArray], seed: int, world: str, alike: str,
     steps: int,
-) -> list[MergeFate]:  # fmt: skip
-    """Return what became of the merges of a run that has ended after so many steps.
+) -> Fates:  # fmt: skip
+    """Return what became of the merges of a run that has ended after so many steps, and which came later.
 
     Args:
         events: Of the run.
@@ -256,10 +300,22 @@ def fates(
                     *(off_by(starts, event, end) if undone is None else (float("nan"), float("nan"))),
                 )
             )  # fmt: skip
+    return found, delays(events, seed)
+
+
+def delays(events: Sequence[MergeEvent], seed: int) -> list[Delay]:
+    """Return the attempts of a run that were refused only because maps were straightened."""
+    found = []
+    for i, event in enumerate(events):
+        if event.straightened and not event.alignment.success:
+            pair = {event.robots_a[0], event.robots_b[0]}
+            merged = (e.step for e in events[i:] if e.kind == "merge" and len(pair & {*e.robots_a, *e.robots_b}) == 2)
+            later = next(merged, None)
+            found.append(Delay(seed, event.step, event.alignment.reason, later and later - event.step))
     return found
 
 
-def summarise(merges: list[MergeFate], runs: int, steps: int) -> dict[str, Any]:
+def summarise(merges: list[MergeFate], late: list[Delay], runs: int, steps: int) -> dict[str, Any]:
     """Return the figures of all runs together."""
     false = [merge for merge in merges if merge.is_false]
     right = [merge for merge in merges if not merge.is_false]
@@ -275,6 +331,10 @@ def summarise(merges: list[MergeFate], runs: int, steps: int) -> dict[str, Any]:
         "false_merges_in_force": sum(merge.counts for merge in false),
         "false_at_the_end": sum(is_false_merge(merge.end_m, merge.end_deg) for merge in merges),
         "steps_until_undone_median": float(np.median(after)) if after else float("nan"),
+        "rms_error_m": float(np.sqrt(np.mean([merge.error_m**2 for merge in merges]))) if merges else float("nan"),
+        "largest_error_m": max((merge.error_m for merge in merges), default=float("nan")),
+        "refused_once_straight": len(late),
+        "never_merged_after_that": sum(delay.merged_after is None for delay in late),
     }
 
 
@@ -282,10 +342,13 @@ def main(
     minutes: Annotated[float, typer.Option(help="How long; the last run is played to its end.")] = 10.0,
     first_seed: Annotated[int, typer.Option(help="Of the first run.")] = 100,
     cycles: Annotated[int | None, typer.Option(help="Steps of a run.", show_default="400, episodes 1500")] = None,
-    kind: Annotated[str, typer.Option(help="aisles or environment.")] = "aisles",
+    kind: Annotated[str, typer.Option(help="aisles, environment or both.")] = "aisles",
     forced: Annotated[bool, typer.Option(help="Merge wrongly on purpose.")] = False,
     shift: Annotated[float | None, typer.Option(help="Forced merges are off by these metres and not turned.")] = None,
-    rejuvenate_every: Annotated[int | None, typer.Option(help="Steps of a filter between its rejuvenations.")] = None,
+    rejuvenate_every: Annotated[
+        int | None, typer.Option(help="Steps of a filter between its rejuvenations.", show_default="the default")
+    ] = None,
+    straighten: Annotated[bool, typer.Option(help="Straighten maps before they merge.")] = True,
     json_file: Annotated[Path | None, typer.Option("--json", help="Write all figures to this file.")] = None,
 ) -> None:
     """Run the soak and print it."""
@@ -294,20 +357,23 @@ def main(
     check_choice("kind", kind, KINDS)
     if shift is not None and not (forced and shift >= 0.0):
         raise bad_argument("shift", "metres, with --forced", shift, "Add --forced, or leave it out.")
-    cycles = (400 if kind == "aisles" else 1500) if cycles is None else cycles
-    check_int("cycles", cycles, 2, "Give a number of steps.")
+    if cycles is not None:
+        check_int("cycles", cycles, 2, "Give a number of steps.")
     check_int("first_seed", first_seed, 0, "Seeds are not negative.")
     if json_file is not None:
         check_writable(json_file, "json")
+    setting = Setting(forced=forced, shift=shift, rejuvenate_every=rejuvenate_every, straighten=straighten)
     console = Console(highlight=False, soft_wrap=True)
-    begin, merges, played = time.monotonic(), [], 0
+    merges: list[MergeFate] = []
+    late: list[Delay] = []
+    begin, played, steps = time.monotonic(), 0, 0
     for seed in count(first_seed):
         if time.monotonic() - begin > 60.0 * minutes:
             break
-        found = (play_aisles if kind == "aisles" else play_environment)(
-            seed, cycles, forced, shift, rejuvenate_every
-        )
-        merges, played = merges + found, played + 1
+        aisles = kind == "aisles" or (kind == "both" and seed % 2 == 0)
+        length = (400 if aisles else 1500) if cycles is None else cycles
+        found, delayed = (play_aisles if aisles else play_environment)(seed, length, setting)
+        merges, late, played, steps = merges + found, late + delayed, played + 1, steps + length
         for merge in found:
             fate = (
                 f"in force, {merge.end_m:.2f} m {merge.end_deg:.1f} deg off at the end"
@@ -319,11 +385,17 @@ def main(
                 f"{merge.step}, {merge.error_m:.2f} m {merge.error_deg:.1f} deg off"
                 f"{', FALSE' if merge.is_false else ''}, {fate}"
             )
-    summary = summarise(merges, played, played * cycles)
+    summary = summarise(merges, late, played, steps)
     for name, value in summary.items():
         console.print(f"{name:30s} {value}")
+    record = {
+        "setting": asdict(setting) | {"kind": kind, "minutes": minutes, "first_seed": first_seed},
+        "summary": summary,
+        "merges": [asdict(merge) for merge in merges],
+        "delays": [asdict(delay) for delay in late],
+    }
     if json_file is not None:
-        json_file.write_text(json.dumps(plain({"summary": summary, "merges": [asdict(m) for m in merges]}), indent=2))
+        json_file.write_text(json.dumps(plain(record), indent=1))
 
 
 if __name__ == "__main__":

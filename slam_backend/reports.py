@@ -79,6 +79,8 @@ class MergeEvent:
         robots_a: The group whose map frame stays.
         robots_b: The other group.
         alignment: `map` of group a from `map` of group b, as found; refused attempts carry the reason.
+        straightened: Whether the maps had aligned as they were, so that they were straightened, and `alignment` is that
+            of the straight ones.
     """
 
     step: int
@@ -86,6 +88,7 @@ class MergeEvent:
     robots_a: tuple[int, ...]
     robots_b: tuple[int, ...]
     alignment: "Alignment"
+    straightened: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)

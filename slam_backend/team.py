@@ -267,10 +267,12 @@ class TeamSlam(TeamKnowledge):
         alignment = align_maps(maps[a.robots], maps[b.robots], rng=self._rng, options=self._alignment)
         speakers = a.trunk.live[0], b.trunk.live[0]
         self._records.exchange.record_maps(*speakers, maps[a.robots], maps[b.robots])
-        if alignment.success and self._merging.straighten and (straight := straightened(a, b)) is not None:
+        straight = straightened(a, b) if alignment.success and self._merging.straighten else None
+        if straight is not None:
             alignment = align_maps(*straight, rng=self._rng, options=self._alignment)
             self._records.exchange.record_straightened(*speakers, *straight)
-        self._events.append(MergeEvent(self._step, "attempt", a.robots, b.robots, alignment))
+        attempt = MergeEvent(self._step, "attempt", a.robots, b.robots, alignment, straight is not None)
+        self._events.append(attempt)
         self._schedule.record(chosen, self._step, alignment.success)
         return (self.merge(*speakers, alignment),) if alignment.success else ()
 
