@@ -49,8 +49,8 @@ def chessboard(folder: Path) -> dict[str, Any]:
 
     Returns:
         Pairs; the reprojection error of the calibration [px]; points of the front end on the board; their distance
-        from the plane that most of them agree on: median in squares and as a share of the depth, and the share of the
-        points within a twentieth of a square (the others were matched to a square beside theirs).
+        from the plane of the board's corners, as OpenCV's search for a chessboard finds them in both images: median in
+        squares and as a share of the depth, and the share of the points within a twentieth of a square.
     """
     images, left_points, right_points = [], [], []
     for number in (1, 2, 3, 4, 5, 6, 7, 8, 9, 11, 12, 13, 14):
@@ -84,8 +84,8 @@ def chessboard(folder: Path) -> dict[str, Any]:
     away, depths = [], []
     for raw in images:
         rectified = rectifier.rectify(*raw)
-        corners = _board(rectified[0])
-        if corners is None:
+        corners, others = (_board(image) for image in rectified)
+        if corners is None or others is None:
             continue
         frame = front_end.measure(*rectified)
         hull = cv2.convexHull(corners)
@@ -93,13 +93,11 @@ def chessboard(folder: Path) -> dict[str, Any]:
         points = frame.measurements.points[np.array(on_board, dtype=bool)]
         if len(points) < 10:
             continue
-        middle = np.median(points, axis=0)
-        kept = points
-        for _ in range(5):  # the plane of what agrees
-            middle = kept.mean(axis=0)
-            normal = np.linalg.svd(kept - middle)[2][2]
-            distance = np.abs((points - middle) @ normal)
-            kept = points[distance <= 3.0 * 1.4826 * np.median(distance)]
+        found, partners = corners.reshape(-1, 2), others.reshape(-1, 2)
+        seen = np.column_stack([found - rectifier.pair.centre_px, found[:, 0] - partners[:, 0]])
+        board = camera.triangulate(seen.astype(np.float64))
+        middle = board.mean(axis=0)
+        normal = np.linalg.svd(board - middle)[2][2]
         away.append(np.abs((points - middle) @ normal))
         depths.append(points[:, 2])
     distances, depth = np.concatenate(away), np.concatenate(depths)

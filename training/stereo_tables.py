@@ -34,9 +34,9 @@ def markdown(result: dict[str, Any]) -> str:
         row = result["chessboard"]
         parts.append(
             f"**Chessboard rig**: {row['pairs']} pairs, calibrated to {row['calibration_px']:.2f} px; {row['points']} "
-            f"points on the board lie {row['median_squares']:.3f} squares (median) off their plane, "
-            f"{row['median_percent_of_depth']:.2f} % of the depth; {100 * row['within_20th']:.0f} % lie within 0.05 "
-            f"squares of it, the others were matched to a square beside theirs."
+            f"points on the board lie {row['median_squares']:.3f} squares (median) off its plane, "
+            f"{row['median_percent_of_depth']:.2f} % of the depth; {100 * row['within_20th']:.1f} % lie within 0.05 "
+            f"squares of it."
         )
     if "planar" in result:
         parts.append(_planar(result["planar"]))

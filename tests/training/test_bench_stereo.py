@@ -146,7 +146,7 @@ def test_real_images(data_dir: Path) -> None:
     board = chessboard(data_dir / "opencv_samples")
     assert board["pairs"] >= 10
     assert board["median_percent_of_depth"] < 0.2
-    assert board["within_20th"] > 0.6
+    assert board["within_20th"] > 0.95
     planar = planar_scores(data_dir / "homogr")
     own = {row["pair"]: row["right"] for row in planar if row["way"] == "usurf"}
     assert own["adam"] > 100
