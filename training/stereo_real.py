@@ -84,7 +84,7 @@ def chessboard(folder: Path) -> dict[str, Any]:
     away, depths = [], []
     for raw in images:
         rectified = rectifier.rectify(*raw)
-        corners, others = (_board(image) for image in rectified)
+        corners, others = _board(rectified[0]), _board(rectified[1])
         if corners is None or others is None:
             continue
         frame = front_end.measure(*rectified)
@@ -93,9 +93,9 @@ def chessboard(folder: Path) -> dict[str, Any]:
         points = frame.measurements.points[np.array(on_board, dtype=bool)]
         if len(points) < 10:
             continue
-        found, partners = corners.reshape(-1, 2), others.reshape(-1, 2)
-        seen = np.column_stack([found - rectifier.pair.centre_px, found[:, 0] - partners[:, 0]])
-        board = camera.triangulate(seen.astype(np.float64))
+        here, there = corners.reshape(-1, 2), others.reshape(-1, 2)
+        centre = rectifier.pair.centre_px
+        board = camera.triangulate(np.column_stack([here - centre, here[:, 0] - there[:, 0]]).astype(np.float64))
         middle = board.mean(axis=0)
         normal = np.linalg.svd(board - middle)[2][2]
         away.append(np.abs((points - middle) @ normal))
