@@ -25,6 +25,8 @@ class TrainConfig(PlainConfig):
         robots: K.
         noise: `"easy"`, `"standard"` or `"hard"`: the preset of the environment.
         particles: Of each filter.
+        straighten: Whether maps are straightened before they are merged, as in the environment by default: it keeps
+            wrong merges out, and here takes most of the time.
         decision_ticks: Ticks of 0.1 s from a decision to the next.
         max_cycles: Decisions of an episode.
         reward: Weights of the named reward terms.
@@ -46,19 +48,20 @@ class TrainConfig(PlainConfig):
     robots: int = 3
     noise: str = "standard"
     particles: int = 30
+    straighten: bool = False
     decision_ticks: int = 20
     max_cycles: int = 45
-    reward: Mapping[str, float] = field(default_factory=lambda: {"map_error": 10.0, "coverage": 10.0})
-    envs: int = 8
-    steps: int = 130_000
+    reward: Mapping[str, float] = field(default_factory=lambda: {"map_error": 3.0, "own_coverage": 10.0})
+    envs: int = 16
+    steps: int = 64_800
     batch: int = 360
     epochs: int = 10
-    learning_rate: float = 2e-3
+    learning_rate: float = 1.5e-3
     gamma: float = 0.95
-    gae_lambda: float = 0.9
+    gae_lambda: float = 0.5
     clip: float = 0.2
     entropy: float = 0.002
-    checkpoint_updates: int = 10
+    checkpoint_updates: int = 5
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -110,7 +113,7 @@ class TrainConfig(PlainConfig):
             decision_ticks=self.decision_ticks,
             max_cycles=self.max_cycles,
             reward=dict(self.reward),
-            belief={"filter": {"num_particles": self.particles}},
+            belief={"filter": {"num_particles": self.particles}, "merging": {"straighten": self.straighten}},
         )
 
     @property

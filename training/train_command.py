@@ -24,8 +24,8 @@ def train(
         str | None, typer.Option(help="A family or a path; see vslam worlds list.", show_default="office")
     ] = None,
     robots: Annotated[int | None, typer.Option(help="How many, 1 to 8.", show_default="3")] = None,
-    steps: Annotated[int | None, typer.Option(help="Decisions of all robots together.", show_default="130000")] = None,
-    envs: Annotated[int | None, typer.Option(help="Environments side by side.", show_default="8")] = None,
+    steps: Annotated[int | None, typer.Option(help="Decisions of all robots together.", show_default="64800")] = None,
+    envs: Annotated[int | None, typer.Option(help="Environments side by side.", show_default="16")] = None,
     workers: Annotated[
         int | None,
         typer.Option(help="Processes that step them; 0: this one. Weights do not depend on it.", show_default="cores"),

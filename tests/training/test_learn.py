@@ -154,7 +154,7 @@ def test_rows_tell_of_episodes(whole: tuple[Path, dict[str, Any]]) -> None:
 
     rows = read_checkpoint(whole[0] / CHECKPOINT_FILE)["watch"]["rows"]
     assert [row["steps"] for row in rows] == [16.0, 32.0, 48.0]
-    assert all(row["return"] == pytest.approx(row["reward/map_error"] + row["reward/coverage"]) for row in rows)
+    assert all(row["return"] == pytest.approx(row["reward/map_error"] + row["reward/own_coverage"]) for row in rows)
     curves = EventAccumulator(str(whole[0] / "tensorboard"))
     curves.Reload()
     for name in ("return", "map_error", "map_recall", "merges", "reward/map_error"):
