@@ -8,7 +8,11 @@ from slam_backend.errors import BoolArray, IntArray, bad_argument, check_array
 
 
 def check_contacts(contacts: ArrayLike | None, num_robots: int) -> BoolArray | None:
-    """Return contacts (K, K) as a checked array; None = all.
+    """Return contacts as a checked array; None = all.
+
+    Args:
+        contacts: (K, K) bool, symmetric; the diagonal means nothing.
+        num_robots: K.
 
     Raises:
         ValueError: If they are no symmetric array of bools.

@@ -35,7 +35,17 @@ def bad_argument(name: str, expected: str, got: object, cure: str) -> ValueError
 
 
 def check_int(name: str, value: Any, minimum: int, cure: str) -> int:
-    """Return `value` as an int, or raise if it is not an integer (bools are not) or below `minimum`."""
+    """Return `value` as an int, or raise if it is not an integer (bools are not) or below `minimum`.
+
+    Args:
+        name: The argument as the caller wrote it.
+        value: What came.
+        minimum: The least that is accepted.
+        cure: What to do about another, a full sentence.
+
+    Raises:
+        ValueError: As `bad_argument` words it.
+    """
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < minimum:
         raise bad_argument(name, f"an int >= {minimum}", value, cure)
     return int(value)
@@ -50,7 +60,19 @@ def check_float(
     at_least: float | None = None,
     at_most: float | None = None,
 ) -> float:
-    """Return `value` as a finite float inside the stated bounds, or raise."""
+    """Return `value` as a finite float inside the stated bounds, or raise.
+
+    Args:
+        name: The argument as the caller wrote it.
+        value: What came.
+        cure: What to do about one outside, a full sentence.
+        above: It must be greater than this.
+        at_least: It must not be less than this.
+        at_most: It must not be greater than this.
+
+    Raises:
+        ValueError: As `bad_argument` words it.
+    """
     expected = "a finite number"
     if above is not None:
         expected += f" > {above:g}"
@@ -81,7 +103,17 @@ def check_seed(seed: Any) -> Any:
 
 
 def check_choice(name: str, value: Any, choices: tuple[str, ...], cure: str = "Choose one of these names.") -> str:
-    """Return `value` if it is one of `choices`, or raise with the list of them."""
+    """Return `value` if it is one of `choices`, or raise with the list of them.
+
+    Args:
+        name: The argument as the caller wrote it.
+        value: What came.
+        choices: All that are accepted.
+        cure: What to do about another, a full sentence.
+
+    Raises:
+        ValueError: As `bad_argument` words it.
+    """
     if not isinstance(value, str) or value not in choices:
         raise bad_argument(name, "one of " + ", ".join(repr(c) for c in choices), value, cure)
     return value
@@ -106,7 +138,11 @@ def check_array(
         dtype: Of the result.
         finite: Refuse NaN and infinity.
 
-    Integer dtypes accept floats only if these are whole numbers.
+    Returns:
+        An array of that shape. Integer dtypes accept floats only if these are whole numbers.
+
+    Raises:
+        ValueError: As `bad_argument` words it.
     """
     if np.issubdtype(dtype, np.integer):
         _check_whole(name, value, cure)

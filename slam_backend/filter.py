@@ -259,8 +259,8 @@ class FastSlam:
         Args:
             estimate: "best": means and conditional covariances of the most probable particle (Eq. 12). "mixture":
                 mean and covariance over all particles that hold the landmark, path uncertainty included,
-                sum w_m (Sigma_m + (mu_m - mu)(mu_m - mu)^T) (Sec. 3.2, see ERRATA); the landmarks are those of the most
-                probable particle.
+                sum w_m (Sigma_m + (mu_m - mu)(mu_m - mu)^T) (Sec. 3.2, see `docs/errata.md`); the landmarks are
+                those of the most probable particle.
             min_count: Landmarks measured fewer times are left out.
         """
         check_choice("estimate", estimate, ("best", "mixture"))

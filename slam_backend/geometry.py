@@ -81,7 +81,15 @@ def _inverse_one(a: list[float]) -> FloatArray:
 
 
 def between(w_from_a: ArrayLike, w_from_b: ArrayLike) -> FloatArray:
-    """Return the pose (..., 3) of b seen from a: what an ideal odometer reads between two poses."""
+    """Return the pose of b seen from a: what an ideal odometer reads between two poses.
+
+    Args:
+        w_from_a: (..., 3) float64 [m, m, rad]. Pose of a.
+        w_from_b: (..., 3) float64 [m, m, rad]. Pose of b, in the same frame.
+
+    Returns:
+        (..., 3) float64 [m, m, rad], frame a.
+    """
     return compose(inverse(w_from_a), w_from_b)
 
 
@@ -105,7 +113,15 @@ def transform_points(a_from_b: ArrayLike, points_b: ArrayLike) -> FloatArray:
 
 
 def rotate_covariances(theta: float, covariances: FloatArray) -> FloatArray:
-    """Rotate (..., 3, 3) covariances of points about the vertical: R Sigma R^T (Eq. 16 as `ERRATA` corrects it)."""
+    """Rotate covariances of points about the vertical: R Sigma R^T (Eq. 16 as `docs/errata.md` corrects it).
+
+    Args:
+        theta: Angle [rad].
+        covariances: (..., 3, 3) float64 [m^2].
+
+    Returns:
+        A new array of the same shape.
+    """
     full = np.eye(3)
     full[:2, :2] = rotation(theta)
     return np.asarray(full @ covariances @ full.T)

@@ -100,7 +100,7 @@ class LogArrays:
         )
 
     def since(self, step: int) -> "LogArrays":
-        """Return the rows whose index in the run is at least `step`; the arrays are views but for `starts`."""
+        """Return the rows whose index in the run is at least `step`; all but `starts` share memory with these."""
         t = int(np.searchsorted(self.steps, step))
         first = int(self.starts[t])
         return LogArrays(

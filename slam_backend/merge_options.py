@@ -15,7 +15,7 @@ class MergeOptions:
     Attributes:
         method: `"particles"`: each new particle pairs one of either group, whose maps are aligned by themselves; the
             correlation of maps and paths survives. `"mixture"`: both maps' mixture covariances are fused into one map
-            that all particles share (Sec. 3.2, see ERRATA).
+            that all particles share (Sec. 3.2, see `docs/errata.md`).
         merged_particles: Of the joint filter; None: as many as the larger of the two.
         straighten: Before a merge both sides' particles are drawn anew from the posterior of whole paths
             (`FastSlam.rejuvenate`), and their maps have to align once more. False: maps are taken as the filters bent

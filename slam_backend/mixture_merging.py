@@ -1,9 +1,9 @@
 """The merge by mixture covariances: two maps are fused once, and all particles of the joint filter share the result.
 
 Sec. 3.2 as it is printed fuses the covariances of the best particle's map, which are conditioned on one path and far
-too small. Here they are mixture covariances over all particles (see ERRATA), so that the map's own uncertainty is
-right. But that a particle's path and its map belong together is lost: `slam_backend.merging` keeps it, and is the
-default.
+too small. Here they are mixture covariances over all particles (see `docs/errata.md`), so that the map's own
+uncertainty is right. But that a particle's path and its map belong together is lost: `slam_backend.merging` keeps it,
+and is the default.
 """
 
 import numpy as np

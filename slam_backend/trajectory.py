@@ -138,6 +138,9 @@ def dead_reckoning(start_pose: ArrayLike, odometry: ArrayLike) -> FloatArray:
     Returns:
         (T + 1, 3) poses in the frame of `start_pose`, which is the first row.
 
+    Raises:
+        ValueError: If a shape is another or a number is not finite.
+
     >>> dead_reckoning([0.0, 0.0, np.pi / 2], [[1.0, 0.0, 0.0], [2.0, 0.0, 0.0]]).round(6)[:, 1].tolist()
     [0.0, 1.0, 3.0]
     """

@@ -36,6 +36,10 @@ def nees(errors: ArrayLike, covariances: ArrayLike) -> FloatArray:
 def anees(errors: ArrayLike, covariances: ArrayLike) -> float:
     """Return the mean of `nees` divided by the dimension: 1 is honest, more is over-confident.
 
+    Args:
+        errors: (n, d) float64, n >= 1. Estimate minus truth.
+        covariances: (n, d, d) float64. As the estimator states them.
+
     Raises:
         ValueError: As `nees`, or if there are no errors at all.
     """

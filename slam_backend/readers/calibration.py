@@ -30,7 +30,7 @@ class RectifiedPair:
     baseline: float
 
     def camera(self, width: int, height: int, **changes: Any) -> StereoCamera:
-        """Return the camera for images of this size; `changes` are further fields of `StereoCamera`."""
+        """Return the camera for images of `width` x `height` [px]; `changes` are further fields of `StereoCamera`."""
         return StereoCamera(focal_px=self.focal_px, baseline=self.baseline, width=width, height=height, **changes)
 
 
@@ -111,6 +111,10 @@ class Rectifier:
     def rectify(self, left: Any, right: Any) -> tuple[Image, Image]:
         """Return the rectified images (H, W) uint8 of a raw pair, interpolated linearly.
 
+        Args:
+            left: (H, W) uint8, of the size of the calibration.
+            right: Likewise.
+
         Raises:
             ValueError: If an image is not grey and of eight bits, or of another size than the calibration's.
         """
@@ -163,6 +167,10 @@ def load_kitti_calibration(path: str | Path) -> RectifiedPair:
 def load_euroc_calibration(left: str | Path, right: str | Path) -> Rectifier:
     """Read two files `sensor.yaml` of EuRoC's cameras and prepare the rectification of their images.
 
+    Args:
+        left: File of the left camera.
+        right: File of the right one.
+
     Raises:
         ValueError: If a file is missing or lacks an entry, or the two are no stereo pair.
     """
@@ -170,7 +178,11 @@ def load_euroc_calibration(left: str | Path, right: str | Path) -> Rectifier:
 
 
 def load_euroc_eye(path: str | Path) -> Eye:
-    """Read one file `sensor.yaml` of EuRoC's cameras: pinhole, radial-tangential distortion, place on the body."""
+    """Read one file `sensor.yaml` of EuRoC's cameras: pinhole, radial-tangential distortion, place on the body.
+
+    Raises:
+        ValueError: If the file is missing, lacks an entry, or tells of another kind of camera.
+    """
     file = Path(path)
     text = re.sub(r"#[^\n]*", "", _text(file))
     model = re.search(r"distortion_model:\s*(\S+)", text)

@@ -20,6 +20,9 @@ def integrate_commands(commands: ArrayLike, times: ArrayLike, hold: float = HOLD
     Returns:
         (T, 3) poses at these times in the robot's start frame.
 
+    Raises:
+        ValueError: If a shape is another, a number is not finite or there is no command.
+
     >>> integrate_commands([[0.0, 1.0, 0.0], [2.0, 0.0, 1.0]], [1.0, 5.0], hold=3.0).tolist()
     [[1.0, 0.0, 0.0], [2.0, 0.0, 3.0]]
     """
@@ -39,7 +42,16 @@ def integrate_commands(commands: ArrayLike, times: ArrayLike, hold: float = HOLD
 
 
 def arc(velocity: FloatArray, angular_velocity: FloatArray, duration: FloatArray) -> FloatArray:
-    """Return the motions (n, 3) of a unicycle at constant velocities (n,) [m/s, rad/s] during (n,) seconds."""
+    """Return the motions of a unicycle at constant velocities.
+
+    Args:
+        velocity: (n,) float64 [m/s]. Forwards.
+        angular_velocity: (n,) float64 [rad/s].
+        duration: (n,) float64 [s].
+
+    Returns:
+        (n, 3) float64 [m, m, rad]. Pose after the motion, seen from that before.
+    """
     turn = angular_velocity * duration
     chord = velocity * duration * np.sinc(turn / (2.0 * np.pi))  # numpy's sinc is sin(pi x) / (pi x)
     return np.stack([chord * np.cos(0.5 * turn), chord * np.sin(0.5 * turn), turn], axis=-1)
