@@ -1,6 +1,8 @@
 """Resampling schemes: normalised weights in, ancestor indices out; gathering is a separate step.
 
-Every scheme is unbiased: particle m is drawn M w_m times on average. They differ in variance.
+Every scheme takes weights (M,) float64 that sum to 1, a source of draws and how many to draw (None: M), and returns
+ancestors (count,) int64 in [0, M). Every one is unbiased: particle m is drawn count w_m times on average. They differ
+in variance.
 """
 
 from collections.abc import Callable
