@@ -7,12 +7,14 @@ from training.bench_env import EnvBenchResult
 from training.env_timing import PEER, StepTimes
 from training.timed_bench import print_caveats, print_goals
 
+TIMES = ("median us", "mean us", "99 % us", "least us", "undisturbed us")  # the last: the median over best repeats
+
 
 def print_env_result(console: Console, result: EnvBenchResult, asked_peer: bool) -> None:
     """Print rows, the budget of a step, what else was measured, and the goals."""
     if result.rows:
         table = Table(title="env.step", title_justify="left")
-        for column in ("robots", "particles", "world", "walls", "mode", "median us", "99 % us", "least us", "steps/s"):
+        for column in ("robots", "particles", "world", "walls", "mode", *TIMES, "steps/s", "by mean"):
             table.add_column(column, justify="left" if column in ("world", "mode") else "right")
         for row in result.rows:
             load = row.load
@@ -29,7 +31,7 @@ def print_env_result(console: Console, result: EnvBenchResult, asked_peer: bool)
         table.add_row("sum", *(f"{total:.0f}" for total in sums), style="bold")
         console.print(table)
     table = Table("", title="Beside", title_justify="left")
-    for column in ("median us", "99 % us", "least us", "per second"):
+    for column in (*TIMES, "per second", "by mean"):
         table.add_column(column, justify="right")
     others: dict[str, StepTimes | None] = {
         "simulator only": result.simulator,
@@ -47,6 +49,6 @@ def print_env_result(console: Console, result: EnvBenchResult, asked_peer: bool)
     print_caveats(console, result.machine, result.complete)
 
 
-def _times(times: StepTimes) -> tuple[str, str, str, str]:
-    rate = f"{times.per_second:,.0f}"
-    return f"{times.median_us:.0f}", f"{times.p99_us:.0f}", f"{times.min_us:.0f}", rate
+def _times(times: StepTimes) -> tuple[str, ...]:
+    micros = (times.median_us, times.mean_us, times.p99_us, times.min_us, times.undisturbed_us)
+    return *(f"{value:.0f}" for value in micros), f"{times.per_second:,.0f}", f"{times.per_second_mean:,.0f}"

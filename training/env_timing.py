@@ -28,23 +28,31 @@ class StepTimes:
 
     Attributes:
         median_us: Half of the calls took longer.
+        mean_us: What happens now and then, and what other programs take, shows here.
         p99_us: 1 % took longer.
         min_us: The shortest.
+        undisturbed_us: Half of the calls took longer, each at the best of its repeats.
         per_second: Calls in a second, by the median.
-        calls: How many.
+        per_second_mean: Calls in a second, by the mean.
+        calls: How many differ; each was repeated as often.
     """
 
     median_us: float
+    mean_us: float
     p99_us: float
     min_us: float
+    undisturbed_us: float
     per_second: float
+    per_second_mean: float
     calls: int
 
     @classmethod
     def of(cls, seconds: FloatArray) -> "StepTimes":
-        """Summarise durations (n,) [s]."""
-        median, high = (float(q) for q in np.quantile(1e6 * seconds, (0.5, 0.99)))
-        return cls(median, high, float(1e6 * seconds.min()), 1e6 / median, len(seconds))
+        """Summarise durations (n,) or (repeats, n) [s]."""
+        micros = 1e6 * np.atleast_2d(seconds)
+        median, high = (float(q) for q in np.quantile(micros, (0.5, 0.99)))
+        mean, undisturbed = float(micros.mean()), float(np.median(micros.min(axis=0)))
+        return cls(median, mean, high, float(micros.min()), undisturbed, 1e6 / median, 1e6 / mean, micros.shape[1])
 
 
 def record_actions(env: ExplorationEnv, seed: int, steps: int) -> list[dict[str, Any]]:
@@ -73,11 +81,14 @@ def time_steps(call: Callable[[Any], Any], arguments: Sequence[Any], warm_up: in
     return seconds
 
 
-def time_env(env: ExplorationEnv, seed: int, steps: int, warm_up: int) -> StepTimes:
-    """Time `env.step` along an episode of the nearest-frontier policy."""
+def time_env(env: ExplorationEnv, seed: int, steps: int, warm_up: int, plays: int = 1) -> StepTimes:
+    """Time `env.step` along an episode of the nearest-frontier policy, which is played again so many times."""
     actions = record_actions(env, seed, warm_up + steps)
-    env.reset(seed=seed)
-    return StepTimes.of(time_steps(env.step, actions, warm_up))
+    durations = []
+    for _ in range(plays):
+        env.reset(seed=seed)
+        durations.append(time_steps(env.step, actions, warm_up))
+    return StepTimes.of(np.array(durations))
 
 
 def time_simulator(config: EnvConfig, seed: int, steps: int, warm_up: int) -> StepTimes:

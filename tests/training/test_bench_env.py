@@ -74,11 +74,18 @@ def test_recorded_actions_play_again() -> None:
 
 
 def test_times_are_summed_up() -> None:
-    """Median, 99th percentile, least and rate are those of the durations."""
+    """Median, mean, 99th percentile, least and rates are those of the durations."""
     times = StepTimes.of(np.array([1.0, 2.0, 3.0, 4.0, 100.0]) * 1e-6)
-    assert (times.median_us, times.min_us, times.calls) == (3.0, 1.0, 5)
-    assert times.per_second == pytest.approx(1e6 / 3.0)
+    assert (times.median_us, times.mean_us, times.min_us, times.calls) == pytest.approx((3.0, 22.0, 1.0, 5))
+    assert (times.per_second, times.per_second_mean) == pytest.approx((1e6 / 3.0, 1e6 / 22.0))
     assert 90.0 < times.p99_us <= 100.0
+
+
+def test_the_best_repeat_of_a_call_is_the_undisturbed_one() -> None:
+    """Where each call is repeated, a disturbance that hits one repeat alone does not show in the undisturbed time."""
+    times = StepTimes.of(np.array([[5.0, 90.0, 7.0], [80.0, 6.0, 70.0]]) * 1e-6)
+    assert (times.undisturbed_us, times.min_us, times.calls) == pytest.approx((6.0, 5.0, 3))
+    assert times.median_us == pytest.approx(38.5)
 
 
 def test_a_missing_peer_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
