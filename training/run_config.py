@@ -31,7 +31,7 @@ class RunConfig(PlainConfig):
         max_cycles: Steps of the episode; None: as many as `EPISODE_S` takes.
         particles: Per filter.
         rejuvenate_every: Ticks of 0.1 s after which the particles of a filter are drawn anew from smoothed paths, as
-            `FilterOptions` has it; None: never.
+            `FilterOptions` has it; 0: never; None: as the environment has it.
         preset: Of the environment's noise.
         sensor: `"landmark"` or `"stereo"`.
         seed: Of all random draws.
@@ -55,7 +55,7 @@ class RunConfig(PlainConfig):
         check_choice("sensor", self.sensor, SENSORS)
         check_int("particles", self.particles, 1, "Use at least one particle; 100 is a good start.")
         if self.rejuvenate_every is not None:
-            check_int("rejuvenate_every", self.rejuvenate_every, 1, "Give a number, or leave it away for never.")
+            check_int("rejuvenate_every", self.rejuvenate_every, 0, "Give a number of ticks, or 0 for never.")
         check_int("seed", self.seed, 0, "Use 0 or a positive number.")
         if self.max_cycles is not None:
             check_int("max_cycles", self.max_cycles, 1, "Give a number of steps.")
@@ -90,7 +90,9 @@ class RunConfig(PlainConfig):
 
     def make_env(self) -> ExplorationEnv:
         """Build the environment."""
-        assumed = {"num_particles": self.particles, "rejuvenate_every": self.rejuvenate_every}
+        assumed: dict[str, Any] = {"num_particles": self.particles}
+        if self.rejuvenate_every is not None:
+            assumed["rejuvenate_every"] = self.rejuvenate_every or None
         config = preset_config(self.preset, self.sensor).replace(belief={"filter": assumed})
         return vslam_v0.parallel_env(
             world=self.world,

@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from slam_backend._jit import jit, lanes
+from slam_backend._jit import inlined, jit, lanes, lanes_inlined
 from slam_backend.errors import BoolArray, FloatArray, IntArray
 
 MIN_DEPTH = 0.05  # [m]; a landmark predicted nearer than this to the camera plane is linearised where it was measured
@@ -29,7 +29,7 @@ def _wrapped(angle: float) -> float:
     return angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
 
 
-@jit
+@inlined
 def _spun(c: float, s: float, a: FloatArray, out: FloatArray) -> None:
     """Write R A R^T (6) for the rotation (c, s) about the vertical."""
     a00, a01, a02, a11, a12, a22 = a[0], a[1], a[2], a[3], a[4], a[5]
@@ -172,6 +172,21 @@ def condense(
     return total
 
 
+@lanes_inlined
+def _subtract(
+    row: FloatArray, at: int, packed: FloatArray, begin: int, count: int, x: float, y: float, z: float
+) -> None:  # fmt: skip
+    """Subtract from a stretch of a row the sum of three rows times x, y, z."""
+    target = row[at : at + count]
+    one, two, three = (
+        packed[0, begin : begin + count],
+        packed[1, begin : begin + count],
+        packed[2, begin : begin + count],
+    )
+    for c in range(count):
+        target[c] -= x * one[c] + y * two[c] + z * three[c]
+
+
 @jit
 def assemble(
     poses: FloatArray, landmarks: FloatArray, columns: IntArray, previous: IntArray, motions: FloatArray,
@@ -197,13 +212,14 @@ def assemble(
         no information.
     """
     cost = 0.0
+    cosines, sines = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     f, g, h = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     r = np.empty(3)
     for b in range(len(poses)):  # odometry
         a = previous[b]
         if a < 0:
             continue
-        c, s = math.cos(poses[a, 2]), math.sin(poses[a, 2])
+        c, s = cosines[a], sines[a]
         dx, dy = poses[b, 0] - poses[a, 0], poses[b, 1] - poses[a, 1]
         mx, my = c * dx + s * dy, -s * dx + c * dy
         r[0], r[1] = mx - motions[b, 0], my - motions[b, 1]
@@ -239,6 +255,10 @@ def assemble(
                 cost += 0.5 * r[i] * w[i, j] * r[j]
     turned = np.empty(6)
     block = np.empty(6)
+    most = 0
+    for landmark in range(len(landmarks)):
+        most = max(most, starts[landmark + 1] - starts[landmark])
+    packed, sought = np.empty((3, 3 * most)), np.empty(most, dtype=np.int64)
     for landmark in range(len(landmarks)):
         first, last = starts[landmark], starts[landmark + 1]
         block[:] = 0.0
@@ -246,7 +266,7 @@ def assemble(
         force[:] = 0.0
         for q in range(first, last):
             key = keys[q]
-            c, s = math.cos(poses[key, 2]), math.sin(poses[key, 2])
+            c, s = cosines[key], sines[key]
             dx, dy = landmarks[landmark, 0] - poses[key, 0], landmarks[landmark, 1] - poses[key, 1]
             u0 = c * dx + s * dy - centres[q, 0]
             u1 = -s * dx + c * dy - centres[q, 1]
@@ -288,24 +308,33 @@ def assemble(
         p = spreads[landmark]
         if not _inverse(block, p) > 0.0:
             return np.inf
+        num = 0
         for q in range(first, last):
             own = columns[keys[q]]
             if own < 0:
                 continue
-            x = cross[q]
+            for i in range(3):
+                packed[0, 3 * num + i], packed[1, 3 * num + i], packed[2, 3 * num + i] = cross[q, i]
+            sought[num] = q
+            num += 1
+        for n in range(num):
+            x, own = cross[sought[n]], columns[keys[sought[n]]]
             for i in range(3):
                 h[i, 0] = x[i, 0] * p[0] + x[i, 1] * p[1] + x[i, 2] * p[2]
                 h[i, 1] = x[i, 0] * p[1] + x[i, 1] * p[3] + x[i, 2] * p[4]
                 h[i, 2] = x[i, 0] * p[2] + x[i, 1] * p[4] + x[i, 2] * p[5]
                 vector[own + i] -= h[i, 0] * force[0] + h[i, 1] * force[1] + h[i, 2] * force[2]
-            for o in range(first, last):
-                other = columns[keys[o]]
-                if other < 0 or other > own:
-                    continue
-                z = cross[o]
+            begin = 0
+            while begin < num:  # columns that follow each other are one stretch of the rows; keys ascend
+                column = columns[keys[sought[begin]]]
+                if column > own:
+                    break
+                end = begin + 1
+                while end < num and columns[keys[sought[end]]] == column + 3 * (end - begin) <= own:
+                    end += 1
                 for i in range(3):
-                    for j in range(3):
-                        matrix[own + i, other + j] -= h[i, 0] * z[j, 0] + h[i, 1] * z[j, 1] + h[i, 2] * z[j, 2]
+                    _subtract(matrix[own + i], column, packed, 3 * begin, 3 * (end - begin), h[i, 0], h[i, 1], h[i, 2])
+                begin = end
     return cost
 
 

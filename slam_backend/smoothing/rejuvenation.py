@@ -1,7 +1,7 @@
 """`rejuvenate`: new particles from the posterior of whole paths, in place of those that resampling has impoverished."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,7 @@ from slam_backend.smoothing.options import SmoothingOptions
 from slam_backend.smoothing.sampling import Draws, draw_paths, scouted
 from slam_backend.smoothing.solving import Mode, find_mode
 
+NEAR = 10.0  # times the tolerance: a descent that is not followed by draws may end so much sooner
 SCOUTS = 32  # paths drawn to see what is rigid, while a long log is taken in
 
 
@@ -112,11 +113,12 @@ def rejuvenate(
     if any((log.kinds == EXACT).any() for log in logs):
         return Rejuvenation(graph, "poses that were given as exact", float("nan"), 0, None)
     share = max(1, options.max_keys // len(logs))
+    near = replace(options, tolerance=NEAR * options.tolerance)
     rest = list(logs)
     while True:
         last = all(len(log) <= share for log in rest)
         grown = extended(graph, [first_rows(log, share) for log in rest], motion, camera[4:], guesses)
-        mode = find_mode(grown, camera, options)
+        mode = find_mode(grown, camera, options if last else near)
         if mode.reason:
             return Rejuvenation(graph, mode.reason, float("nan"), mode.iterations, None)
         if last:
@@ -181,6 +183,7 @@ def _particles(graph: PathGraph, mode: Mode, draws: Draws, weights: FloatArray) 
     """Gather what particles hold."""
     counts = np.bincount(mode.sightings.landmarks, weights=mode.sightings.counts, minlength=len(graph.landmark_ids))
     seen = counts > 0
+    tiles = draws.tiles if seen.all() else draws.tiles[seen]
     poses, starts = draws.poses[graph.tips], draws.poses[graph.heads]
     means = mode.poses[graph.tips]
     joint = _covariance(mode.factor, mode.columns[graph.tips])
@@ -194,7 +197,7 @@ def _particles(graph: PathGraph, mode: Mode, draws: Draws, weights: FloatArray) 
         array[:, 2] = wrap_angle(array[:, 2])
     means[:, 2] = wrap_angle(means[:, 2])
     return Particles(
-        poses, starts, np.log(np.maximum(weights, 1e-300)), densities, graph.landmark_ids[seen], draws.tiles[seen],
+        poses, starts, np.log(np.maximum(weights, 1e-300)), densities, graph.landmark_ids[seen], tiles,
         counts[seen].astype(np.int64), means, covariances,
     )  # fmt: skip
 

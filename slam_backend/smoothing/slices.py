@@ -16,10 +16,9 @@ from slam_backend.motion import OdometryModel
 from slam_backend.smoothing.coarsening import at_mode
 from slam_backend.smoothing.graph import PathGraph, extended
 from slam_backend.smoothing.options import SmoothingOptions
-from slam_backend.smoothing.rejuvenation import Looks, Rejuvenation, drawn, settled
+from slam_backend.smoothing.rejuvenation import NEAR, Looks, Rejuvenation, drawn, settled
 from slam_backend.smoothing.solving import Mode, find_mode
 
-NEAR = 10.0  # times the tolerance: between draws a descent may end so much sooner
 LAST_STEPS = 3  # of Gauss and Newton in the slice that draws: the graph was at its mode but for the last few keys
 
 

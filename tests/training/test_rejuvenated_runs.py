@@ -73,9 +73,16 @@ def test_the_filters_of_a_run_are_told(sensor: str) -> None:
     config = RunConfig(world="fig5", particles=17, rejuvenate_every=9, preset="hard", sensor=sensor)
     chosen = config.make_env().config
     assert (chosen.belief.filter.num_particles, chosen.belief.filter.rejuvenate_every) == (17, 9)
-    usual = {"filter": {"num_particles": 100, "rejuvenate_every": None}}
     expected = preset_config("hard", sensor).replace(world="fig5", max_cycles=1800)
+    usual = {"filter": {"num_particles": 100, "rejuvenate_every": expected.belief.filter.rejuvenate_every}}
     assert chosen.replace(belief=usual) == expected
+
+
+def test_a_run_is_rejuvenated_as_the_environment_has_it_unless_told_otherwise() -> None:
+    """Without a word the environment's interval holds; 0 is never."""
+    assert RunConfig().make_env().config.belief == preset_config("standard").belief
+    assert preset_config("standard").belief.filter.rejuvenate_every is not None
+    assert RunConfig(rejuvenate_every=0).make_env().config.belief.filter.rejuvenate_every is None
 
 
 @pytest.mark.slow
@@ -83,8 +90,8 @@ def test_a_run_is_rejuvenated_and_repeats_itself(vslam: Any, tmp_path: Path) -> 
     """Of three runs of the command, that without differs from that with, and that from its config does not."""
     plain, one, two = (tmp_path / name for name in ("plain", "one", "two"))
     options = ("--robots", "2", "--particles", "11", "--max-cycles", "40", "--world", "fig5", "--seed", "104")
-    with_it = (*options, "--rejuvenate-every", "10")
-    for folder, extra in ((plain, options), (one, with_it), (two, ("--config", str(one)))):
+    with_it, without = (*options, "--rejuvenate-every", "10"), (*options, "--rejuvenate-every", "0")
+    for folder, extra in ((plain, without), (one, with_it), (two, ("--config", str(one)))):
         assert vslam("run", *extra, "--no-video", "--out", str(folder)).status == 0
     assert tomllib.loads((one / "config.toml").read_text())["config"]["rejuvenate_every"] == 10
     assert EnvConfig.from_toml(one / "environment.toml").belief.filter.rejuvenate_every == 10
@@ -92,11 +99,10 @@ def test_a_run_is_rejuvenated_and_repeats_itself(vslam: Any, tmp_path: Path) -> 
     assert estimates(one) != estimates(plain)
 
 
-@pytest.mark.parametrize("command", [("replay", "mrclam"), ("replay", "victoria"), ("replay", "kitti"), ("run",)])
+@pytest.mark.parametrize("command", [("replay", "mrclam"), ("replay", "victoria"), ("replay", "kitti")])
 def test_no_steps_between_are_refused(command: tuple[str, ...], refusal: Any) -> None:
     """Every zero steps is no interval: one line, status 2."""
-    path = ("--path", "none") if command[0] == "replay" else ()
-    shown = refusal(*command, *path, "--rejuvenate-every", "0")
+    shown = refusal(*command, "--path", "none", "--rejuvenate-every", "0")
     assert shown.startswith("error rejuvenate_every: expected an int >= 1, got 0. Give a number,")
 
 
