@@ -3,7 +3,7 @@
     python benchmarks/knobs.py --seeds 6 --json knobs.json --figure docs/figures/knobs.png
 
 Three robots explore offices for 150 s. Each knob is turned by itself from the standard preset to a value as hard as
-that of the hard preset, or harder.
+that of the hard preset, or harder; `--only preset` plays the presets alone.
 """
 
 import os
@@ -29,6 +29,7 @@ from vslam_env import EnvConfig, preset_config, vslam_v0
 
 DECISIONS = 150  # of a second each
 ROBOTS = 3
+STANDARD = "preset standard"
 
 KNOBS: dict[str, dict[str, Any]] = {
     "odometry noise x 2": {
@@ -58,8 +59,8 @@ KNOBS: dict[str, dict[str, Any]] = {
 def variants() -> dict[str, EnvConfig]:
     """Return the presets and the knobs, each turned by itself."""
     common = {"num_robots": ROBOTS, "action_type": "goal", "max_cycles": DECISIONS}
-    presets = {name: preset_config(name).replace(**common) for name in ("easy", "standard", "hard")}
-    return presets | {name: presets["standard"].replace(**changes) for name, changes in KNOBS.items()}
+    presets = {f"preset {name}": preset_config(name).replace(**common) for name in ("easy", "standard", "hard")}
+    return presets | {name: presets[STANDARD].replace(**changes) for name, changes in KNOBS.items()}
 
 
 def play(config: EnvConfig, seed: int) -> dict[str, Any]:
@@ -87,7 +88,7 @@ def draw(results: dict[str, list[dict[str, Any]]], path: Path) -> None:
     """Draw the map error of each episode with its mean, and the mean number of merges."""
     figure = Figure(figsize=(9.0, 0.34 * len(results) + 1.2), layout="constrained")
     left, right = figure.subplots(1, 2, sharey=True, width_ratios=(2, 1))
-    standard = summary(results["standard"])["map_error"]
+    standard = summary(results[STANDARD])["map_error"]
     for row, trials in enumerate(results.values()):
         errors = [trial["map_error"] for trial in trials]
         left.plot(errors, np.full(len(errors), row), "o", color="0.6", markersize=4, zorder=2)
@@ -108,17 +109,19 @@ def draw(results: dict[str, list[dict[str, Any]]], path: Path) -> None:
 
 def main(
     seeds: Annotated[int, typer.Option(help="Episodes of each variant.")] = 6,
+    first_seed: Annotated[int, typer.Option(help="Of them.")] = 0,
     only: Annotated[str | None, typer.Option(help="Variants whose names contain this.")] = None,
     json_file: Annotated[Path | None, typer.Option("--json", help="Write all trials to this file.")] = None,
     figure: Annotated[Path | None, typer.Option(help="Draw them into this file.")] = None,
 ) -> None:
     """Play all variants and print their means."""
     check_int("seeds", seeds, 1, "Play one episode or more.")
+    check_int("first_seed", first_seed, 0, "Give an int >= 0.")
     for path in (json_file, figure):
         if path is not None:
             check_writable(path, "json" if path is json_file else "figure")
-    chosen = {n: c for n, c in variants().items() if only is None or only in n or n == "standard"}
-    jobs = [(name, seed) for name in chosen for seed in range(seeds)]
+    chosen = {n: c for n, c in variants().items() if only is None or only in n or n == STANDARD}
+    jobs = [(name, seed) for name in chosen for seed in range(first_seed, first_seed + seeds)]
     results: dict[str, list[dict[str, Any]]] = {name: [] for name in chosen}
     for name, seed in track(jobs, "Episodes", transient=True):
         results[name].append(play(chosen[name], seed))

@@ -198,13 +198,14 @@ def preset_config(name: str, sensor: str = "landmark") -> EnvConfig:
     """Return a preset.
 
     `standard`: odometry with sigma 5 % of the distance and 2 degrees per metre, and a bias per episode of 2 % and 0.5
-    degrees per metre; 5 landmarks a tick, detected with probability 0.9, 0.02 false points, descriptor noise 0.17.
-    `easy`: odometry noise and bias halved, 10 landmarks a tick detected with probability 0.95, no false points,
-    descriptor noise 0.1.
-    `hard`: odometry noise and bias doubled, 3 landmarks a tick detected with probability 0.8, 0.1 false points,
-    descriptor noise 0.25, and every fifth landmark looks like another one.
-    The filters assume the odometry noise of their preset.
-    With `sensor="stereo"` only the odometry differs between presets, and filters assume what `stereo_belief` says.
+    degrees per metre; 5 landmarks a tick within 8 m, detected with probability 0.9, 0.02 false points, descriptor
+    noise 0.17.
+    `easy`: odometry noise and bias halved, 10 landmarks a tick within 12 m, detected with probability 0.95, no false
+    points, descriptor noise 0.1.
+    `hard`: odometry noise and bias doubled, 3 landmarks a tick within 5 m, detected with probability 0.8, 0.1 false
+    points, descriptor noise 0.25, every fifth landmark looks like another one, and radios lose half of the contacts.
+    The filters know the range and the odometry noise of their preset.
+    With `sensor="stereo"` only odometry and radios differ, and filters assume what `stereo_belief` says.
 
     Raises:
         ValueError: If there is no such preset or sensor.
@@ -217,18 +218,20 @@ def preset_config(name: str, sensor: str = "landmark") -> EnvConfig:
         return dataclasses.replace(eyes, belief=stereo_belief(eyes.stereo, plain.belief))
     if name == "standard":
         return EnvConfig()
-    scale = 0.5 if name == "easy" else 2.0
+    scale, reach = (0.5, 12.0) if name == "easy" else (2.0, 5.0)
     standard, motion = EnvConfig(), OdometryModel()
     sensors = {
         "easy": {"max_measurements": 10, "detection_probability": 0.95, "false_points": 0.0, "descriptor_noise": 0.1},
         "hard": {"max_measurements": 3, "detection_probability": 0.8, "false_points": 0.1, "descriptor_noise": 0.25},
     }
     assumed = {part: scale * getattr(motion, part) for part in ("sigma_along", "sigma_across", "sigma_heading")}
+    camera = {"max_range": reach}
     return standard.replace(
         odometry={f.name: scale * getattr(standard.odometry, f.name) for f in dataclasses.fields(standard.odometry)},
-        belief={"filter": {"motion": assumed}},
-        landmark_sensor=sensors[name],
+        belief={"filter": {"motion": assumed, "camera": camera}},
+        landmark_sensor=sensors[name] | {"camera": camera},
         landmarks={"repeated": 0.2 if name == "hard" else 0.0},
+        comm_loss=0.5 if name == "hard" else 0.0,
     )
 
 

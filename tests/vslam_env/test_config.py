@@ -44,7 +44,10 @@ def test_presets_are_ordered() -> None:
         assert less.landmark_sensor.false_points < more.landmark_sensor.false_points
         assert less.landmark_sensor.detection_probability > more.landmark_sensor.detection_probability
         assert less.landmark_sensor.max_measurements > more.landmark_sensor.max_measurements
+        assert less.landmark_sensor.camera.max_range > more.landmark_sensor.camera.max_range
         assert less.belief.filter.motion.sigma_along < more.belief.filter.motion.sigma_along
+        assert less.belief.filter.camera.max_range == less.landmark_sensor.camera.max_range
+        assert less.comm_loss <= more.comm_loss
 
 
 def test_true_and_assumed_noise_are_apart() -> None:
