@@ -7,10 +7,14 @@ from scipy.linalg import lapack
 
 from slam_backend.errors import FloatArray, IntArray
 from slam_backend.geometry import between
+from slam_backend.resampling import effective_sample_size
 from slam_backend.smoothing import _kernels
 from slam_backend.smoothing._kernels import LANES, POSE_ROWS, WORK_ROWS
+from slam_backend.smoothing.bending import bend
 from slam_backend.smoothing.graph import LEVER, PathGraph
 from slam_backend.smoothing.solving import Mode
+
+BENT_BELOW = 0.5  # share of M: where the sample size of straight paths is less, bent ones are tried
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,6 +39,12 @@ class Draws:
         rows = self.tiles.transpose(0, 2, 1, 3).reshape(len(self.tiles), 9, -1)
         return np.ascontiguousarray(rows[:, :, : self.poses.shape[2]])
 
+    @property
+    def sample_size(self) -> float:
+        """Effective sample size of the weights, 0 if there are none."""
+        weights = np.exp(self.log_weights - self.log_weights.max())
+        return effective_sample_size(weights / weights.sum()) if np.isfinite(weights).all() else 0.0
+
     def taken(self, ancestors: IntArray) -> "Draws":
         """Return as many paths as there are ancestors (M',), each a copy of its ancestor, weighed alike."""
         m = len(ancestors)
@@ -46,7 +56,9 @@ class Draws:
 def draw_paths(graph: PathGraph, mode: Mode, num_particles: int, rng: np.random.Generator) -> Draws:
     """Draw x^(i) = mode + U^-1 z, z ~ N(0, I), and replay each path.
 
-    log w = log p(path given odometry) + log p(measurements given path) - log q(path). The first path is the mode.
+    log w = log p(path given odometry) + log p(measurements given path) - log q(path). The first path is the mode. Where
+    the weights of these say that the posterior is no such Gaussian, the same paths are bent (`bending`), and of both
+    those are returned whose effective sample size is larger.
 
     Args:
         graph: Odometry and measurements.
@@ -55,11 +67,20 @@ def draw_paths(graph: PathGraph, mode: Mode, num_particles: int, rng: np.random.
         rng: Source of the draws.
     """
     poses, log_proposals = _poses(mode, num_particles, rng)
+    straight = _weighed(graph, mode, poses, log_proposals)
+    if straight.sample_size >= BENT_BELOW * num_particles:
+        return straight
+    bent = _weighed(graph, mode, bend(mode.poses, graph.previous, poses - mode.poses[:, :, None]), log_proposals)
+    return bent if bent.sample_size > straight.sample_size else straight
+
+
+def _weighed(graph: PathGraph, mode: Mode, poses: FloatArray, log_proposals: FloatArray) -> Draws:
+    """Replay paths (k, 3, M) and weigh them."""
+    num_paths = poses.shape[2]
     rows = lane_rows(poses)
-    tiles, log_likelihood = replay(mode, rows, num_particles)
-    log_odometry, spreads = weigh_odometry(graph, mode, rows, num_particles)
-    log_weights = log_likelihood + log_odometry - log_proposals
-    return Draws(poses, tiles, log_weights, spreads)
+    tiles, log_likelihood = replay(mode, rows, num_paths)
+    log_odometry, spreads = weigh_odometry(graph, mode, rows, num_paths)
+    return Draws(poses, tiles, log_likelihood + log_odometry - log_proposals, spreads)
 
 
 def scouted(graph: PathGraph, mode: Mode, num_paths: int, rng: np.random.Generator) -> FloatArray:
