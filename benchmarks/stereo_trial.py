@@ -58,9 +58,8 @@ def play(trial: StereoTrial) -> dict[str, Any]:
     """Run an episode and return its metrics, and the seconds it took."""
     cv2.setNumThreads(1)
     begin = time.perf_counter()
-    config = preset_config("standard", "stereo").replace(
-        world="office", num_robots=trial.num_robots, max_cycles=trial.cycles, stereo={"textures": {"style": trial.style}}
-    )
+    told = {"num_robots": trial.num_robots, "max_cycles": trial.cycles, "stereo": {"textures": {"style": trial.style}}}
+    config = preset_config("standard", "stereo").replace(world="office", **told)
     env = vslam_v0.parallel_env(config=config)
     policies = {agent: make_policy("frontier", config.action_type) for agent in env.possible_agents}
     scores = score_episode(run_episode(env, policies, trial.seed))
