@@ -31,7 +31,10 @@ def check_step(
     """
     none = [None] * k
     for name, value in (
-        ("odometry", odometry), ("measurements", measurements), ("identities", identities), ("poses", poses)
+        ("odometry", odometry),
+        ("measurements", measurements),
+        ("identities", identities),
+        ("poses", poses),
     ):
         if value is None and name in ("identities", "poses"):
             continue

@@ -62,9 +62,7 @@ class Trial:
     @property
     def spec(self) -> RunSpec:
         """The run that is simulated."""
-        return RunSpec(
-            robots=self.robots, length=self.length, preset=self.preset, association=self.association
-        )
+        return RunSpec(robots=self.robots, length=self.length, preset=self.preset, association=self.association)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

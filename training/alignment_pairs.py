@@ -186,7 +186,11 @@ def _pair(points_a: FloatArray, points_b: FloatArray, right: int, alike: int, rn
 
 
 def _pair_of(
-    points_a: FloatArray, looks_a: FloatArray, points_b: FloatArray, looks_b: FloatArray, right: int,
+    points_a: FloatArray,
+    looks_a: FloatArray,
+    points_b: FloatArray,
+    looks_b: FloatArray,
+    right: int,
     rng: np.random.Generator,
 ) -> MapPair:
     """Return noisy maps of points in one frame, b in a frame of its own that lies among its landmarks, shuffled."""

@@ -159,8 +159,10 @@ class BatchProblem:
             focal = self.camera.focal_px / depth
             scale = np.zeros((len(poses), 3, 3))
             scale[:, 0, 0] = scale[:, 1, 1] = focal
-            scale[:, :, 2] = -focal[:, None] / depth[:, None] * np.column_stack(
-                [predicted[:, :2], np.full(len(depth), self.camera.baseline)]
+            scale[:, :, 2] = (
+                -focal[:, None]
+                / depth[:, None]
+                * np.column_stack([predicted[:, :2], np.full(len(depth), self.camera.baseline)])
             )
             scale /= sigmas[:, None]
         scale = scale @ ROBOT_FROM_CAMERA.T

@@ -64,9 +64,7 @@ def ideal_online(problem: BatchProblem, batch: BatchEstimate) -> OnlineEstimate:
         new = np.isin(np.arange(len(rows)), first) & (columns >= known)
         for row in rows[new]:  # in the order of first sighting, which is that of the unknowns
             pose = slice(3 * problem.robots[row], 3 * problem.robots[row] + 3)
-            _append(
-                mean, covariance, pose, known, sights.residuals[row], sights.by_pose[row], sights.by_landmark[row]
-            )
+            _append(mean, covariance, pose, known, sights.residuals[row], sights.by_pose[row], sights.by_landmark[row])
             known += 3
         old = rows[~new]
         if len(old):
@@ -87,7 +85,12 @@ def ideal_online(problem: BatchProblem, batch: BatchEstimate) -> OnlineEstimate:
 
 
 def _predict(
-    mean: FloatArray, covariance: FloatArray, own: slice, known: int, residual: FloatArray, by_first: FloatArray,
+    mean: FloatArray,
+    covariance: FloatArray,
+    own: slice,
+    known: int,
+    residual: FloatArray,
+    by_first: FloatArray,
     by_second: FloatArray,
 ) -> None:
     """Move one pose in place: residual + F d_before + G d_after is standard normal, hence d_after = -G^-1 (...)."""
@@ -101,7 +104,12 @@ def _predict(
 
 
 def _append(
-    mean: FloatArray, covariance: FloatArray, pose: slice, known: int, residual: FloatArray, by_pose: FloatArray,
+    mean: FloatArray,
+    covariance: FloatArray,
+    pose: slice,
+    known: int,
+    residual: FloatArray,
+    by_pose: FloatArray,
     by_landmark: FloatArray,
 ) -> None:
     """Add a landmark in place, of which nothing is known but its first sighting."""
@@ -126,9 +134,7 @@ def _update(mean: FloatArray, covariance: FloatArray, residuals: FloatArray, jac
     covariance -= half.T @ half
 
 
-def _rows(
-    by_pose: FloatArray, by_landmark: FloatArray, poses: IntArray, landmarks: IntArray, size: int
-) -> FloatArray:
+def _rows(by_pose: FloatArray, by_landmark: FloatArray, poses: IntArray, landmarks: IntArray, size: int) -> FloatArray:
     """Return the Jacobian (3 n, size) with blocks (n, 3, 3) at the columns of pose and landmark of each measurement."""
     jacobian = np.zeros((len(by_pose), 3, size))
     each, inner = np.arange(len(by_pose)), np.arange(3)

@@ -64,9 +64,7 @@ def align_log(config: MrclamPairsConfig, on_part: Callable[[float], None] = lamb
     for place, duration in enumerate(config.durations):
         limit = duration or None
         log = load_mrclam(config.path, None, limit, None)
-        alone = ReplayConfig(
-            path=config.path, duration=limit, alone=True, particles=config.particles, seed=config.seed
-        )
+        alone = ReplayConfig(path=config.path, duration=limit, alone=True, particles=config.particles, seed=config.seed)
         done = place / len(config.durations)
         result = replay(log, alone, lambda share, report, d=done: on_part(d + share / len(config.durations)))  # type: ignore[misc]
         rows += [{"duration_s": limit} | row for row in align_pairs(result, log)]

@@ -55,8 +55,13 @@ class Fig6Config(PlainConfig):
         """Return the trials of the map error, those on the same run in a row, seed by seed."""
         return [
             ErrorTrial(
-                regime=name, proposal=proposal, robots=robots, particles=particles, measurements=self.measurements,
-                length=float(self.length), seed=seed,
+                regime=name,
+                proposal=proposal,
+                robots=robots,
+                particles=particles,
+                measurements=self.measurements,
+                length=float(self.length),
+                seed=seed,
             )
             for seed in range(self.seed, self.seed + self.seeds)
             for name in self.regimes
@@ -70,7 +75,10 @@ class Fig6Config(PlainConfig):
         """Return the trials of the time per step, seed by seed; none without the paper's regime."""
         return [
             TimeTrial(
-                robots=self.robots, particles=particles, measurements=self.measurements, length=float(self.length),
+                robots=self.robots,
+                particles=particles,
+                measurements=self.measurements,
+                length=float(self.length),
                 seed=seed,
             )
             for seed in range(self.seed, self.seed + self.seeds)

@@ -24,9 +24,7 @@ def replay_mrclam(
     path: Annotated[
         Path | None, typer.Option(help="Folder of the log.", show_default=f"{DATASET} in $VSLAM_DATA")
     ] = None,
-    robots: Annotated[
-        str | None, typer.Option(help="Numbers with commas, e.g. 1,2,5.", show_default="all")
-    ] = None,
+    robots: Annotated[str | None, typer.Option(help="Numbers with commas, e.g. 1,2,5.", show_default="all")] = None,
     truth: Annotated[
         Path | None, typer.Option(help="File of the true poses of the one robot named.", show_default="the folder's")
     ] = None,

@@ -52,9 +52,7 @@ def holds_images(path: str | Path) -> bool:
     return _eyes(Path(path)) is not None
 
 
-def load_kitti_images(
-    path: str | Path, truth: str | Path | None = None, duration: float | None = None
-) -> KittiImages:
+def load_kitti_images(path: str | Path, truth: str | Path | None = None, duration: float | None = None) -> KittiImages:
     """Read a folder with `image_0` and `image_1` (or `image_l` and `image_r`), `calib.txt` and perhaps `poses.txt`.
 
     Args:

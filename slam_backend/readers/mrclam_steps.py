@@ -150,7 +150,6 @@ def _robot_steps(
     descriptors = np.eye(len(subjects), dtype=np.float32)[column]
     bounds = np.searchsorted(step, np.arange(len(times) + 1))
     frames = [
-        Measurements(points[a:b], descriptors[a:b], covariances[a:b]) if b > a else None
-        for a, b in pairwise(bounds)
+        Measurements(points[a:b], descriptors[a:b], covariances[a:b]) if b > a else None for a, b in pairwise(bounds)
     ]
     return RobotSteps(odometry, reckoned, tuple(frames))

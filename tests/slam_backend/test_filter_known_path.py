@@ -178,9 +178,7 @@ def test_no_noise_no_error_with_given_covariances(proposal: Any, num_robots: int
     for _ in range(40):
         poses = compose(poses, [0.25, 0.02, 0.3])
         covariances = [measure(rng, pose, landmarks, sigma)[0].covariances for pose in poses]
-        points = [
-            CAMERA.camera_from_robot((landmarks - [pose[0], pose[1], 0.0]) @ turn(pose[2])) for pose in poses
-        ]
+        points = [CAMERA.camera_from_robot((landmarks - [pose[0], pose[1], 0.0]) @ turn(pose[2])) for pose in poses]
         frames = [Measurements(some, np.eye(7), noise) for some, noise in zip(points, covariances, strict=True)]
         report = slam.step([[0.25, 0.02, 0.3]] * num_robots, frames, identities=[range(7)] * num_robots)
         assert report.ess == pytest.approx(5.0)

@@ -38,9 +38,7 @@ def test_moving_the_start_moves_the_answer(proposal: Any) -> None:
     results = []
     for initial in ([0.0, 0.0, 0.0], start):
         world = StereoWorld(np.random.default_rng(4))
-        slam = FastSlam(
-            num_particles=7, camera=world.camera, proposal=proposal, seed=2, initial_poses=[initial]
-        )
+        slam = FastSlam(num_particles=7, camera=world.camera, proposal=proposal, seed=2, initial_poses=[initial])
         _, reports = drive(slam, world, 25)
         results.append((slam, reports))
     (a, reports_a), (b, reports_b) = results
@@ -59,9 +57,7 @@ def test_no_noise_no_error(proposal: Any, num_robots: int) -> None:
     """Exact odometry and exact measurements give exact poses and an exact map, associations unknown."""
     world = StereoWorld(np.random.default_rng(1))
     starts = np.array([[0.0, 0.0, 0.0], [0.4, -0.3, 2.0]])[:num_robots]
-    slam = FastSlam(
-        num_robots, 5, world.camera, EXACT_MOTION, proposal, seed=0, initial_poses=starts, dead_zone=11.34
-    )
+    slam = FastSlam(num_robots, 5, world.camera, EXACT_MOTION, proposal, seed=0, initial_poses=starts, dead_zone=11.34)
     poses = starts.copy()
     for _ in range(60):
         poses = compose(poses, MOVE)

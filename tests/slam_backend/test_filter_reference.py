@@ -217,7 +217,6 @@ def run_both(seed: int, num_particles: int, most: int, steps: int, proposal: str
     return counts
 
 
-
 def run_worlds(seeds: range, sizes: tuple[int, ...], most: int, steps: int) -> Counter[str]:
     """Run worlds that differ in size, options and luck; return what happened in all of them."""
     total: Counter[str] = Counter()

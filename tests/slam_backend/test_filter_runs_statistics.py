@@ -51,9 +51,7 @@ def test_uncertainty_of_whole_runs(steps: int, lowest: float, highest: float) ->
 
 def test_more_particles_are_less_overconfident() -> None:
     """Over three turns, 200 particles claim less certainty than 10 in the same runs; Wilcoxon's test, p < 1e-3."""
-    few, many = (
-        [np.log(run(seed, num_particles, 60)[0]).mean() for seed in range(20)] for num_particles in (10, 200)
-    )
+    few, many = ([np.log(run(seed, num_particles, 60)[0]).mean() for seed in range(20)] for num_particles in (10, 200))
     assert stats.wilcoxon(few, many, alternative="greater").pvalue < 1e-3
 
 

@@ -35,9 +35,7 @@ def solve_with_gtsam(gtsam: ModuleType, problem: BatchProblem, start: Estimate) 
     for row, landmark in enumerate(start.landmarks):
         values.insert(landmark_key(row), landmark)
     camera = problem.camera
-    stereo = gtsam.noiseModel.Diagonal.Sigmas(
-        np.array([camera.sigma_px, camera.sigma_px, camera.sigma_disparity_px])
-    )
+    stereo = gtsam.noiseModel.Diagonal.Sigmas(np.array([camera.sigma_px, camera.sigma_px, camera.sigma_disparity_px]))
     for n, point in enumerate(problem.points):
         keys = [pose_key(problem.robots[n], problem.steps[n]), landmark_key(problem.landmarks[n])]
         graph.add(gtsam.CustomFactor(stereo, keys, _stereo_error(gtsam, camera, point)))

@@ -85,9 +85,7 @@ def test_maps_are_scored_by_the_landmarks_behind_them(run: StereoRun) -> None:
 
 def test_methods_come_in_their_order(rows: list[dict[str, Any]]) -> None:
     """Batch ML is nearest to the truth, dead reckoning farthest; all figures that a method can have are there."""
-    mean = {
-        method: np.mean([row["pose_rms_m"] for row in rows if row["method"] == method]) for method in SMALL.methods
-    }
+    mean = {method: np.mean([row["pose_rms_m"] for row in rows if row["method"] == method]) for method in SMALL.methods}
     assert mean["batch_ml"] <= mean["ideal_online"] < mean["fastslam2"] < mean["dead_reckoning"]
     for row in rows:
         of_all = [figure for figure in FIGURES if figure not in ("rejuvenation_ms", "refused_share")]
@@ -137,9 +135,7 @@ def test_rejuvenation_is_a_method_of_its_own() -> None:
 
 def test_filters_that_assume_more_noise_claim_less() -> None:
     """More noise of the measurements, or landmarks that walk, make them less sure; the run and the peers stay."""
-    trial = Trial(
-        preset="good", association="known", robots=1, length=12.0, method="fastslam2", particles=20, seed=30
-    )
+    trial = Trial(preset="good", association="known", robots=1, length=12.0, method="fastslam2", particles=20, seed=30)
     as_it_is = play(trial)["nees_median"]
     assert play(replace(trial, noise_factor=9.0))["nees_median"] < 0.5 * as_it_is
     assert play(replace(trial, landmark_noise=0.03))["nees_median"] < 0.9 * as_it_is

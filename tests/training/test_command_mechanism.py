@@ -66,9 +66,7 @@ def test_what_is_given_goes_above_quick_and_quick_above_a_file(tmp_path: Path) -
         gather("other", {}, **common)
 
 
-def test_logs_are_looked_for_below_the_folder_of_data(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_logs_are_looked_for_below_the_folder_of_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A log that is not named is where VSLAM_DATA says; without that variable the error says what to name."""
     common: dict[str, Any] = {"config": None, "json": None, "out": None, "log": (Path("park"), "the park's log")}
     monkeypatch.setenv("VSLAM_DATA", str(tmp_path))

@@ -97,9 +97,7 @@ def test_the_papers_filter_resamples_at_every_step(run: StereoRun) -> None:
 
 def test_trials_repeat() -> None:
     """The same trial gives the same figures, and others for another seed."""
-    trial = ErrorTrial(
-        regime="good", proposal="fastslam1", robots=2, particles=5, measurements=8, length=3.0, seed=42
-    )
+    trial = ErrorTrial(regime="good", proposal="fastslam1", robots=2, particles=5, measurements=8, length=3.0, seed=42)
     other = replace(trial, seed=43)
     assert play_error(trial) == play_error(trial)
     assert play_error(trial)["map_rmse_m"] != play_error(other)["map_rmse_m"]

@@ -60,9 +60,7 @@ def test_noise_is_removed_that_dead_reckoning_keeps(tmp_path: Path) -> None:
     assert len(result.groups) == 1
 
 
-def test_a_run_is_written_and_repeats_itself(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, vslam: Any
-) -> None:
+def test_a_run_is_written_and_repeats_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, vslam: Any) -> None:
     """The command leaves a complete folder, and run again from its config the same metrics to the last digit."""
     log, first, second = (tmp_path / name for name in ("log", "first", "second"))
     log.mkdir()

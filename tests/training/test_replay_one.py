@@ -158,9 +158,7 @@ def test_a_run_is_written_and_repeats_itself(
     assert np.array_equal(estimate.poses, Trajectory.load_tum(second / "estimate.tum").poses)
 
 
-@pytest.mark.parametrize(
-    ("command", "what"), [("victoria", "the Victoria Park log"), ("kitti", "KITTI features")]
-)
+@pytest.mark.parametrize(("command", "what"), [("victoria", "the Victoria Park log"), ("kitti", "KITTI features")])
 def test_a_log_that_is_not_named_is_asked_for(
     command: str, what: str, monkeypatch: pytest.MonkeyPatch, refusal: Any
 ) -> None:

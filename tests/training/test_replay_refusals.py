@@ -44,9 +44,7 @@ def _turn_back(command: str, log: Path) -> None:
         ("kitti", "path: expected an archive (.npz) of KITTI features, or a folder with one, got no such file. Check"),
     ],
 )
-def test_a_log_that_is_not_there_is_told_so(
-    command: str, message: str, refusal: Any, tmp_path: Path
-) -> None:
+def test_a_log_that_is_not_there_is_told_so(command: str, message: str, refusal: Any, tmp_path: Path) -> None:
     """A path that leads nowhere is named."""
     assert refusal("replay", command, "--path", "none").startswith(f"error {message}")
 
@@ -81,9 +79,7 @@ def test_a_file_that_was_cut_is_named(
         ("kitti", "path: expected drive.npz with two or more rising times in 'time_stamps', got a different one."),
     ],
 )
-def test_time_that_goes_back_is_refused(
-    command: str, message: str, refusal: Any, tmp_path: Path
-) -> None:
+def test_time_that_goes_back_is_refused(command: str, message: str, refusal: Any, tmp_path: Path) -> None:
     """Two readings in the wrong order end the replay before it begins."""
     log = tmp_path / "log"
     log.mkdir()
@@ -93,9 +89,7 @@ def test_time_that_goes_back_is_refused(
 
 
 @pytest.mark.parametrize("command", WRITERS)
-def test_a_folder_with_files_is_never_written_to(
-    command: str, refusal: Any, tmp_path: Path
-) -> None:
+def test_a_folder_with_files_is_never_written_to(command: str, refusal: Any, tmp_path: Path) -> None:
     """The run folder is a new or an empty one; whatever another one holds stays."""
     for name in ("log", "full"):
         (tmp_path / name).mkdir()

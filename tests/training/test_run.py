@@ -90,9 +90,7 @@ def test_an_episode_can_be_stopped() -> None:
     config = RunConfig(robots=2, policy="random_walk", seed=3)
     env = vslam_v0.parallel_env(world=ROOM, num_robots=2, max_cycles=STEPS, num_particles=13)
     seen: list[int] = []
-    stopped = run_episode(
-        env, config.make_policies(env), 3, lambda p: seen.append(p.step), lambda: len(seen) > 5
-    )
+    stopped = run_episode(env, config.make_policies(env), 3, lambda p: seen.append(p.step), lambda: len(seen) > 5)
     assert seen == [0, 1, 2, 3, 4, 5]
     assert not stopped.complete
     assert len(stopped.times) == 6
@@ -147,6 +145,7 @@ def test_a_merge_is_false_beyond_half_a_metre_or_five_degrees(error_m: float, er
 
 def test_figures_are_drawn_for_any_team(record: EpisodeRecord, tmp_path: Path) -> None:
     """One robot or five, merged or not, and a run that was stopped at once: all give two pictures."""
+
     def cut(robots: int, rows: int) -> EpisodeRecord:
         chosen = [k % 2 for k in range(robots)]
         return replace(

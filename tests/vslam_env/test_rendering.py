@@ -77,9 +77,7 @@ def test_a_robot_is_drawn_where_it_is() -> None:
         np.testing.assert_allclose(frame[row + strips[0], column], robot_colour(robot), atol=2)
 
 
-@given(
-    arrays(np.float64, (5, 2), elements=st.floats(-50.0, 50.0)), st.integers(100, 900), st.integers(100, 900)
-)
+@given(arrays(np.float64, (5, 2), elements=st.floats(-50.0, 50.0)), st.integers(100, 900), st.integers(100, 900))
 def test_a_viewport_keeps_proportions_and_holds_all(points: np.ndarray, width: int, height: int) -> None:
     """All points fall inside the image, and distances are scaled alike in x and y, with y turned around."""
     view = Viewport.around(points, width, height)
