@@ -153,7 +153,16 @@ def fuse_maps(map_a: LandmarkMap, map_b: LandmarkMap, alignment: Alignment) -> L
 
 
 def check_inliers(inliers: IntArray, size_a: int, size_b: int) -> None:
-    """Raise unless the inliers (k, 2) pair existing landmarks one-to-one."""
+    """Raise unless the inliers pair existing landmarks one-to-one.
+
+    Args:
+        inliers: (k, 2) int64. Rows of either map.
+        size_a: Landmarks of the first map.
+        size_b: Landmarks of the second.
+
+    Raises:
+        ValueError: If a row lies outside or comes twice.
+    """
     outside = (inliers < 0) | (inliers >= np.array([size_a, size_b]))
     repeated = any(len(np.unique(column)) < len(column) for column in inliers.T)
     if outside.any() or repeated:

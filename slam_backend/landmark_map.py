@@ -123,6 +123,9 @@ class LandmarkMap:
 
         Returns:
             A new map: means R mu + t, covariances R Sigma R^T, the rest shared with this one.
+
+        Raises:
+            ValueError: If `a_from_b` is no pose.
         """
         pose = check_array("a_from_b", a_from_b, (3,), "Give a pose (x, y, theta).")
         return self._trusted(
@@ -134,7 +137,14 @@ class LandmarkMap:
         )
 
     def subset(self, indices: ArrayLike) -> Self:
-        """Return the landmarks at `indices`: (k,) integers, each at most once, or an (N,) mask of bools."""
+        """Return some of the landmarks, in the order asked for.
+
+        Args:
+            indices: (k,) integers, each at most once, or (N,) bool, a mask.
+
+        Raises:
+            ValueError: If they are neither, or name a landmark twice or one that is not there.
+        """
         chosen = np.asarray(indices)
         if chosen.dtype == np.bool_ and chosen.shape == (len(self),):
             return self._trusted(*(getattr(self, name)[chosen] for name in FIELDS))
@@ -147,7 +157,11 @@ class LandmarkMap:
         return self._trusted(*(getattr(self, name)[rows] for name in FIELDS))
 
     def save(self, path: str | Path) -> None:
-        """Write the map to `path`, exactly as named, as a numpy archive that `load` reads back bit for bit."""
+        """Write the map to `path`, exactly as named, as a numpy archive that `load` reads back bit for bit.
+
+        Raises:
+            ValueError: If the folder of `path` is not there.
+        """
         arrays: dict[str, Any] = {name: getattr(self, name) for name in FIELDS}
         if not Path(path).parent.is_dir():
             cure = f"Make the folder {str(Path(path).parent)!r} first."
