@@ -21,10 +21,11 @@ from rich.console import Console
 
 from slam_backend.errors import bad_argument, check_int
 from slam_backend.filter import FastSlam
+from slam_backend.metrics import map_rmse
 from slam_backend.smoothing.options import SmoothingOptions
 from slam_backend.warming import warm_up
 from training.accuracy_trials import REJUVENATE_EVERY
-from training.stereo_runs import STEP, RunSpec, simulate_run
+from training.stereo_runs import STEP, RunSpec, StereoRun, simulate_run
 
 app = typer.Typer(no_args_is_help=True)
 console = Console(highlight=False, soft_wrap=True)
@@ -66,18 +67,24 @@ def long_run(
     steps: Annotated[int, typer.Option(help="Of the run.")] = 10_000,
     landmarks: Annotated[int, typer.Option(help="In the office.")] = 2000,
     every: Annotated[int, typer.Option(help="Steps between rejuvenations.")] = 50,
+    effort: Annotated[float, typer.Option(help="See SmoothingOptions.")] = SmoothingOptions().effort,
     seed: Annotated[int, typer.Option(help="Of the run and of the filters.")] = 100,
 ) -> None:
-    """Time a run with rejuvenation and without, interleaved."""
+    """Time a run with rejuvenation and without, interleaved, and say how far off poses and maps are."""
+    smoothing = SmoothingOptions(effort=effort)
     warm_up()
     run = simulate_run(RunSpec(length=STEP * steps, landmarks=landmarks), seed)
-    filters = [run.build_filter(100, "fastslam2", seed, rejuvenate_every=chosen) for chosen in (None, every)]
-    spent, drawn = np.zeros(2), []
-    for reading in run.readings():
+    filters = [
+        run.build_filter(100, "fastslam2", seed, rejuvenate_every=chosen, smoothing=smoothing)
+        for chosen in (None, every)
+    ]
+    spent, drawn, squares = np.zeros(2), [], np.zeros(2)
+    for step, reading in enumerate(run.readings()):
         for i, slam in enumerate(filters):
             begin = time.process_time()
             report = slam.step(**reading).rejuvenation
             spent[i] += (now := time.process_time()) - begin
+            squares[i] += ((slam.pose().mean - run.true_paths[0, step])[:2] ** 2).sum()
             if report is not None:
                 drawn.append(now - begin)
     console.print(
@@ -86,9 +93,14 @@ def long_run(
         f"{1e3 * np.median(drawn):.0f} ms, at most {1e3 * max(drawn):.0f} ms; the smoother holds "
         f"{smoother_bytes(filters[1]) / 1e6:.1f} MB, the log {filters[1].log().nbytes / 1e6:.1f} MB"
     )
-    for name, slam in zip(("without", "with"), filters, strict=True):
-        off = slam.pose().mean - run.true_paths[0, -1]
-        console.print(f"{name:8s} last pose {np.hypot(off[0], off[1]):.3f} m off")
+    for name, slam, square in zip(("without", "with"), filters, squares, strict=True):
+        pose = np.sqrt(square / run.num_steps)
+        console.print(f"{name:8s} pose {pose:.3f} m off (RMS of all steps), map {map_off(run, slam):.3f} m")
+
+
+def map_off(run: StereoRun, slam: FastSlam) -> float:
+    """Return the RMS error [m] of a filter's landmarks, told by their places."""
+    return map_rmse(slam.map().means, run.landmarks).rmse
 
 
 def smoother_bytes(slam: FastSlam) -> int:

@@ -311,7 +311,8 @@ def write_maps(maps: ParticleMaps, best: int, particles: Particles, walk: float)
         odds = np.repeat(mean[:, None], m, axis=1)
     counts = np.repeat(particles.counts[rows][:, None], m, axis=1)
     tiles = particles.tiles[rows]
-    tiles[:, :, DIAGONAL] += walk
+    for row in DIAGONAL:
+        tiles[:, :, row] += walk
     maps.load_tiles(
         tiles, counts, maps.descriptors[slots], maps.ids[slots], maps.identities[slots],
         maps.next_id, odds,

@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from slam_backend._jit import inlined, jit, lanes, lanes_inlined
+from slam_backend._jit import inlined, jit, lanes
 from slam_backend.errors import BoolArray, FloatArray, IntArray
 
 MIN_DEPTH = 0.05  # [m]; a landmark predicted nearer than this to the camera plane is linearised where it was measured
@@ -172,21 +172,6 @@ def condense(
     return total
 
 
-@lanes_inlined
-def _subtract(
-    row: FloatArray, at: int, packed: FloatArray, begin: int, count: int, x: float, y: float, z: float
-) -> None:  # fmt: skip
-    """Subtract from a stretch of a row the sum of three rows times x, y, z."""
-    target = row[at : at + count]
-    one, two, three = (
-        packed[0, begin : begin + count],
-        packed[1, begin : begin + count],
-        packed[2, begin : begin + count],
-    )
-    for c in range(count):
-        target[c] -= x * one[c] + y * two[c] + z * three[c]
-
-
 @jit
 def assemble(
     poses: FloatArray, landmarks: FloatArray, columns: IntArray, previous: IntArray, motions: FloatArray,
@@ -258,7 +243,7 @@ def assemble(
     most = 0
     for landmark in range(len(landmarks)):
         most = max(most, starts[landmark + 1] - starts[landmark])
-    packed, sought = np.empty((3, 3 * most)), np.empty(most, dtype=np.int64)
+    sought, column_of = np.empty(most, dtype=np.int64), np.empty(most, dtype=np.int64)
     for landmark in range(len(landmarks)):
         first, last = starts[landmark], starts[landmark + 1]
         block[:] = 0.0
@@ -311,30 +296,29 @@ def assemble(
         num = 0
         for q in range(first, last):
             own = columns[keys[q]]
-            if own < 0:
-                continue
-            for i in range(3):
-                packed[0, 3 * num + i], packed[1, 3 * num + i], packed[2, 3 * num + i] = cross[q, i]
-            sought[num] = q
-            num += 1
-        for n in range(num):
-            x, own = cross[sought[n]], columns[keys[sought[n]]]
+            if own >= 0:
+                sought[num], column_of[num] = q, own
+                num += 1
+        for n in range(num):  # keys ascend, and columns with them
+            x, own = cross[sought[n]], column_of[n]
             for i in range(3):
                 h[i, 0] = x[i, 0] * p[0] + x[i, 1] * p[1] + x[i, 2] * p[2]
                 h[i, 1] = x[i, 0] * p[1] + x[i, 1] * p[3] + x[i, 2] * p[4]
                 h[i, 2] = x[i, 0] * p[2] + x[i, 1] * p[4] + x[i, 2] * p[5]
                 vector[own + i] -= h[i, 0] * force[0] + h[i, 1] * force[1] + h[i, 2] * force[2]
-            begin = 0
-            while begin < num:  # columns that follow each other are one stretch of the rows; keys ascend
-                column = columns[keys[sought[begin]]]
-                if column > own:
+            h00, h01, h02 = h[0, 0], h[0, 1], h[0, 2]
+            h10, h11, h12 = h[1, 0], h[1, 1], h[1, 2]
+            h20, h21, h22 = h[2, 0], h[2, 1], h[2, 2]
+            for o in range(num):
+                at = column_of[o]
+                if at > own:
                     break
-                end = begin + 1
-                while end < num and columns[keys[sought[end]]] == column + 3 * (end - begin) <= own:
-                    end += 1
-                for i in range(3):
-                    _subtract(matrix[own + i], column, packed, 3 * begin, 3 * (end - begin), h[i, 0], h[i, 1], h[i, 2])
-                begin = end
+                z = cross[sought[o]]
+                for j in range(3):
+                    z0, z1, z2 = z[j, 0], z[j, 1], z[j, 2]
+                    matrix[own, at + j] -= h00 * z0 + h01 * z1 + h02 * z2
+                    matrix[own + 1, at + j] -= h10 * z0 + h11 * z1 + h12 * z2
+                    matrix[own + 2, at + j] -= h20 * z0 + h21 * z1 + h22 * z2
     return cost
 
 

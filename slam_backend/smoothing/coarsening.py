@@ -184,14 +184,14 @@ def _combined(
     """Add up the forms of each pair of key and landmark, about the centre of the first."""
     if not len(keys):
         return keys, landmarks, centres, infos, slopes, counts
-    order = np.lexsort((keys, landmarks))
+    order = np.argsort(landmarks * (keys.max() + 1) + keys, kind="stable")  # which is nearly theirs already
     keys, landmarks = keys[order], landmarks[order]
     centres, infos, slopes, counts = centres[order], infos[order], slopes[order], counts[order]
     new = np.ones(len(keys), dtype=np.bool_)
     new[1:] = (keys[1:] != keys[:-1]) | (landmarks[1:] != landmarks[:-1])
-    first = np.flatnonzero(new)
-    shift = centres[first][np.cumsum(new) - 1] - centres
-    slopes = slopes - np.einsum("nij,nj->ni", _full(infos), shift)
+    first, other = np.flatnonzero(new), np.flatnonzero(~new)
+    shift = centres[first][np.cumsum(new)[other] - 1] - centres[other]
+    slopes[other] -= np.einsum("nij,nj->ni", _full(infos[other]), shift)
     return (
         keys[first], landmarks[first], centres[first], np.add.reduceat(infos, first), np.add.reduceat(slopes, first),
         np.add.reduceat(counts, first),
