@@ -64,6 +64,7 @@ class MergeFate:
         step: When it was made.
         robots_a, robots_b: Which groups.
         error_m, error_deg: Of its motion.
+        bent_m, bent_deg: Of the motion by which the maps would have merged had they not been straightened; NaN if none.
         undone_after: Steps until it was undone; None: it was not.
         ended_after: Steps until the run ended.
         end_m, end_deg: Of one group's frame in the other's as the team has it at the end; NaN if undone.
@@ -77,6 +78,8 @@ class MergeFate:
     robots_b: tuple[int, ...]
     error_m: float
     error_deg: float
+    bent_m: float
+    bent_deg: float
     undone_after: int | None
     ended_after: int
     end_m: float
@@ -295,7 +298,7 @@ def fates(
             found.append(
                 MergeFate(
                     seed, world, alike, event.step, event.robots_a, event.robots_b,
-                    *off_by(starts, event, event.alignment.transform),
+                    *off_by(starts, event, event.alignment.transform), *off_if_bent(starts, events[:i], event),
                     None if undone is None else undone - event.step, steps - event.step,
                     *(off_by(starts, event, end) if undone is None else (float("nan"), float("nan"))),
                 )
@@ -303,11 +306,24 @@ def fates(
     return found, delays(events, seed)
 
 
+def off_if_bent(starts: FloatArray, before: Sequence[MergeEvent], merge: MergeEvent) -> tuple[float, float]:
+    """Return by how much [m, degrees] the maps of a merge were off before they were straightened; NaN if they were not.
+
+    Args:
+        starts: As in `fates`.
+        before: The events before the merge, the attempt that led to it among them.
+        merge: The merge.
+    """
+    attempt = next((event for event in before if event.alignment is merge.alignment), None)
+    nothing = float("nan"), float("nan")
+    return nothing if attempt is None or attempt.bent is None else off_by(starts, attempt, attempt.bent.transform)
+
+
 def delays(events: Sequence[MergeEvent], seed: int) -> list[Delay]:
     """Return the attempts of a run that were refused only because maps were straightened."""
     found = []
     for i, event in enumerate(events):
-        if event.straightened and not event.alignment.success:
+        if event.bent is not None and not event.alignment.success:
             pair = {event.robots_a[0], event.robots_b[0]}
             merged = (e.step for e in events[i:] if e.kind == "merge" and len(pair & {*e.robots_a, *e.robots_b}) == 2)
             later = next(merged, None)
@@ -320,6 +336,7 @@ def summarise(merges: list[MergeFate], late: list[Delay], runs: int, steps: int)
     false = [merge for merge in merges if merge.is_false]
     right = [merge for merge in merges if not merge.is_false]
     after = [merge.undone_after for merge in false if merge.undone_after is not None]
+    bent = any(np.isfinite(merge.bent_m) for merge in merges)
     return {
         "runs": runs,
         "steps": steps,
@@ -333,6 +350,8 @@ def summarise(merges: list[MergeFate], late: list[Delay], runs: int, steps: int)
         "steps_until_undone_median": float(np.median(after)) if after else float("nan"),
         "rms_error_m": float(np.sqrt(np.mean([merge.error_m**2 for merge in merges]))) if merges else float("nan"),
         "largest_error_m": max((merge.error_m for merge in merges), default=float("nan")),
+        "false_had_they_been_bent": sum(is_false_merge(merge.bent_m, merge.bent_deg) for merge in merges),
+        "rms_error_had_they_been_bent_m": float(np.sqrt(np.nanmean([m.bent_m**2 for m in merges]))) if bent else None,
         "refused_once_straight": len(late),
         "never_merged_after_that": sum(delay.merged_after is None for delay in late),
     }

@@ -79,8 +79,8 @@ class MergeEvent:
         robots_a: The group whose map frame stays.
         robots_b: The other group.
         alignment: `map` of group a from `map` of group b, as found; refused attempts carry the reason.
-        straightened: Whether the maps had aligned as they were, so that they were straightened, and `alignment` is that
-            of the straight ones.
+        bent: Of an attempt: the alignment of the maps as the filters had bent them, where these were straightened then
+            and `alignment` is that of the straight ones; else None.
     """
 
     step: int
@@ -88,7 +88,7 @@ class MergeEvent:
     robots_a: tuple[int, ...]
     robots_b: tuple[int, ...]
     alignment: "Alignment"
-    straightened: bool = False
+    bent: "Alignment | None" = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

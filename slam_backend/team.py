@@ -265,14 +265,14 @@ class TeamSlam(TeamKnowledge):
             return ()
         a, b = pairs[chosen]
         alignment = align_maps(maps[a.robots], maps[b.robots], rng=self._rng, options=self._alignment)
+        bent: Alignment | None = None
         speakers = a.trunk.live[0], b.trunk.live[0]
         self._records.exchange.record_maps(*speakers, maps[a.robots], maps[b.robots])
         straight = straightened(a, b) if alignment.success and self._merging.straighten else None
         if straight is not None:
-            alignment = align_maps(*straight, rng=self._rng, options=self._alignment)
+            bent, alignment = alignment, align_maps(*straight, rng=self._rng, options=self._alignment)
             self._records.exchange.record_straightened(*speakers, *straight)
-        attempt = MergeEvent(self._step, "attempt", a.robots, b.robots, alignment, straight is not None)
-        self._events.append(attempt)
+        self._events.append(MergeEvent(self._step, "attempt", a.robots, b.robots, alignment, bent))
         self._schedule.record(chosen, self._step, alignment.success)
         return (self.merge(*speakers, alignment),) if alignment.success else ()
 

@@ -63,9 +63,10 @@ def test_a_merge_is_that_of_straightened_maps() -> None:
     _, team = driven(112, AT_LAST)
     sides = [straightened(alone._find(robot)[0].filter) for robot in range(2)]
     rng = alone._rng
-    assert align_maps(*both_maps(alone), rng=rng).success
+    bent = align_maps(*both_maps(alone), rng=rng)
     found = align_maps(sides[0].map("mixture"), sides[1].map("mixture"), rng=rng)
-    assert [(event.kind, event.straightened) for event in team.events] == [("attempt", True), ("merge", False)]
+    assert [event.kind for event in team.events] == ["attempt", "merge"]
+    assert_same(team.events[0].bent, bent)
     assert_same(team.events[1].alignment, found)
     watch = team._find(0)[0].watches[0]
     for side, of_side, before in zip(watch.sides, sides, watch.before, strict=True):
@@ -99,7 +100,9 @@ def test_maps_that_no_longer_fit_are_not_merged() -> None:
     strict = AlignmentOptions(max_sigma_position=float(np.mean(sigmas)))
     _, team = driven(113, AT_LAST, alignment=strict)
     event = team.events[0]
-    assert (event.kind, event.alignment.reason, event.straightened) == ("attempt", "too uncertain", True)
+    assert (event.kind, event.alignment.reason) == ("attempt", "too uncertain")
+    assert event.bent is not None
+    assert event.bent.success
     assert len(team.events) == 1
     assert team.groups == ((0,), (1,))
     assert not team._schedule.may_try(((0,), (1,)), STEPS)
@@ -116,7 +119,7 @@ def test_what_cannot_be_bent_is_merged_as_it_is() -> None:
             poses = [between(start, pose) for start, pose in zip(simulation.starts, simulation.poses, strict=True)]
             team.step(odometry, frames, poses=poses)
         assert len(team.groups) == 1
-        assert not team.events[0].straightened
+        assert team.events[0].bent is None
         states.append(team.get_state() | {"merging": None})
     assert_same(states[0], states[1])
 
