@@ -14,13 +14,13 @@ from slam_backend.log_arrays import LogArrays
 from slam_backend.reports import PoseEstimate
 from slam_backend.run_log import RobotLog
 from slam_backend.smoothing.coarsening import coarsened
-from slam_backend.smoothing.graph import PathGraph, first_rows, mean_pose
+from slam_backend.smoothing.extending import first_rows
+from slam_backend.smoothing.graph import PathGraph, mean_pose
 from slam_backend.smoothing.joining import joined
 from slam_backend.smoothing.options import SmoothingOptions
-from slam_backend.smoothing.rejuvenation import Looks, Particles, Rejuvenation, rejuvenate
+from slam_backend.smoothing.rejuvenation import Looks, Rejuvenation, rejuvenate
 from slam_backend.smoothing.slices import Draft, Smoother
 
-DIAGONAL = [3, 6, 8]  # of a landmark's covariance, in the rows of a tile
 CLOSURE = 3  # landmarks not seen for long that are matched in one step: a loop is closed
 SOONEST = 5  # after a fifth of the usual time at the earliest
 LEAST_ROWS = 8  # of each log in a slice, so that no more of them come while it is worked through
@@ -284,36 +284,3 @@ def _thinned(graph: PathGraph, robots: int, camera: FloatArray, options: Smoothi
     share = len(graph.tips) / robots
     keys, fresh = max(2, int(share * options.max_keys)), max(1, int(share * options.fresh_keys))
     return coarsened(graph, camera, replace(options, max_keys=keys, fresh_keys=fresh))
-
-
-def write_maps(maps: ParticleMaps, best: int, particles: Particles, walk: float) -> None:
-    """Give all particles the landmarks of their paths: those that the most probable one held and a sighting supports.
-
-    What only others held was a mistake, as far as is known: the log's association is that of the most probable. Names,
-    descriptors and odds stay; where a landmark's odds differ between particles, all get the mean of those that held it.
-    To the smoother landmarks stand still; that they may move until they are seen the next time is added here.
-
-    Args:
-        maps: Of the filter, changed.
-        best: Its most probable particle.
-        particles: The new ones.
-        walk: Variance [m^2] along each axis, see `FilterOptions.landmark_walk`.
-    """
-    slots = maps.used_slots()
-    slots = slots[(maps.of_particle(best, slots)[1] > 0) & np.isin(maps.ids[slots], particles.ids)]
-    rows = np.searchsorted(particles.ids[order := np.argsort(particles.ids)], maps.ids[slots])
-    rows = order[rows]
-    m = maps.num_particles
-    odds = maps.dense_odds(slots)
-    if odds is not None:
-        held = maps.dense(slots)[1] > 0
-        mean = (odds * held).sum(axis=1) / np.maximum(held.sum(axis=1), 1)
-        odds = np.repeat(mean[:, None], m, axis=1)
-    counts = np.repeat(particles.counts[rows][:, None], m, axis=1)
-    tiles = particles.tiles[rows]
-    for row in DIAGONAL:
-        tiles[:, :, row] += walk
-    maps.load_tiles(
-        tiles, counts, maps.descriptors[slots], maps.ids[slots], maps.identities[slots],
-        maps.next_id, odds,
-    )  # fmt: skip

@@ -18,7 +18,8 @@ from slam_backend._best_map import best_map, best_outline
 from slam_backend._existence_step import ExistenceStep
 from slam_backend._frame_buffers import FrameBuffers, Turn
 from slam_backend._particle_maps import ParticleMaps, aligned
-from slam_backend._rejuvenation_step import RejuvenationStep, write_maps
+from slam_backend._rejuvenated_maps import write_maps
+from slam_backend._rejuvenation_step import RejuvenationStep
 from slam_backend._start_frames import AT_ORIGIN, KNOWN, seen_from_starts, start_kind
 from slam_backend._step_input import check_step
 from slam_backend.adaptation import AdaptiveParticles, next_num_particles

@@ -12,7 +12,8 @@ import numpy as np
 
 from slam_backend.errors import BoolArray, FloatArray, IntArray
 from slam_backend.geometry import between, compose, rotation
-from slam_backend.smoothing.graph import NONE, PathGraph, chained
+from slam_backend.smoothing.extending import chained
+from slam_backend.smoothing.graph import NONE, PathGraph
 from slam_backend.smoothing.options import SmoothingOptions
 from slam_backend.smoothing.sightings import Sightings
 from slam_backend.smoothing.solving import Mode

@@ -14,7 +14,8 @@ from slam_backend.motion import OdometryModel
 from slam_backend.resampling import effective_sample_size, systematic
 from slam_backend.smoothing.coarsening import at_mode, coarsened, compacted
 from slam_backend.smoothing.duplicates import find_duplicates, without_duplicates
-from slam_backend.smoothing.graph import PathGraph, extended, first_rows
+from slam_backend.smoothing.extending import extended, first_rows
+from slam_backend.smoothing.graph import PathGraph
 from slam_backend.smoothing.options import SmoothingOptions
 from slam_backend.smoothing.sampling import Draws, draw_paths, scouted
 from slam_backend.smoothing.solving import Mode, find_mode

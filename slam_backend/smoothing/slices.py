@@ -14,7 +14,8 @@ from slam_backend.errors import FloatArray
 from slam_backend.log_arrays import REJECTED, LogArrays
 from slam_backend.motion import OdometryModel
 from slam_backend.smoothing.coarsening import at_mode
-from slam_backend.smoothing.graph import PathGraph, extended
+from slam_backend.smoothing.extending import extended
+from slam_backend.smoothing.graph import PathGraph
 from slam_backend.smoothing.options import SmoothingOptions
 from slam_backend.smoothing.rejuvenation import NEAR, Looks, Rejuvenation, drawn, settled
 from slam_backend.smoothing.solving import Mode, find_mode

@@ -7,7 +7,8 @@ import numpy as np
 from slam_backend.errors import FloatArray
 from slam_backend.geometry import between, inverse, transform_points, wrap_angle
 from slam_backend.run_log import RobotLog
-from slam_backend.smoothing.graph import PathGraph, extended
+from slam_backend.smoothing.extending import extended
+from slam_backend.smoothing.graph import PathGraph
 from slam_backend.smoothing.options import SmoothingOptions
 from training.batch_problem import BatchProblem
 from training.stereo_runs import RunSpec, StereoRun, simulate_run

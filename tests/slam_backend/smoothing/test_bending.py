@@ -11,7 +11,8 @@ from slam_backend.geometry import between, compose
 from slam_backend.motion import OdometryModel
 from slam_backend.run_log import RobotLog
 from slam_backend.smoothing.bending import bend
-from slam_backend.smoothing.graph import PathGraph, extended
+from slam_backend.smoothing.extending import extended
+from slam_backend.smoothing.graph import PathGraph
 from slam_backend.smoothing.sampling import _poses, _weighed, draw_paths
 from slam_backend.smoothing.solving import find_mode
 

@@ -6,7 +6,8 @@ from small_problems import TIGHT, camera_of, graph_of, logs_of, small_run
 from slam_backend.geometry import compose
 from slam_backend.run_log import RobotLog
 from slam_backend.smoothing.coarsening import at_mode, coarsened
-from slam_backend.smoothing.graph import PathGraph, extended
+from slam_backend.smoothing.extending import extended
+from slam_backend.smoothing.graph import PathGraph
 from slam_backend.smoothing.options import SmoothingOptions
 from slam_backend.smoothing.rejuvenation import rejuvenate
 from slam_backend.smoothing.sampling import draw_paths, lane_rows, replay

@@ -3,7 +3,8 @@ import pytest
 from small_problems import camera_of, graph_of, logs_of, small_run
 
 from slam_backend.geometry import between, compose
-from slam_backend.smoothing.graph import PathGraph, chained, first_rows
+from slam_backend.smoothing.extending import chained, first_rows
+from slam_backend.smoothing.graph import PathGraph
 from slam_backend.smoothing.options import SmoothingOptions
 from slam_backend.smoothing.rejuvenation import rejuvenate
 

@@ -2,7 +2,8 @@ import numpy as np
 from small_problems import TIGHT, camera_of, logs_of, small_run
 
 from slam_backend.geometry import between, compose
-from slam_backend.smoothing.graph import NONE, PathGraph, extended
+from slam_backend.smoothing.extending import extended
+from slam_backend.smoothing.graph import NONE, PathGraph
 from slam_backend.smoothing.joining import joined
 from slam_backend.smoothing.solving import find_mode
 

@@ -13,7 +13,8 @@ from slam_backend.camera import StereoCamera
 from slam_backend.motion import OdometryModel
 from slam_backend.run_log import RobotLog
 from slam_backend.smoothing._kernels import invert
-from slam_backend.smoothing.graph import PathGraph, extended
+from slam_backend.smoothing.extending import extended
+from slam_backend.smoothing.graph import PathGraph
 from slam_backend.smoothing.options import SmoothingOptions
 from slam_backend.smoothing.solving import find_mode
 from training.batch_ml import batch_ml

@@ -5,6 +5,8 @@ import pickle
 
 import numpy as np
 import pytest
+from filter_contents import contents
+from merged_pair import NEVER, false_alignment
 from same_bits import assert_same
 from simulated_team import SimulatedTeam
 
@@ -98,3 +100,24 @@ def test_no_two_filters_work_on_their_smoothers_in_one_step(monkeypatch):
     simulation.run(team, 60)
     assert len(worked) > 10
     assert len(set(worked)) == len(worked)
+
+
+def test_after_an_undo_smoothers_are_as_if_they_had_never_been_joined():
+    """Filters with all that their smoothers know are bit for bit those of a team that never merged, and stay so."""
+    smoothing = SmoothingOptions(slice_keys=16, max_keys=40)
+    (simulation, team), (other, twin) = (
+        (run, run.build(attempts=NEVER, rejuvenate_every=20, smoothing=smoothing))
+        for run in (SimulatedTeam(num_robots=2, seed=101) for _ in range(2))
+    )
+    simulation.run(team, 80)
+    other.run(twin, 80)
+    team.merge(0, 1, false_alignment(simulation, team, np.array([3.0, -2.0, 0.5])))
+    while not any(event.kind == "undo" for event in team.events):
+        assert len(simulation.run(team, 1)) == len(other.run(twin, 1)) == 1
+        assert team._step < 400
+    for _ in range(2):
+        for robot in range(2):
+            slam, same = (each._find(robot)[0].filter for each in (team, twin))
+            assert_same(contents(slam), contents(same))
+        simulation.run(team, 15)
+        other.run(twin, 15)

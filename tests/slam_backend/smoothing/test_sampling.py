@@ -6,7 +6,8 @@ from small_problems import TIGHT, camera_of, graph_of, small_run
 from slam_backend.errors import FloatArray
 from slam_backend.motion import OdometryModel
 from slam_backend.run_log import RobotLog
-from slam_backend.smoothing.graph import PathGraph, extended
+from slam_backend.smoothing.extending import extended
+from slam_backend.smoothing.graph import PathGraph
 from slam_backend.smoothing.sampling import draw_paths, lane_rows, replay, weigh_odometry
 from slam_backend.smoothing.solving import Mode, find_mode
 

@@ -11,7 +11,8 @@ from slam_backend.filter import FastSlam
 from slam_backend.geometry import wrap_angle
 from slam_backend.motion import OdometryModel
 from slam_backend.smoothing import slices
-from slam_backend.smoothing.graph import PathGraph, first_rows
+from slam_backend.smoothing.extending import first_rows
+from slam_backend.smoothing.graph import PathGraph
 from slam_backend.smoothing.options import SmoothingOptions
 from slam_backend.smoothing.slices import Draft, Smoother
 from slam_backend.smoothing.solving import find_mode

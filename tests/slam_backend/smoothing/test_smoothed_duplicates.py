@@ -5,7 +5,8 @@ from small_problems import TIGHT, camera_of, graph_of, logs_of, small_run
 
 from slam_backend.run_log import RobotLog
 from slam_backend.smoothing.duplicates import find_duplicates, without_duplicates
-from slam_backend.smoothing.graph import PathGraph, extended
+from slam_backend.smoothing.extending import extended
+from slam_backend.smoothing.graph import PathGraph
 from slam_backend.smoothing.sampling import draw_paths
 from slam_backend.smoothing.solving import find_mode
 
