@@ -12,13 +12,14 @@ from scipy.special import bdtrc
 
 from slam_backend import _alignment_kernels as kernels
 from slam_backend._candidates import match_table
-from slam_backend._evidence import FALSE_ALARMS, differ, fitting
+from slam_backend._evidence import differ, fitting
 from slam_backend._matching import look_alikes
 from slam_backend.alignment_types import RIVAL_DISTANCE, AlignmentOptions
 from slam_backend.errors import FloatArray, IntArray
 from slam_backend.landmark_map import LandmarkMap
 
 MOST_RECURRING = 0.2  # of the shared landmarks, but for the two that any motion can be made to fit
+NEEDLESS = 0.05  # how often a right alignment may be refused because chance makes a double: it is tried again later
 MOST_LANDMARKS = 200  # of a constellation that are looked at, every so many-th of it
 MOST_ALIKE = 50  # landmarks with more look-alikes than this tell nothing
 SAMPLES = 4000  # pairs of pairs that are tried
@@ -29,7 +30,7 @@ def recurs(landmarks: LandmarkMap, rows: IntArray, variance: float, options: Ali
     """Tell whether a constellation of a map occurs in it a second time, as far as two maps of one place agree.
 
     It does if by some motion a fifth of its landmarks come to lie on landmarks that look like them, and so many would
-    do so by chance, among as many look-alikes spread over the map, in less than one of a thousand maps.
+    do so by chance, among as many look-alikes spread over the map, in less than one of twenty maps.
 
     Args:
         landmarks: The map.
@@ -61,7 +62,7 @@ def recurs(landmarks: LandmarkMap, rows: IntArray, variance: float, options: Ali
     for start in found[np.argsort(-found[:, 3], kind="stable")[:STRONGEST], :3]:
         pose = kernels.refine(table, start.copy(), variance, options.position_gate)[0]
         more = np.count_nonzero(fitting(table, matches, pose, variance, options.position_gate)) - 2
-        if more >= beyond and count * bdtrc(more - 1, len(rows) - 2, chance) <= FALSE_ALARMS:
+        if more >= beyond and count * bdtrc(more - 1, len(rows) - 2, chance) <= NEEDLESS:
             return True
     return False
 
