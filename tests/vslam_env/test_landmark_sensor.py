@@ -191,6 +191,7 @@ def test_frames_repeat_with_the_seed() -> None:
         frames = [frame for _ in range(20) for frame in sensor.measure(poses, rng)]
         bundles.append(b"".join(f.measurements.points.tobytes() + f.true_ids.tobytes() for f in frames))
     assert bundles[0] == bundles[1] != bundles[2]
+    assert {frame.measurements.descriptors.dtype for frame in frames} == {np.dtype(np.float32)}
 
 
 def test_an_empty_view_gives_an_empty_frame() -> None:

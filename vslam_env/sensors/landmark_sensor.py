@@ -130,14 +130,13 @@ class LandmarkSensor:
             descriptors,
         )
         ids, points, descriptors = ids[:total], points[:total], descriptors[:total]
-        if any(num_false.tolist()):
-            at = np.repeat(np.cumsum(counts), num_false)
-            ids = np.insert(ids, at, -1)
-            points = np.insert(points, at, self._false_points(len(at), rng), axis=0)
-            descriptors = np.insert(descriptors, at, self._false_descriptors(len(at), rng), axis=0)
-            counts = counts + num_false
-            order = np.lexsort((rng.random(len(ids)), np.repeat(np.arange(robots), counts)))
-            ids, points, descriptors = ids[order], points[order], descriptors[order]
+        extra = int(num_false.sum())
+        if extra:
+            ids = np.concatenate([ids, np.full(extra, -1)])
+            points = np.concatenate([points, self._false_points(extra, rng)])
+            descriptors = np.concatenate([descriptors, self._false_descriptors(extra, rng)])
+            order = _mixed(counts.tolist(), num_false.tolist(), rng.random(len(ids)).tolist())
+            ids, points, descriptors, counts = ids[order], points[order], descriptors[order], counts + num_false
         noise = rng.standard_normal((len(ids), 3 + descriptors.shape[1]))
         sharp, looks = np.empty(len(ids), np.bool_), np.empty(descriptors.shape, np.float32)
         if _add_noise(points, descriptors, noise, self._stereo, config.descriptor_noise, sharp, looks) < len(ids):
@@ -166,6 +165,27 @@ class LandmarkSensor:
         own *= self._own_share / np.linalg.norm(own, axis=1, keepdims=True)
         descriptors = self._common + own
         return np.asarray(descriptors / np.linalg.norm(descriptors, axis=1, keepdims=True))
+
+
+def _mixed(num_true: list[int], num_false: list[int], keys: list[float]) -> list[int]:
+    """Return the rows of each robot's points in random order, when false ones stand behind all true ones.
+
+    Args:
+        num_true: Per robot.
+        num_false: Per robot.
+        keys: Random numbers, as many as points: each robot's points are ordered by its share of them.
+
+    >>> _mixed([2, 1], [0, 2], [0.9, 0.1, 0.5, 0.3, 0.4])
+    [1, 0, 3, 4, 2]
+    """
+    order: list[int] = []
+    true, false = 0, sum(num_true)
+    for real, made_up in zip(num_true, num_false, strict=True):
+        rows = [*range(true, true + real), *range(false, false + made_up)]
+        own = keys[len(order) : len(order) + len(rows)]
+        order += [row for _, row in sorted(zip(own, rows, strict=True))]
+        true, false = true + real, false + made_up
+    return order
 
 
 @jit
