@@ -36,6 +36,8 @@ from slam_backend.reports import MapDropped, MergeEvent, RejuvenationReport, Ren
 from slam_backend.team_knowledge import TeamKnowledge
 from slam_backend.undoing import Undoing
 
+LEAST_KEPT = 0.8  # of the landmarks on which two bent maps agree, the straight ones have to agree on so many
+
 
 class TeamSlam(TeamKnowledge):
     """Visual FastSLAM for a team whose robots do not know where they start.
@@ -268,10 +270,16 @@ class TeamSlam(TeamKnowledge):
         bent: Alignment | None = None
         speakers = a.trunk.live[0], b.trunk.live[0]
         self._records.exchange.record_maps(*speakers, maps[a.robots], maps[b.robots])
+        before = [group.trunk.filter.get_state() for group in (a, b)] if alignment.success else []
         straight = straightened(a, b) if alignment.success and self._merging.straighten else None
         if straight is not None:
             bent, alignment = alignment, align_maps(*straight, rng=self._rng, options=self._alignment)
             self._records.exchange.record_straightened(*speakers, *straight)
+            fewer = alignment.success and len(alignment.inliers) < LEAST_KEPT * len(bent.inliers)
+            if fewer or alignment.reason == "too few inliers":
+                alignment = Alignment.refused("too few inliers", alignment.ratio)
+                for group, state in zip((a, b), before, strict=True):  # the smoother has lost its way
+                    group.trunk.filter.set_state(state)
         self._events.append(MergeEvent(self._step, "attempt", a.robots, b.robots, alignment, bent))
         self._schedule.record(chosen, self._step, alignment.success)
         return (self.merge(*speakers, alignment),) if alignment.success else ()

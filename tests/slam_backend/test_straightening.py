@@ -2,16 +2,19 @@
 
 import numpy as np
 import pytest
+from filter_contents import contents
 from merged_pair import NEVER
 from same_bits import assert_same
 from simulated_team import SimulatedTeam
 
+from slam_backend import team as team_module
 from slam_backend.alignment import AlignmentOptions, align_maps
 from slam_backend.attempts import AttemptOptions
 from slam_backend.branches import restored_filter
 from slam_backend.exchange import LANDMARK_BYTES
 from slam_backend.filter import FastSlam
 from slam_backend.geometry import between
+from slam_backend.groups import Group
 from slam_backend.landmark_map import LandmarkMap
 from slam_backend.merge_options import MergeOptions
 from slam_backend.team import TeamSlam
@@ -106,6 +109,26 @@ def test_maps_that_no_longer_fit_are_not_merged() -> None:
     assert len(team.events) == 1
     assert team.groups == ((0,), (1,))
     assert not team._schedule.may_try(((0,), (1,)), STEPS)
+
+
+@pytest.mark.parametrize("every", [4, 2])
+def test_maps_that_agree_on_less_once_straight_are_not_merged(every: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A smoother that has lost its way is not believed: the attempt is refused, and the filters are as they were."""
+    _, alone = driven(112, NEVER)
+    original = team_module.straightened
+
+    def lost(a: Group, b: Group) -> tuple[LandmarkMap, LandmarkMap]:
+        maps = original(a, b)
+        assert maps is not None
+        return maps[0].subset(np.flatnonzero(np.arange(len(maps[0])) % every)), maps[1]
+
+    monkeypatch.setattr(team_module, "straightened", lost)
+    _, team = driven(112, AT_LAST)
+    event = team.events[0]
+    assert (len(team.events), event.alignment.reason) == (1, "too few inliers")
+    assert event.bent is not None
+    for robot in range(2):
+        assert_same(contents(team._find(robot)[0].filter), contents(alone._find(robot)[0].filter))
 
 
 def test_what_cannot_be_bent_is_merged_as_it_is() -> None:
