@@ -248,17 +248,23 @@ class ParticleMaps:
 
     def load_tiles(
         self, tiles: FloatArray, counts: NDArray[np.integer[Any]], descriptors: NDArray[np.float32], ids: IntArray,
-        identities: IntArray, next_id: int, odds: FloatArray | None = None,
+        identities: IntArray, next_id: int, odds: FloatArray | None = None, chosen: IntArray | None = None,
     ) -> None:  # fmt: skip
-        """Replace all landmarks by these, each held by a particle: `load` with values as `blocks` holds them."""
-        n, m = len(tiles), self.num_particles
+        """Replace all landmarks by these, each held by a particle: `load` with values as `blocks` holds them.
+
+        Where rows of `tiles` are `chosen` (n,), all else is of these, in their order.
+        """
+        n, m = len(ids), self.num_particles
         self.__init__(m, self.log_odds_prior)  # type: ignore[misc]
         self.tops[2] = next_id
         if not n:
             return
         self.make_room(n, descriptors.shape[1])
         slots, rows = np.arange(n), np.arange(n)
-        self.blocks[:n] = tiles
+        if chosen is None:
+            self.blocks[:n] = tiles
+        else:
+            np.take(tiles, chosen, axis=0, out=self.blocks[:n], mode="clip")  # else it would go through a buffer
         self.counts[rows, :m] = counts
         self.row_of[slots], self.map_of[slots] = rows, 0
         self.ids[slots], self.identities[slots] = ids, identities

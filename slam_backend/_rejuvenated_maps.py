@@ -30,12 +30,10 @@ def write_maps(maps: ParticleMaps, best: int, particles: Particles, walk: float)
     if odds is not None:
         held = maps.dense(slots)[1] > 0
         mean = (odds * held).sum(axis=1) / np.maximum(held.sum(axis=1), 1)
-        odds = np.repeat(mean[:, None], m, axis=1)
-    counts = np.repeat(particles.counts[rows][:, None], m, axis=1)
-    tiles = particles.tiles[rows]
-    for row in DIAGONAL:
-        tiles[:, :, row] += walk
+        odds = np.broadcast_to(mean[:, None], (len(mean), m))
     maps.load_tiles(
-        tiles, counts, maps.descriptors[slots], maps.ids[slots], maps.identities[slots],
-        maps.next_id, odds,
+        particles.tiles, np.broadcast_to(particles.counts[rows, None], (len(rows), m)), maps.descriptors[slots],
+        maps.ids[slots], maps.identities[slots], maps.next_id, odds, rows,
     )  # fmt: skip
+    for row in DIAGONAL:
+        maps.blocks[: len(rows), :, row] += walk

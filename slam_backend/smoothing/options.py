@@ -33,18 +33,18 @@ class SmoothingOptions:
         tolerance: The descent ends when the cost is expected to fall by less than this (half a squared distance).
     """
 
-    max_keys: int = 180
+    max_keys: int = 120
     fresh_keys: int = 60
     kernel: float = 16.0
     noise_scale: float = 1.0
     closure_after: int = 100
-    effort: float = 4.0
+    effort: float = 1.5
     free_sightings: int = 3000
     least_ess: float = 0.3
     more_draws: int = 8
     slice_keys: int | None = None
     max_iterations: int = 15
-    tolerance: float = 0.01
+    tolerance: float = 0.1
 
     def __post_init__(self) -> None:
         check_int("max_keys", self.max_keys, 2, "Two poses are the least that can be smoothed.")
@@ -53,10 +53,10 @@ class SmoothingOptions:
         if self.slice_keys is not None:
             check_int("slice_keys", self.slice_keys, 1, "Use 30, or None for all at once.")
         check_int("max_iterations", self.max_iterations, 1, "Ten are enough as a rule.")
-        check_float("effort", self.effort, "Use 4; more is dearer.", above=0.0)
+        check_float("effort", self.effort, "Use 1.5; more is dearer.", above=0.0)
         check_int("free_sightings", self.free_sightings, 0, "Use 0 to count them all.")
         check_int("closure_after", self.closure_after, 0, "Use 0 to look for no closures.")
         check_float("kernel", self.kernel, "Use 0 for plain squares.", at_least=0.0)
         check_float("noise_scale", self.noise_scale, "Use 1 for the noise as it is.", above=0.0)
-        check_float("tolerance", self.tolerance, "Use 0.01.", above=0.0)
+        check_float("tolerance", self.tolerance, "Use 0.1.", above=0.0)
         check_float("least_ess", self.least_ess, "Give a share of M.", at_least=0.0, at_most=1.0)

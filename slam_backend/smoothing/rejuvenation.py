@@ -113,7 +113,7 @@ def rejuvenate(
     """
     if any((log.kinds == EXACT).any() for log in logs):
         return Rejuvenation(graph, "poses that were given as exact", float("nan"), 0, None)
-    share = max(1, options.max_keys // len(logs))
+    share = max(1, 2 * options.max_keys // len(logs))
     near = replace(options, tolerance=NEAR * options.tolerance)
     rest = list(logs)
     while True:
