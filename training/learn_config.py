@@ -25,8 +25,8 @@ class TrainConfig(PlainConfig):
         robots: K.
         noise: `"easy"`, `"standard"` or `"hard"`: the preset of the environment.
         particles: Of each filter.
-        straighten: Whether maps are straightened before they are merged, as in the environment by default: it keeps
-            wrong merges out, and here takes most of the time.
+        straighten: Whether filters are rejuvenated, and maps straightened before they are merged, as in the environment
+            by default: it makes maps truer and keeps wrong merges out, and here takes most of the time.
         decision_ticks: Ticks of 0.1 s from a decision to the next.
         max_cycles: Decisions of an episode.
         reward: Weights of the named reward terms.
@@ -113,7 +113,10 @@ class TrainConfig(PlainConfig):
             decision_ticks=self.decision_ticks,
             max_cycles=self.max_cycles,
             reward=dict(self.reward),
-            belief={"filter": {"num_particles": self.particles}, "merging": {"straighten": self.straighten}},
+            belief={
+                "filter": {"num_particles": self.particles} | ({} if self.straighten else {"rejuvenate_every": None}),
+                "merging": {"straighten": self.straighten},
+            },
         )
 
     @property
