@@ -7,7 +7,6 @@ from merged_pair import NEVER
 from same_bits import assert_same
 from simulated_team import SimulatedTeam
 
-from slam_backend import group_changes
 from slam_backend import team as team_module
 from slam_backend.alignment import AlignmentOptions, align_maps
 from slam_backend.attempts import AttemptOptions
@@ -18,7 +17,6 @@ from slam_backend.geometry import between
 from slam_backend.groups import Group
 from slam_backend.landmark_map import LandmarkMap
 from slam_backend.merge_options import MergeOptions
-from slam_backend.merging import merge_filters, motion_covariance
 from slam_backend.team import TeamSlam
 
 STEPS = 80
@@ -163,25 +161,3 @@ def test_whether_to_straighten_is_a_bool() -> None:
     """A number is refused."""
     with pytest.raises(ValueError, match=r"merging\.straighten: expected True or False, got 1\. Give a bool"):
         MergeOptions(straighten=1)  # type: ignore[arg-type]
-
-
-def test_the_spread_of_motions_is_that_of_the_particles_that_a_merge_makes() -> None:
-    """It is the scatter of where the joint filter's particles let the other robot start, told before the merge."""
-    _, team = driven(112, NEVER)
-    a, b = (team._find(robot)[0].filter for robot in range(2))
-    alignment = align_maps(*both_maps(team), rng=np.random.default_rng(1))
-    pairs = np.column_stack([a.map().ids[alignment.inliers[:, 0]], b.map().ids[alignment.inliers[:, 1]]])
-    foretold = motion_covariance(a, b, alignment, pairs, np.random.default_rng(2))
-    joint, _ = merge_filters(a, b, alignment, pairs, np.random.default_rng(2))
-    starts = joint._starts[1, :, : joint.num_particles].T
-    np.testing.assert_allclose(foretold, np.cov(starts.T, bias=True), atol=1e-12)
-
-
-def test_a_merge_waits_until_its_particles_agree(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where a merge's particles differ by too much in the motion the attempt is refused as too uncertain."""
-    _, team = driven(112, AT_LAST)
-    assert [event.kind for event in team.events] == ["attempt", "merge"]
-    monkeypatch.setattr(group_changes, "SURE", 1e4)  # 0.05 mm
-    _, team = driven(112, AT_LAST)
-    assert [(event.kind, event.alignment.reason) for event in team.events] == [("attempt", "too uncertain")]
-    assert len(team.groups) == 2
