@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from slam_backend._blas import on_one_thread
 from slam_backend._particle_maps import ParticleMaps
 from slam_backend.errors import FloatArray, IntArray
 from slam_backend.filter_options import FilterOptions
@@ -145,6 +146,7 @@ class RejuvenationStep:
         slots = slots[maps.identities[slots] < 0]
         return Looks(maps.ids[slots], maps.descriptors[slots], self._options.descriptor_gate)
 
+    @on_one_thread
     def join(
         self, a: "RejuvenationStep", b: "RejuvenationStep", starts: Sequence[FloatArray],
         renamed: IntArray, camera: FloatArray,

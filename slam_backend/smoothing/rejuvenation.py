@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import lapack
 
+from slam_backend._blas import on_one_thread
 from slam_backend.errors import FloatArray, IntArray
 from slam_backend.geometry import wrap_angle
 from slam_backend.log_arrays import EXACT, LogArrays
@@ -84,6 +85,7 @@ class Rejuvenation:
     particles: Particles | None
 
 
+@on_one_thread
 def rejuvenate(
     graph: PathGraph,
     logs: Sequence[LogArrays],

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from slam_backend._blas import on_one_thread
 from slam_backend.errors import FloatArray
 from slam_backend.log_arrays import REJECTED, LogArrays
 from slam_backend.motion import OdometryModel
@@ -54,6 +55,7 @@ class Smoother:
     options: SmoothingOptions
     rng: np.random.Generator
 
+    @on_one_thread
     def take_in(
         self, graph: PathGraph, logs: Sequence[LogArrays], guesses: Sequence[Mapping[int, FloatArray]]
     ) -> PathGraph | Draft | str:
@@ -61,12 +63,14 @@ class Smoother:
         grown = extended(graph, logs, self.motion, self.camera[4:], guesses)
         return self.descend(Draft(graph=grown))
 
+    @on_one_thread
     def descend(self, draft: Draft) -> PathGraph | Draft | str:
         """Do one step; return the graph if that ended the descent, how it now stands if not, or what is wrong."""
         near = replace(self.options, tolerance=NEAR * self.options.tolerance)
         mode = find_mode(draft.graph, self.camera, near, 1, draft.damping)
         return self._after(draft, mode)
 
+    @on_one_thread
     def draw(
         self,
         graph: PathGraph,
@@ -83,6 +87,7 @@ class Smoother:
             return drawn(grown, mode, self.camera, num_particles, self.rng, self.options, looks)
         return self._after(draft, mode)
 
+    @on_one_thread
     def without_measurements(self, graph: PathGraph, logs: Sequence[LogArrays]) -> PathGraph:
         """Return the graph after all rows of the logs, of which only the odometry is believed."""
         blind = [replace(log, ids=np.full_like(log.ids, REJECTED)) for log in logs]

@@ -150,7 +150,7 @@ def test_a_clone_is_independent() -> None:
 
 @pytest.mark.slow
 def test_another_process_goes_on(tmp_path: Path) -> None:
-    """A state on disk goes on in another process, under another hash seed, with the same bytes."""
+    """A state on disk goes on in another process, with other hashes and threads of BLAS, with the same bytes."""
     env = _begun()
     save_state(env.get_state(), tmp_path / "state")
     code = (
@@ -161,15 +161,18 @@ def test_another_process_goes_on(tmp_path: Path) -> None:
         "print(t._go_on(env, 100))"
     )
     folder = Path(__file__).parent
-    found = subprocess.run(
-        [sys.executable, "-c", code],
-        cwd=folder,
-        env=os.environ | {"PYTHONHASHSEED": "12345", "PYTHONPATH": f"{folder}:{folder.parents[1]}"},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert found.stdout.strip() == _go_on(env, 100)
+    reference = _go_on(env, 100)
+    for hashes, threads in (("12345", "1"), ("54321", "2")):
+        other = {"PYTHONHASHSEED": hashes, "OPENBLAS_NUM_THREADS": threads, "OMP_NUM_THREADS": threads}
+        found = subprocess.run(
+            [sys.executable, "-c", code],
+            cwd=folder,
+            env=os.environ | other | {"PYTHONPATH": f"{folder}:{folder.parents[1]}"},
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        assert found.stdout.strip() == reference, other
 
 
 def _edited(**changes: Any) -> Callable[[], Any]:
