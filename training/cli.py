@@ -67,3 +67,7 @@ def main() -> None:
             raise
         Console(stderr=True, soft_wrap=True, highlight=False).print(f"[red]error[/] {escape(str(error))}")
         sys.exit(2)
+
+
+if __name__ == "__main__":
+    main()

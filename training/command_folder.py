@@ -38,11 +38,11 @@ def choose(
         json: Likewise; refused now if it cannot be written, rather than after the work.
         out: Likewise.
         quick: What --quick stands for, if it was given.
-        log: Where `path` is if nobody says it: below the folder of data, and what an error would call it.
+        log: Where `path` is if nobody says it: below the folder of data, and what must be there, as an error says it.
 
     Raises:
-        ValueError: If `json` cannot be written, `config` cannot be read or is of another command, or a value is out
-            of its range.
+        ValueError: If `json` cannot be written, `config` cannot be read or is of another command, there is no such
+            `log`, or a value is out of its range.
     """
     return kind.from_mapping(gather(command, given, config=config, json=json, out=out, quick=quick, log=log))
 
@@ -58,7 +58,7 @@ def gather(
     log: tuple[Path, str] | None = None,
 ) -> dict[str, Any]:
     """Return the plain values of which `choose` makes a configuration; arguments and errors as there."""
-    from training.replay_paths import default_path
+    from training.replay_paths import find_log
     from training.run_folder import check_writable, read_config
 
     if json is not None and json.parent != out:  # the run's own folder does not exist yet
@@ -67,8 +67,8 @@ def gather(
     if config is not None:
         values, values["seed"] = read_config(config, command)
     values |= dict(quick or {}) | _given(given)
-    if log is not None and "path" not in values:
-        values["path"] = default_path(*log)
+    if log is not None:
+        values["path"] = find_log(values.get("path"), *log)
     return values
 
 

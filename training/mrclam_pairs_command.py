@@ -8,7 +8,7 @@ import typer
 from training.command_folder import begin, choose, finish
 from training.command_options import Check, Config, Json, Out, Seed, numbers
 from training.command_progress import share_shown
-from training.replay_command import DATASET
+from training.replay_command import DATASET, LOG
 from training.text_tables import console_table, markdown_table
 
 HEADINGS = (
@@ -42,8 +42,7 @@ def bench_mrclam(
     given = {
         "path": path, "durations": numbers("durations", durations, float), "particles": particles, "seed": seed,
     }  # fmt: skip
-    log = (DATASET, "the MR.CLAM log")
-    chosen = choose(MrclamPairsConfig, COMMAND, given, config=config, json=json, out=out, log=log)
+    chosen = choose(MrclamPairsConfig, COMMAND, given, config=config, json=json, out=out, log=LOG)
     console, folder = begin(COMMAND, chosen, out)
     with share_shown(console, "robots map alone") as update:
         rows = align_log(chosen, update)

@@ -18,6 +18,7 @@ if TYPE_CHECKING:  # what computes is imported when the command runs, so that --
 
 COMMAND = "replay mrclam"
 DATASET = Path("mrclam") / "MRCLAM_Dataset7"
+LOG = (DATASET, "a folder of the MR.CLAM log, with Barcodes.dat, Landmark_Groundtruth.dat and Robot*.dat")
 
 
 def replay_mrclam(
@@ -64,8 +65,7 @@ def replay_mrclam(
         "rejuvenate_every": rejuvenate_every,
         "seed": seed,
     }
-    place = (DATASET, "the MR.CLAM log")
-    chosen = choose(ReplayConfig, COMMAND, given, config=config, json=json, out=out, log=place)
+    chosen = choose(ReplayConfig, COMMAND, given, config=config, json=json, out=out, log=LOG)
     log = load_mrclam(chosen.path, chosen.robots, chosen.duration, chosen.truth)
     console, folder = begin(COMMAND, chosen, out)
     result = _replay_live(console, log, chosen, replay)

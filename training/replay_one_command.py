@@ -37,13 +37,14 @@ def replay_victoria(
     config: Config = None,
 ) -> None:
     """A car among the trees of a park: trees without names, matched by where they stand, GPS as the truth."""
-    from slam_backend.readers.victoria import load_victoria
+    from slam_backend.readers.victoria import CONTROLS_FILE, GPS_FILE, TREES_FILE, load_victoria
     from training.replay_victoria import VictoriaConfig, replay, score, summarise
 
     command = "replay victoria"
     given = {"path": path, "duration": duration, "particles": particles, "estimator": estimator}
     given |= {"rejuvenate_every": rejuvenate_every, "seed": seed}
-    place = (VICTORIA, "the Victoria Park log")
+    files = f"{CONTROLS_FILE}, {TREES_FILE} and {GPS_FILE}"
+    place = (VICTORIA, f"a folder of the Victoria Park log, with {files}")
     chosen = choose(VictoriaConfig, command, given, config=config, json=json, out=out, log=place)
     log = load_victoria(chosen.path, chosen.duration)
     console, folder = begin(command, chosen, out)
@@ -90,7 +91,7 @@ def replay_kitti(
     command = "replay kitti"
     given = {"path": path, "truth": truth, "duration": duration, "particles": particles, "estimator": estimator}
     given |= {"rejuvenate_every": rejuvenate_every, "seed": seed}
-    place = (KITTI, "KITTI features")
+    place = (KITTI, "an archive (.npz) of KITTI features, a folder with one, or one of images (image_0, ...)")
     values = gather(command, given, config=config, json=json, out=out, log=place)
     if holds_images(values["path"]):
         replay_folder_of_images(values, out, json)

@@ -11,6 +11,7 @@ from training.command_options import Config, Json, Out, Seed
 
 COMMAND = "replay stereo"
 PAIRS = Path("euroc_pairs")
+WHAT = "a folder with two stereo pairs (left_img_0.png, right_img_0.png, left_img_1.png, ...) and their calibration"
 
 
 def replay_stereo(
@@ -33,7 +34,7 @@ def replay_stereo(
     from training.replay_pairs import PairsConfig, align_pairs, load_pairs, summarise_pairs
     from training.run_folder import plain
 
-    given, place = {"path": path, "descriptor": descriptor, "seed": seed}, (PAIRS, "the stereo pairs")
+    given, place = {"path": path, "descriptor": descriptor, "seed": seed}, (PAIRS, WHAT)
     chosen = choose(PairsConfig, COMMAND, given, config=config, json=json, out=out, log=place)
     log = load_pairs(chosen.path)
     console, folder = begin(COMMAND, chosen, out)

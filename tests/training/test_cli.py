@@ -7,6 +7,8 @@ import pytest
 from training import cli
 from training.command_options import numbers, words
 
+MRCLAM = "path: expected a folder of the MR.CLAM log, with Barcodes.dat, Landmark_Groundtruth.dat and Robot*.dat"
+
 
 @pytest.mark.parametrize(
     "command",
@@ -25,8 +27,8 @@ def test_every_command_explains_itself(vslam: Any, command: tuple[str, ...]) -> 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("--path", "/nowhere"), "path: expected a folder of the MR.CLAM log, got no such folder. Check '/nowhere'."),
-        ((), "path: expected a folder of the MR.CLAM log, got no --path. Name it, or set VSLAM_DATA."),
+        (("--path", "/nowhere"), MRCLAM + ", got no such path. Check '/nowhere'; if --path is left away, it is "),
+        ((), MRCLAM + ", got no --path. Name it, or set VSLAM_DATA."),
         (("--path", ".", "--robots", "1;2"), "robots: expected numbers with commas between, got '1;2'."),
         (("--path", ".", "--robots", "7"), "robots: expected different numbers from 1 to 5, got (7,)."),
         (("--path", ".", "--particles", "0"), "particles: expected an int >= 1, got 0."),
@@ -64,6 +66,15 @@ def test_numbers_with_commas() -> None:
     assert numbers("robots", None) is words(None) is None
     with pytest.raises(ValueError, match="robots: expected numbers with commas between, got '1-3'"):
         numbers("robots", "1-3")
+
+
+@pytest.mark.parametrize("module", ["training", "training.cli"])
+def test_modules_are_the_command(module: str) -> None:
+    """`python -m training` and `python -m training.cli` say what `vslam` says, with its exit status."""
+    for arguments, status, says in ((["--help"], 0, "Usage: vslam"), (["run", "--robots", "0"], 2, "robots: expected")):
+        done = subprocess.run([sys.executable, "-m", module, *arguments], capture_output=True, text=True)
+        assert done.returncode == status
+        assert says in done.stdout + done.stderr
 
 
 def test_help_needs_no_heavy_import() -> None:

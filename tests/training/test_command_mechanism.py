@@ -67,13 +67,18 @@ def test_what_is_given_goes_above_quick_and_quick_above_a_file(tmp_path: Path) -
 
 
 def test_logs_are_looked_for_below_the_folder_of_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A log that is not named is where VSLAM_DATA says; without that variable the error says what to name."""
-    common: dict[str, Any] = {"config": None, "json": None, "out": None, "log": (Path("park"), "the park's log")}
+    """A log that is not named is where VSLAM_DATA says; without that variable, or a log there, the error says so."""
+    common: dict[str, Any] = {"config": None, "json": None, "out": None, "log": (Path("park"), "a park's log")}
     monkeypatch.setenv("VSLAM_DATA", str(tmp_path))
+    with pytest.raises(ValueError, match=r"path: expected a park's log, got no such path\. Check '.*park'; if --path"):
+        choose(Numbers, "count", {}, **common)
+    for name in ("park", "mine"):
+        (tmp_path / name).mkdir()
     assert choose(Numbers, "count", {}, **common).path == str(tmp_path / "park")
+    monkeypatch.chdir(tmp_path)
     assert choose(Numbers, "count", {"path": Path("mine")}, **common).path == str(Path("mine").resolve())
     monkeypatch.delenv("VSLAM_DATA")
-    with pytest.raises(ValueError, match="path: expected a folder of the park's log, got no --path"):
+    with pytest.raises(ValueError, match="path: expected a park's log, got no --path"):
         choose(Numbers, "count", {}, **common)
 
 

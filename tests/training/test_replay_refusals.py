@@ -39,14 +39,18 @@ def _turn_back(command: str, log: Path) -> None:
 @pytest.mark.parametrize(
     ("command", "message"),
     [
-        ("mrclam", "path: expected a folder of the MR.CLAM log, got no such folder. Check"),
-        ("victoria", "path: expected a folder of the Victoria Park log, got no such folder. Check"),
-        ("kitti", "path: expected an archive (.npz) of KITTI features, or a folder with one, got no such file. Check"),
+        ("mrclam", "path: expected a folder of the MR.CLAM log, with Barcodes.dat, Landmark_Groundtruth.dat, "),
+        ("victoria", "path: expected a folder of the Victoria Park log, with aa3_dr.mat, Victoria"),
+        ("kitti", "path: expected an archive (.npz) of KITTI features, a folder with one, or one of images (image_0, "),
+        ("stereo", "path: expected a folder with two stereo pairs (left_img_0.png, "),
     ],
 )
 def test_a_log_that_is_not_there_is_told_so(command: str, message: str, refusal: Any, tmp_path: Path) -> None:
-    """A path that leads nowhere is named."""
-    assert refusal("replay", command, "--path", "none").startswith(f"error {message}")
+    """A path that leads nowhere is named, with what must be there and where else it is looked for."""
+    said = refusal("replay", command, "--path", "none")
+    assert said.startswith(f"error {message}")
+    assert ", got no such path. Check '" in said
+    assert "/none'; if --path is left away, it is '" in said
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,5 @@
+"""`python -m training` is the command `vslam`."""
+
+from training.cli import main
+
+main()
