@@ -39,7 +39,7 @@ def _turn_back(command: str, log: Path) -> None:
 @pytest.mark.parametrize(
     ("command", "message"),
     [
-        ("mrclam", "path: expected a folder of the MR.CLAM log, with Barcodes.dat, Landmark_Groundtruth.dat, "),
+        ("mrclam", "path: expected a folder of the MR.CLAM log, with Barcodes.dat, Landmark_Groundtruth.dat and "),
         ("victoria", "path: expected a folder of the Victoria Park log, with aa3_dr.mat, Victoria"),
         ("kitti", "path: expected an archive (.npz) of KITTI features, a folder with one, or one of images (image_0, "),
         ("stereo", "path: expected a folder with two stereo pairs (left_img_0.png, "),
