@@ -11,7 +11,6 @@ from slam_backend._particle_maps import aligned
 from slam_backend.errors import FloatArray, IntArray
 from slam_backend.measurements import Measurements
 
-UPPER = np.triu_indices(3)  # where the six stored elements of a covariance stand in the full matrix
 CANDIDATES = 64  # of one frame for which there is working space; more get their own each time
 EMPTY = Measurements.empty(0)
 NO_COVARIANCES = np.zeros((0, 3, 3))
@@ -72,7 +71,7 @@ class FrameBuffers:
             self._distances = np.zeros((2 * most, self.padded))
             self._new_slots = np.zeros(2 * most, dtype=np.int64)
 
-    def take(self, robot: int, frame: Measurements | None, names: IntArray | None) -> Turn:
+    def take(self, frame: Measurements | None, names: IntArray | None) -> Turn:
         """Return a robot's readings as the kernels take them, with room for what becomes of them."""
         if frame is None:
             frame = EMPTY

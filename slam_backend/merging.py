@@ -26,11 +26,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend._frame_buffers import UPPER
+from slam_backend._packed import UNPACK, UPPER
 from slam_backend.alignment import Alignment
 from slam_backend.errors import BoolArray, FloatArray, IntArray
 from slam_backend.existence import ExistenceModel
-from slam_backend.filter import UNPACK, FastSlam
+from slam_backend.filter import FastSlam
 from slam_backend.fusion import fuse_descriptors, fuse_landmarks
 from slam_backend.geometry import compose, inverse, rotation
 from slam_backend.resampling import systematic
@@ -163,7 +163,7 @@ def finish(joint: FastSlam, a: FastSlam, b: FastSlam, renamed: IntArray) -> None
     joint._logs = [log.copy() for log in a._logs] + [log.renamed(renamed[:, 0], renamed[:, 1]) for log in b._logs]
     if joint._rejuvenation is not None and a._rejuvenation is not None and b._rejuvenation is not None:
         starts = [slam._starts[:, :, : slam.num_particles] for slam in (a, b, joint)]
-        joint._rejuvenation.join(a._rejuvenation, b._rejuvenation, starts, renamed, joint._camera)
+        joint._rejuvenation.join(a._rejuvenation, b._rejuvenation, starts, renamed, joint._assumed.camera)
 
 
 class _Dense(NamedTuple):

@@ -8,7 +8,7 @@ and is the default.
 
 import numpy as np
 
-from slam_backend._frame_buffers import UPPER
+from slam_backend._packed import UPPER
 from slam_backend.alignment import Alignment
 from slam_backend.errors import IntArray
 from slam_backend.filter import FastSlam

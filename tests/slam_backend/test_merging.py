@@ -20,9 +20,10 @@ from mapped_once import (
 )
 from same_bits import assert_same
 
+from slam_backend._packed import UNPACK
 from slam_backend.alignment import Alignment
 from slam_backend.errors import IntArray
-from slam_backend.filter import UNPACK, FastSlam
+from slam_backend.filter import FastSlam
 from slam_backend.fusion import fuse_landmarks
 from slam_backend.geometry import compose, inverse, rotate_covariances, rotation, transform_points, wrap_angle
 from slam_backend.measurements import Measurements

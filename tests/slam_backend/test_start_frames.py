@@ -1,7 +1,8 @@
 import numpy as np
 
+from slam_backend._packed import UNPACK
 from slam_backend._start_frames import AT_ORIGIN, KNOWN, SPREAD, seen_from_starts, start_kind
-from slam_backend.filter import UNPACK, FastSlam
+from slam_backend.filter import FastSlam
 from slam_backend.geometry import between, compose, rotation, wrap_angle
 from slam_backend.measurements import Measurements
 

@@ -1,0 +1,150 @@
+"""All that a filter holds, from the particles to the random stream: made, copied with ancestors, renumbered, kept."""
+
+import copy
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from slam_backend._existence_step import ExistenceStep
+from slam_backend._frame_buffers import FrameBuffers
+from slam_backend._mixtures import pose_mixture
+from slam_backend._particle_maps import ParticleMaps, aligned
+from slam_backend._rejuvenation_step import RejuvenationStep
+from slam_backend._turns import Assumed
+from slam_backend.errors import IntArray, bad_argument, check_int, check_seed
+from slam_backend.filter_options import FilterOptions
+from slam_backend.reports import PoseEstimate
+from slam_backend.run_log import RobotLog
+
+POSES = ("_poses", "_starts", "_means", "_covariances")  # (K, 3 or 6, P), of each robot
+KEPT = (*POSES, "_blind", "_log_weights", "_path_log_weights", "_weights")
+OTHERS_KEPT = ("steps", "estimates", "maps", "logs", "options", "rng")
+
+
+class FilterState:
+    """What a filter of K robots with M particles holds; in P lanes, as particles come in whole blocks of them.
+
+    The lanes beyond M mean nothing. Poses are in the map frame.
+
+    Attributes:
+        options: What it assumes and how it decides.
+        may_smooth: Whether it may in the next step; filters of a team take turns.
+        _poses: (K, 3, P) float64 [m, m, rad]. Of each robot (x_t^[m]).
+        _starts: (K, 3, P) likewise. Where each robot started; spreads at a merge.
+        _means, _covariances: (K, 3, P), (K, 6, P). N(x^, P^) of each particle before sampling.
+        _blind: (K,) bool. Whether that was propagated since the last sighting.
+        _log_weights: (M,) since the last resampling, normalised; `_weights` (M,) as the last step left them.
+        _path_log_weights: (M,) accumulated along the ancestral line (Eq. 12).
+        _maps: The landmarks of all particles.
+        _estimates: Per robot its pose over all particles, as of the last step.
+        _logs: Per robot what it did and measured, and which landmarks that was taken for.
+        _steps: Number of the next step.
+        _rng: The filter's own random stream.
+    """
+
+    def _set_up(self, num_robots: int, options: FilterOptions, seed: Any, num_particles: int | None = None) -> None:
+        """Begin with all robots at the origin and no landmarks; with `num_particles` in place of the options' own."""
+        k = check_int("num_robots", num_robots, 1, "Use at least one robot.")
+        m = options.num_particles if num_particles is None else num_particles
+        self.options = options
+        self.may_smooth = True
+        self._rng = np.random.default_rng(check_seed(seed))
+        self._assumed = Assumed.by(options)
+        existence = options.existence
+        self._existence = None if existence is None else ExistenceStep(existence, options.camera)
+        self._rejuvenation = None if options.rejuvenate_every is None else RejuvenationStep(options, k)
+        self._maps = ParticleMaps(m, None if existence is None else existence.log_odds_prior)
+        padded = self._maps.padded
+        self._poses = aligned((k, 3, padded), np.float64)
+        self._starts = aligned((k, 3, padded), np.float64)
+        self._means = aligned((k, 3, padded), np.float64)
+        self._covariances = aligned((k, 6, padded), np.float64)
+        self._blind = np.zeros(k, dtype=np.bool_)
+        self._log_weights = np.full(m, -np.log(m))
+        self._path_log_weights = np.zeros(m)
+        self._weights = np.full(m, 1.0 / m)
+        self._steps = 0
+        self._logs = [RobotLog() for _ in range(k)]
+        self._buffers = FrameBuffers(padded)
+        self._estimates = [self._mixture(robot) for robot in range(k)]
+
+    @property
+    def num_robots(self) -> int:
+        """K."""
+        return len(self._poses)
+
+    @property
+    def num_particles(self) -> int:
+        """M."""
+        return self._maps.num_particles
+
+    def _mixture(self, robot: int) -> PoseEstimate:
+        """Return a robot's pose over all particles, map frame."""
+        return pose_mixture(self._means[robot], self._covariances[robot], self._weights)
+
+    # ------------------------------------------------------------------ other particles, other robots
+
+    def _become(self, ancestors: IntArray) -> None:
+        """Go on with as many particles as there are ancestors (M',), equally weighted."""
+        self._maps = self._maps.taken(ancestors)
+        for name in POSES:
+            old = getattr(self, name)
+            array = aligned((*old.shape[:2], self._maps.padded), np.float64)
+            array[:, :, : len(ancestors)] = old[:, :, ancestors]
+            setattr(self, name, array)
+        self._path_log_weights = self._path_log_weights[ancestors]
+        self._weights = np.full(len(ancestors), 1.0 / len(ancestors))
+        self._log_weights = np.full(len(ancestors), -np.log(len(ancestors)))
+        self._buffers = FrameBuffers(self._maps.padded)
+
+    def reorder(self, order: IntArray) -> None:
+        """Renumber the robots: robot i becomes the one that was `order[i]`; (K,) a permutation."""
+        for name in POSES:
+            array = getattr(self, name)
+            array[:] = array[order]
+        self._blind = self._blind[order]
+        self._logs = [self._logs[robot] for robot in order]
+        self._estimates = [self._estimates[robot] for robot in order]
+        if self._rejuvenation is not None:
+            self._rejuvenation.reorder(order)
+
+    # ------------------------------------------------------------------ snapshots
+
+    def get_state(self) -> dict[str, Any]:
+        """Return all that decides how the filter goes on, its random stream included. Shares nothing with it."""
+        state: dict[str, Any] = {name: getattr(self, name).copy() for name in KEPT}
+        state |= {"steps": self._steps, "estimates": _copies(self._estimates), "maps": self._maps.get_state()}
+        state["logs"] = tuple(log.get_state() for log in self._logs)
+        if self._rejuvenation is not None:
+            state["rejuvenation"] = self._rejuvenation.get_state()
+        return state | {"options": self.options, "rng": copy.deepcopy(self._rng.bit_generator.state)}
+
+    def set_state(self, state: Mapping[str, Any]) -> None:
+        """Go on exactly as the filter that gave `state`.
+
+        Raises:
+            ValueError: If `state` is not one of `get_state`.
+        """
+        missing = [name for name in (*KEPT, *OTHERS_KEPT) if name not in state]
+        if missing:
+            raise bad_argument("state", "a dict from FastSlam.get_state", f"no {missing[0]!r}", "Pass it unchanged.")
+        shapes = [state[name].shape == getattr(self, name).shape for name in ("_poses", "_weights")]
+        same = state["options"] == self.options and all(shapes)
+        if not same:
+            self._set_up(len(state["_poses"]), state["options"], 0, len(state["_weights"]))
+        for name in KEPT:
+            getattr(self, name)[:] = state[name]
+        self._maps.set_state(state["maps"])
+        for log, logged in zip(self._logs, state["logs"], strict=True):
+            log.set_state(logged)
+        if self._rejuvenation is not None:
+            self._rejuvenation.set_state(state["rejuvenation"])
+        self._steps, self._estimates = state["steps"], list(_copies(state["estimates"]))
+        # A stream of its own: the old one may be the caller's, or of another kind.
+        self._rng = np.random.Generator(getattr(np.random, state["rng"]["bit_generator"])(0))
+        self._rng.bit_generator.state = state["rng"]
+
+
+def _copies(estimates: Sequence[PoseEstimate]) -> tuple[PoseEstimate, ...]:
+    return tuple(PoseEstimate(estimate.mean.copy(), estimate.covariance.copy()) for estimate in estimates)

@@ -1,0 +1,143 @@
+"""What a filter knows: poses, particles, maps, logs. `FastSlam` adds what changes them."""
+
+from typing import Literal
+
+import numpy as np
+
+from slam_backend._best_map import best_map, best_outline
+from slam_backend._filter_state import FilterState
+from slam_backend._mixtures import map_mixture, pose_mixture
+from slam_backend._start_frames import AT_ORIGIN, KNOWN, seen_from_starts, start_kind
+from slam_backend.errors import FloatArray, IntArray, bad_argument, check_choice
+from slam_backend.geometry import between, rotate_covariances
+from slam_backend.landmark_map import LandmarkMap, MapOutline
+from slam_backend.reports import PoseEstimate
+from slam_backend.run_log import RobotLog
+
+
+class FilterKnowledge(FilterState):
+    """All that can be asked of a filter."""
+
+    @property
+    def num_landmarks(self) -> int:
+        """Landmarks that at least one particle holds."""
+        return int(np.count_nonzero(self._maps.ids >= 0))
+
+    @property
+    def map_size(self) -> int:
+        """Landmarks that the most probable particle holds: the length of `map()`."""
+        slots = np.flatnonzero(self._maps.ids >= 0)
+        return int(np.count_nonzero(self._maps.of_particle(self.best_particle, slots)[1]))
+
+    @property
+    def descriptor_size(self) -> int:
+        """Length of the descriptors in the map, 0 before the first one."""
+        return int(self._maps.descriptors.shape[1])
+
+    def log(self, robot: int = 0) -> RobotLog:
+        """Return what the robot did and measured so far: odometry, points, and the landmarks they were taken for."""
+        return self._logs[self._check_robot(robot)].copy()
+
+    @property
+    def nbytes(self) -> int:
+        """Memory that the particles hold [bytes]: mostly (72 + 4) per particle and landmark."""
+        arrays = (self._poses, self._starts, self._means, self._covariances, self._log_weights, self._path_log_weights)
+        return self._maps.nbytes + sum(array.nbytes for array in arrays)
+
+    @property
+    def weights(self) -> FloatArray:
+        """(M,) weights, summing to 1. A copy."""
+        return np.asarray(np.exp(self._log_weights))
+
+    @property
+    def best_particle(self) -> int:
+        """Index of the most probable particle, by accumulated log-weight (Eq. 12)."""
+        return int(self._path_log_weights.argmax())
+
+    def pose(self, robot: int = 0) -> PoseEstimate:
+        """Return the mean and covariance of a robot's pose over all particles, map frame.
+
+        They are those of the mixture of N(x^, P^) before sampling, which scatters less than the samples.
+        """
+        return self._estimates[self._check_robot(robot)]
+
+    def particles(self, robot: int = 0) -> tuple[FloatArray, FloatArray]:
+        """Return poses (M, 3), map frame, and normalised log-weights (M,) of a robot. Copies."""
+        return self._columns(self._poses[self._check_robot(robot)]), self._log_weights.copy()
+
+    def start_pose(self, robot: int = 0) -> FloatArray:
+        """Return (3,) where the robot started, map frame, by the most probable particle. A copy."""
+        return np.array(self._starts[self._check_robot(robot), :, self.best_particle])
+
+    def pose_from_start(self, robot: int = 0) -> PoseEstimate:
+        """Return the mean and covariance of a robot's pose in its own start frame.
+
+        Each particle's pose is seen from where the robot started in that particle, so that what the filter does not
+        know of the start, after a merge, does not blur it.
+        """
+        return self._seen_from_start(self._check_robot(robot))[0]
+
+    def _seen_from_start(self, robot: int) -> tuple[PoseEstimate, FloatArray]:
+        """Return what `pose_from_start` and `start_pose` return."""
+        start, estimate = np.empty(3), self._estimates[robot]
+        kind = start_kind(self._starts[robot], self.num_particles, self.best_particle, start)
+        if kind == AT_ORIGIN:  # the map frame is its own start frame
+            return estimate, start
+        if kind == KNOWN:
+            turned = rotate_covariances(-start[2], estimate.covariance)
+            return PoseEstimate(between(start, estimate.mean), turned), start
+        seen = seen_from_starts(self._starts[robot], self._means[robot], self._covariances[robot], self.num_particles)
+        return pose_mixture(*seen, self.weights), start
+
+    def particles_from_start(self, robot: int = 0) -> FloatArray:
+        """Return a robot's poses (M, 3), each seen from where it started in that particle."""
+        starts = self._columns(self._starts[self._check_robot(robot)])
+        return between(starts, self._columns(self._poses[robot]))
+
+    def _columns(self, rows: FloatArray) -> FloatArray:
+        """Return (M, c) of padded rows (c, P). A copy."""
+        return rows[:, : self.num_particles].T.copy()
+
+    def map(self, estimate: Literal["best", "mixture"] = "best", min_count: int = 1) -> LandmarkMap:
+        """Return the map in the map frame, landmarks by ascending id.
+
+        Args:
+            estimate: "best": means and conditional covariances of the most probable particle (Eq. 12). "mixture":
+                mean and covariance over all particles that hold the landmark, path uncertainty included,
+                sum w_m (Sigma_m + (mu_m - mu)(mu_m - mu)^T) (Sec. 3.2, see `docs/errata.md`); the landmarks are
+                those of the most probable particle.
+            min_count: Landmarks measured fewer times are left out.
+        """
+        check_choice("estimate", estimate, ("best", "mixture"))
+        best, least = self.best_particle, max(min_count, 1)
+        if estimate == "best":
+            return LandmarkMap._trusted(*best_map(self._maps, best, least))
+        return LandmarkMap._trusted(*map_mixture(self._maps, best, self._log_weights, least))
+
+    def outline(self, min_count: int = 1) -> MapOutline:
+        """Return the outline of `map(min_count=min_count)`, much faster."""
+        return best_outline(self._maps, self.best_particle, max(min_count, 1))
+
+    def existence(self) -> tuple[IntArray, FloatArray]:
+        """Return the ids (n,) of the landmarks of `map()`, ascending, and the probability (n,) that each exists.
+
+        Raises:
+            ValueError: If the filter was built without `existence`.
+        """
+        if self._existence is None:
+            cure = "Build the filter with existence=ExistenceModel()."
+            raise bad_argument("existence", "a filter that keeps it", "one that does not", cure)
+        slots = self._maps.used_slots()
+        slots = slots[self._maps.of_particle(self.best_particle, slots)[1] > 0]
+        return self._maps.ids[slots], 1.0 / (1.0 + np.exp(-self._maps.odds_of_particle(self.best_particle, slots)))
+
+    def _dense(self) -> tuple[IntArray, FloatArray, FloatArray, IntArray]:
+        """Return ids (n,), means (n, 3, M), covariances (n, 6, M) and counts (n, M), 0 where a particle lacks it."""
+        slots = self._maps.used_slots()
+        values, counts = self._maps.dense(slots)
+        return self._maps.ids[slots], values[:, :3], values[:, 3:], counts.astype(np.int64)
+
+    def _check_robot(self, robot: int) -> int:
+        if isinstance(robot, bool) or not isinstance(robot, (int, np.integer)) or not 0 <= robot < self.num_robots:
+            raise bad_argument("robot", f"an index from 0 to {self.num_robots - 1}", robot, "Count robots from 0.")
+        return int(robot)
