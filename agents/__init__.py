@@ -1,4 +1,4 @@
-"""Exploration policies that see only what a robot can know, and their comparison."""
+"""Exploration policies that see only what a robot can know."""
 
 from agents.policy import Policy
 from agents.registry import POLICIES, make_policy

@@ -1,16 +1,37 @@
-"""Policies by name, and trained ones by their file."""
+"""Policies by name, trained ones by their file, and those of the user by their module."""
 
 from pathlib import Path
 
 from agents.nearest_frontier import NearestFrontier, NearestFrontierGoals
+from agents.own import ACTION_TYPES, is_own, make_own, own_action_type
 from agents.policy import Policy
 from agents.random_goals import RandomGoals
 from agents.random_walk import RandomWalk
 from agents.trained import SUFFIX, TrainedGoals, load_model
 from slam_backend.errors import bad_argument, check_choice
 
-POLICIES = ("frontier", "random_goals", "random_walk")
-ACTION_TYPES = ("continuous", "discrete", "goal")
+POLICIES = {  # and the types of action that each knows, that with which policies are compared first
+    "frontier": ("goal", "continuous", "discrete"),
+    "random_goals": ("goal",),
+    "random_walk": ("continuous", "discrete"),
+}
+
+
+def action_types(name: str) -> tuple[str, ...]:
+    """Return the types of action that a policy knows, that with which policies are compared first.
+
+    Args:
+        name: As in `make_policy`.
+
+    Raises:
+        ValueError: If there is no such policy.
+    """
+    if is_model(name):
+        return ("goal",)
+    if is_own(name):
+        return (own_action_type(name),)
+    cure = "Choose one of these names, the path of a trained model, or MODULE:NAME of your own."
+    return POLICIES[check_choice("policy", name, tuple(POLICIES), cure)]
 
 
 def make_policy(name: str, action_type: str) -> Policy:
@@ -19,25 +40,24 @@ def make_policy(name: str, action_type: str) -> Policy:
     Args:
         name: `"frontier"`: nearest frontier, for all action types. `"random_goals"`: random candidates, for `goal`.
             `"random_walk"`: for `continuous` and `discrete`. The path of a model that `vslam train` wrote, or of its
-            run folder: for `goal` actions and dict observations.
+            run folder: for `goal` actions and dict observations. `"module:Name"`: what that makes when called without
+            arguments, for the actions that its attribute `action_type` names, or else for `goal`.
         action_type: Of the environment.
 
     Raises:
         ValueError: If there is no such policy, it does not know this type of action, or a model cannot be read.
     """
+    known = action_types(name)
+    if check_choice("action_type", action_type, ACTION_TYPES) not in known:
+        expected = f"{' or '.join(map(repr, known))} for policy {name!r}"
+        raise bad_argument("action_type", expected, action_type, "Change one of the two.")
     if is_model(name):
-        check_choice("action_type", action_type, ACTION_TYPES)
-        if action_type != "goal":
-            raise bad_argument("action_type", "'goal' for a trained policy", action_type, "Use goal actions.")
         return TrainedGoals(load_model(name)[0])
-    check_choice("policy", name, POLICIES)
-    check_choice("action_type", action_type, ACTION_TYPES)
+    if is_own(name):
+        return make_own(name)
     discrete = action_type == "discrete"
     if name == "frontier":
         return NearestFrontierGoals() if action_type == "goal" else NearestFrontier(discrete)
-    if (name == "random_goals") != (action_type == "goal"):
-        knows = "'goal'" if name == "random_goals" else "'continuous' or 'discrete'"
-        raise bad_argument("action_type", f"{knows} for policy {name!r}", action_type, "Change one of the two.")
     return RandomGoals() if name == "random_goals" else RandomWalk(discrete)
 
 

@@ -1,7 +1,7 @@
 """One episode of an environment under given policies, and the record of it that tables and figures are made of."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -106,12 +106,14 @@ class Progress:
         time: Since the reset [s].
         infos: Of all agents, as the environment gave them.
         new_merges: Merges of this step.
+        rewards: Of all agents for this step; none after the reset.
     """
 
     step: int
     time: float
     infos: Mapping[str, Mapping[str, Any]]
     new_merges: tuple[MergeRecord, ...]
+    rewards: Mapping[str, float] = field(default_factory=dict)
 
 
 def run_episode(
@@ -151,8 +153,8 @@ def run_episode(
     while env.agents and not should_stop():
         actions = {a: policies[a].act(observations[a], env.belief(a), rngs[a]) for a in env.agents}
         log.before_step()
-        observations, _, _, _, infos = env.step(actions)
-        on_step(log.after_step(infos, len(odometry) - 1))
+        observations, rewards, _, _, infos = env.step(actions)
+        on_step(replace(log.after_step(infos, len(odometry) - 1), rewards=rewards))
     return log.finish(np.array(odometry))
 
 

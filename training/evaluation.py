@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 
 from agents.policy import Policy
-from agents.registry import POLICIES, make_policy
+from agents.registry import make_policy
 from agents.trained import TrainedGoals, load_model
 from slam_backend.errors import bad_argument, check_choice, check_int
+from training.episode import run_episode
 from training.plain_config import PlainConfig
 from vslam_env import vslam_v0
 from vslam_env.config import EnvConfig
@@ -58,8 +59,7 @@ class EvaluateConfig(PlainConfig):
         check_int("seed", self.seed, 0, "Use 0 or a positive number.")
         check_choice("split", self.split, SPLITS)
         for name in self.policies:
-            check_choice("policies", name, POLICIES)
-            make_policy(name, "goal")  # refuses what cannot choose goals
+            make_policy(name, "goal")  # refuses what is not there, or cannot choose goals
 
     @classmethod
     def completed(cls, values: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -103,18 +103,11 @@ class EvaluateTrial:
 def play(config: EvaluateConfig, trial: EvaluateTrial) -> dict[str, Any]:
     """Play an episode; return the trial and its figures, means over the robots."""
     env = _environment(config)
-    observations, _ = env.reset(seed=trial.seed)
-    streams = np.random.SeedSequence([trial.seed, len(env.agents)]).spawn(len(env.agents))
-    rngs = {agent: np.random.default_rng(stream) for agent, stream in zip(env.agents, streams, strict=True)}
-    policies = {agent: _policy(config, trial.policy) for agent in env.agents}
-    total = 0.0
-    infos: dict[str, Any] = {}
-    while env.agents:
-        actions = {a: policies[a].act(observations[a], env.belief(a), rngs[a]) for a in env.agents}
-        observations, rewards, _, _, infos = env.step(actions)
-        total += float(np.mean(list(rewards.values())))
-    last = {name: float(np.mean([info[name] for info in infos.values()])) for name in LAST}
-    return asdict(trial) | {"return": total} | last
+    policies = {agent: _policy(config, trial.policy) for agent in env.possible_agents}
+    rewards: list[float] = []
+    record = run_episode(env, policies, trial.seed, lambda step: rewards.extend(step.rewards.values()))
+    last = {name: float(np.mean([info[name] for info in record.infos])) for name in LAST}
+    return asdict(trial) | {"return": sum(rewards) / len(policies)} | last
 
 
 @cache

@@ -3,19 +3,18 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
 from rich.console import Console
-from rich.table import Table
 
-from training.accuracy_summary import interval
 from training.evaluation import FIGURES, MODEL
+from training.seed_means import ahead_by, mean_of, shown
+from training.text_tables import console_table
 
 Rows = Sequence[Mapping[str, Any]]
 SHOWN = {
     "return": "return [m]",
     "map_error": "map error [m]",
     "map_recall": "recall",
-    "coverage": "coverage",
+    "coverage": "floor",
     "merges": "merges",
     "distance": "way [m]",
 }
@@ -32,7 +31,7 @@ def summarise(rows: Rows) -> list[dict[str, Any]]:
         own = [row for row in rows if row["policy"] == name]
         line: dict[str, Any] = {"policy": name, "seeds": len(own)}
         for figure in FIGURES:
-            line |= _described(figure, np.array([row[figure] for row in own]))
+            line |= mean_of(figure, [row[figure] for row in own])
         lines.append(line)
     return lines
 
@@ -49,37 +48,30 @@ def leads(rows: Rows) -> list[dict[str, Any]]:
     own = returns.pop(MODEL, {})
     found = []
     for name, theirs in returns.items():
-        seeds = sorted(own.keys() & theirs.keys())
-        if seeds:
-            ahead = np.array([own[seed] - theirs[seed] for seed in seeds])
-            told = {"over": name, "seeds": len(seeds), "won": float((ahead > 0.0).mean())}
-            found.append(told | _described("lead", ahead))
+        ahead = ahead_by(own, theirs)
+        if len(ahead):
+            told = {"over": name, "seeds": len(ahead), "won": float((ahead > 0.0).mean())}
+            found.append(told | mean_of("lead", ahead))
     return found
 
 
 def print_evaluation(console: Console, lines: Rows, ahead: Rows) -> None:
-    """Print both as tables."""
-    table = Table("policy", title="Worlds that were not trained on", title_justify="left")
-    for label in (*SHOWN.values(), "seeds"):
-        table.add_column(label, justify="right")
-    for line in lines:
-        shown = (_with_interval(line, name) if name in WITH_INTERVAL else f"{line[name]:.2f}" for name in SHOWN)
-        table.add_row(line["policy"], *shown, str(line["seeds"]))
-    console.print(table)
+    """Print a table, which 80 columns hold, and a line for each lead."""
+    played = sorted({line["seeds"] for line in lines})
+    episodes = "-".join(str(n) for n in (played if len(played) < 2 else (played[0], played[-1])))
+    rows = [
+        [
+            line["policy"],
+            *(shown(line, name, stacked=True) if name in WITH_INTERVAL else f"{line[name]:.2f}" for name in SHOWN),
+        ]
+        for line in lines
+    ]
+    title = f"Worlds that were not trained on, {episodes} episodes of each policy"
+    console.print(console_table(title, ["policy", *SHOWN.values()], rows))
     for lead in ahead:
         console.print(
-            f"model - {lead['over']}: {_with_interval(lead, 'lead')} m of return, ahead in {100.0 * lead['won']:.0f} % "
+            f"model - {lead['over']}: {shown(lead, 'lead')} m of return, ahead in {100.0 * lead['won']:.0f} % "
             f"of {lead['seeds']} seeds",
             highlight=False,
             soft_wrap=True,
         )
-
-
-def _described(name: str, values: Any) -> dict[str, Any]:
-    low, high = interval((values,), np.mean)
-    return {name: float(values.mean()), f"{name}_low": low, f"{name}_high": high}
-
-
-def _with_interval(line: Mapping[str, Any], name: str) -> str:
-    mean, low, high = (line[f"{name}{end}"] for end in ("", "_low", "_high"))
-    return f"{mean:.3f}" if low is None or high is None else f"{mean:.3f} ({low:.3f} .. {high:.3f})"

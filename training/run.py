@@ -26,12 +26,15 @@ def run(
     robots: Annotated[int | None, typer.Option(help="How many, 1 to 8.", show_default="3")] = None,
     policy: Annotated[
         str | None,
-        typer.Option(help="frontier, random_goals, random_walk, or a trained model's path.", show_default="frontier"),
+        typer.Option(
+            help="frontier, random_goals, random_walk, a trained model's path, or MODULE:NAME of your own.",
+            show_default="frontier",
+        ),
     ] = None,
     seed: Seed = None,
     action_type: Annotated[
         str | None,
-        typer.Option(help="continuous, discrete or goal.", show_default="continuous; of a model goal"),
+        typer.Option(help="continuous, discrete or goal.", show_default="continuous, if the policy knows it"),
     ] = None,
     max_cycles: Annotated[int | None, typer.Option(help="Steps of the episode.", show_default="180 s worth")] = None,
     particles: Particles = None,
@@ -49,15 +52,15 @@ def run(
     config: Config = None,
 ) -> None:
     """Robots that do not know where they start explore a building, map it, and join their maps."""
-    from agents.registry import is_model
+    from agents.registry import action_types
     from training.episode_scores import score_episode
     from training.figures import draw_errors, draw_maps
     from training.run_config import RunConfig
     from training.run_folder import plain
     from training.run_tables import print_tables
 
-    if action_type is None and policy is not None and is_model(policy):
-        action_type = "goal"
+    if action_type is None and policy is not None and "continuous" not in (known := action_types(policy)):
+        action_type = known[0]
     given = {
         "world": world,
         "robots": robots,

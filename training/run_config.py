@@ -11,7 +11,7 @@ from agents.trained import load_model
 from slam_backend.errors import check_choice, check_int
 from training.plain_config import PlainConfig
 from vslam_env import vslam_v0
-from vslam_env.config import ACTION_TYPES, GOAL_DECISION_TICKS, PRESETS, SENSORS, TICK, preset_config
+from vslam_env.config import ACTION_TYPES, GOAL_DECISION_TICKS, PRESETS, SENSORS, TICK, EnvConfig, preset_config
 from vslam_env.environment import ExplorationEnv
 from vslam_env.world import WORLD_FAMILIES
 
@@ -26,7 +26,8 @@ class RunConfig(PlainConfig):
     Attributes:
         world: A family name, or the path of a floor plan, a JSON file or a folder.
         robots: How many.
-        policy: A name of the registry of policies, or the path of a trained model; the same for all robots.
+        policy: A name of the registry of policies, the path of a trained model, or `module:name` of one's own; the
+            same for all robots.
         action_type: `"continuous"`, `"discrete"` or `"goal"`.
         max_cycles: Steps of the episode; None: as many as `EPISODE_S` takes.
         particles: Per filter.
@@ -88,21 +89,23 @@ class RunConfig(PlainConfig):
         """Steps of the episode."""
         return round(EPISODE_S / self.step_s) if self.max_cycles is None else self.max_cycles
 
-    def make_env(self) -> ExplorationEnv:
-        """Build the environment."""
+    def environment(self) -> EnvConfig:
+        """Return the environment's configuration."""
         assumed: dict[str, Any] = {"num_particles": self.particles}
         if self.rejuvenate_every is not None:
             assumed["rejuvenate_every"] = self.rejuvenate_every or None
-        config = preset_config(self.preset, self.sensor).replace(belief={"filter": assumed})
-        return vslam_v0.parallel_env(
+        return preset_config(self.preset, self.sensor).replace(
+            belief={"filter": assumed},
             world=self.world,
             num_robots=self.robots,
-            sensor=self.sensor,
             action_type=self.action_type,
             decision_ticks=self.decision_ticks,
             max_cycles=self.num_steps,
-            config=config,
         )
+
+    def make_env(self) -> ExplorationEnv:
+        """Build the environment."""
+        return vslam_v0.parallel_env(config=self.environment())
 
     def make_policies(self, env: ExplorationEnv) -> dict[str, Policy]:
         """Build one policy for each agent."""

@@ -9,7 +9,7 @@ from rich.table import Table
 
 def console_table(title: str, headings: Sequence[str], rows: Sequence[Sequence[str]] = ()) -> Table:
     """Return a table for the console; title, headings and rows are shown as they are, markup and all."""
-    table = Table(title=escape(title), box=SIMPLE_HEAD, title_justify="left", padding=(0, 1))
+    table = Table(title=escape(title), box=SIMPLE_HEAD, title_justify="left", padding=(0, 1), collapse_padding=True)
     for column, heading in enumerate(headings):
         table.add_column(escape(heading), justify="left" if column == 0 else "right")
     for row in rows:

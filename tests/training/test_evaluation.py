@@ -1,15 +1,18 @@
 """What trainings and evaluations say, without a learner: sums over seeds, curves, refusals."""
 
+import io
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from rich.console import Console
 
+from agents import POLICIES
 from training import learn_extra
 from training.evaluation import FIGURES, EvaluateConfig
-from training.evaluation_summary import leads, summarise
+from training.evaluation_summary import leads, print_evaluation, summarise
 from training.figures_learning import running_mean
 from training.learn_config import TrainConfig
 from training.learn_curves import ends_of, to_csv
@@ -42,6 +45,19 @@ def test_equal_differences_have_an_interval_of_no_width() -> None:
     assert (model["policy"], other["policy"]) == ("model", "other")
     assert model["return"] == pytest.approx(2.25)
     assert model["return_low"] < 2.25 < model["return_high"]
+
+
+def test_the_table_fits_into_80_columns() -> None:
+    """No figure is folded or cut on a terminal of 80 columns, long names of policies, signs and hundreds among them."""
+    rows = [_row(name, seed, 0.01 * (seed - 9)) | {"distance": 123.45} for seed in range(20) for name in POLICIES]
+    rows += [_row("model", seed, -0.25) for seed in range(20)]
+    console = Console(file=io.StringIO(), width=80)
+    print_evaluation(console, summarise(rows), [])
+    text = console.file.getvalue()  # type: ignore[attr-defined]
+    assert "…" not in text
+    assert all(line.count("..") in (0, 2) for line in text.splitlines())  # both intervals of a policy side by side
+    for told in ("random_goals", "-0.250..-0.250", "123.45", "20 episodes of each policy"):
+        assert told in text
 
 
 def test_nobody_leads_without_a_model() -> None:
@@ -90,8 +106,8 @@ def test_splits_are_those_of_many_worlds(tmp_path: Path) -> None:
         ({"model": "m", "mood": 1}, "config: expected names among model, .* got 'mood'"),
         ({"model": "m", "seeds": 1}, "seeds: expected an int >= 2, got 1"),
         ({"model": "m", "split": "train"}, "split: expected one of 'validation', 'test', got 'train'"),
-        ({"model": "m", "policies": ["best"]}, "policies: expected one of 'frontier'"),
-        ({"model": "m", "policies": ["random_walk"]}, "action_type: expected 'continuous' or 'discrete'"),
+        ({"model": "m", "policies": ["best"]}, "policy: expected one of 'frontier'"),
+        ({"model": "m", "policies": ["random_walk"]}, "action_type: expected 'continuous' or 'discrete' for policy"),
     ],
 )
 def test_bad_evaluations_are_refused(values: dict[str, Any], says: str) -> None:

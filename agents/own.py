@@ -1,0 +1,78 @@
+"""Policies of the user, by the name of their module: `my_module:Careful`."""
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from agents.policy import Policy
+from slam_backend.errors import bad_argument, check_choice
+
+ACTION_TYPES = ("continuous", "discrete", "goal")
+EXPECTED = "MODULE:NAME of a policy"
+METHODS = ("reset", "act")
+
+
+def is_own(name: str) -> bool:
+    """Tell whether a name is meant as a module and what makes a policy in it, not as a path."""
+    module, colon, factory = name.partition(":")
+    return bool(colon) and factory.isidentifier() and all(part.isidentifier() for part in module.split("."))
+
+
+def own_action_type(name: str) -> str:
+    """Return the type of action that a policy is for: its attribute `action_type`, or `"goal"` if it has none.
+
+    Raises:
+        ValueError: If there is no such policy, or that attribute is no type of action.
+    """
+    return check_choice(f"{name}.action_type", getattr(_find(name), "action_type", "goal"), ACTION_TYPES)
+
+
+def make_own(name: str) -> Policy:
+    """Make a policy for one robot by calling what the name stands for, without arguments.
+
+    Modules are looked for as usual, and first in the current folder.
+
+    Args:
+        name: Such as `"my_module:Careful"`.
+
+    Raises:
+        ValueError: If the module or the name in it is not there, or what it makes is no policy.
+    """
+    policy = _find(name)()
+    missing = [method for method in METHODS if not callable(getattr(policy, method, None))]
+    if missing:
+        got = f"a {type(policy).__name__} without {missing[0]}"
+        raise bad_argument("policy", EXPECTED, got, "A policy has the methods reset() and act(...).")
+    made: Policy = policy
+    return made
+
+
+def _find(name: str) -> Any:
+    """Return what makes the policy."""
+    module, _, factory = name.partition(":")
+    try:
+        with _current_folder_first():
+            found = import_module(module)
+    except ModuleNotFoundError as error:
+        if error.name is None or not f"{module}.".startswith(f"{error.name}."):
+            raise  # the module is there, and asks for one that is not
+        cure = "Name a module that is installed, or work in the folder that holds it."
+        raise bad_argument("policy", EXPECTED, f"no module {module!r}", cure) from error
+    made = getattr(found, factory, None)
+    if not callable(made):
+        raise bad_argument("policy", EXPECTED, f"no class or function {factory!r} in {module}", "Check the name.")
+    return made
+
+
+@contextmanager
+def _current_folder_first() -> Iterator[None]:
+    """Let imports look into the current folder, as `python -m` does and an installed command does not."""
+    here = str(Path.cwd())
+    sys.path.insert(0, here)
+    try:
+        yield
+    finally:
+        sys.path.remove(here)
