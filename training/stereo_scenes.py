@@ -1,6 +1,6 @@
 """Scenes for measuring the stereo eye: a hall of panels for its speed, one long wall for how views change."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -125,8 +125,3 @@ def wall_pose(along: float, distance: float, angle: float) -> FloatArray:
     """Return the pose (3,) of a camera that looks at a point of the long wall from a distance under an angle."""
     heading = -0.5 * np.pi + angle
     return np.array([along - distance * np.cos(heading), -distance * np.sin(heading), heading])
-
-
-def with_sigmas(camera: StereoCamera, sigma_px: float, sigma_disparity_px: float) -> StereoCamera:
-    """Return a camera with other standard deviations [px]."""
-    return replace(camera, sigma_px=sigma_px, sigma_disparity_px=sigma_disparity_px)

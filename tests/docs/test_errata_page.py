@@ -1,0 +1,47 @@
+"""The ledger of equations, and every other page, names what is there."""
+
+import re
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+TESTS = {file.name: file.read_text(encoding="utf-8") for file in (ROOT / "tests").rglob("*.py")}
+PAGES = {page.name: page.read_text(encoding="utf-8") for page in sorted((ROOT / "docs").rglob("*.md"))}
+LEDGER = [
+    [cell.strip() for cell in line.strip("|").split(" | ")]
+    for line in PAGES["errata.md"].splitlines()
+    if line.startswith("| ") and not line.startswith("| equation")
+]
+NAMED_TEST = re.compile(r"`(?:[\w/]*/)?(\w+\.py|)::(\w+)`")
+
+
+def _assert_there(text: str) -> int:
+    """Return how many tests a text names, all of which exist; `::test` is one of the file named before."""
+    file, named = "", NAMED_TEST.findall(text)
+    for given, test in named:
+        file = given or file
+        assert re.search(rf"^def {test}\(", TESTS[file], re.MULTILINE), f"{file}::{test}"
+    return len(named)
+
+
+@pytest.mark.parametrize(("functions", "tests"), [row[1:3] for row in LEDGER], ids=[row[0] for row in LEDGER])
+def test_the_ledger_names_functions_and_tests_that_exist(functions: str, tests: str) -> None:
+    """Every row names at least one function of the package and one test, and all of them are there."""
+    paths = re.findall(r"`([^`]+)`", functions)
+    assert paths
+    for path in paths:
+        found: Any = import_module("slam_backend")
+        for name in path.split("."):
+            if not hasattr(found, name):  # a module that nobody has imported yet
+                import_module(f"{found.__name__}.{name}")
+            found = getattr(found, name)
+    assert _assert_there(tests)
+
+
+@pytest.mark.parametrize("page", [name for name, text in PAGES.items() if NAMED_TEST.search(text)])
+def test_tests_that_pages_name_exist(page: str) -> None:
+    """A page that calls a test as its witness names one that is there."""
+    assert _assert_there(PAGES[page])
