@@ -165,7 +165,7 @@ class RejuvenationStep:
             for step, where in zip((a, b), starts[:2], strict=True)
         )
         robots, options = len(starts[2]), self._options.smoothing
-        if options.slice_keys is not None and own.num_keys + other.num_keys > options.max_keys:
+        if options.slice_keys is not None and own.num_keys + other.num_keys > options.most_keys(robots):
             own, other = (_thinned(graph, robots, camera, options) for graph in (own, other))
         robot = int(np.flatnonzero(other.previous[other.heads] < 0)[0])  # one that defines b's frame
         motion = compose(mean_pose(starts[2][len(starts[0]) + robot]), inverse(other.poses[other.heads[robot]]))
@@ -284,5 +284,5 @@ def _told(graph: PathGraph, reason: str) -> Rejuvenation:
 def _thinned(graph: PathGraph, robots: int, camera: FloatArray, options: SmoothingOptions) -> PathGraph:
     """Return a graph with no more than its share of all robots' keys."""
     share = len(graph.tips) / robots
-    keys, fresh = max(2, int(share * options.max_keys)), max(1, int(share * options.fresh_keys))
-    return coarsened(graph, camera, replace(options, max_keys=keys, fresh_keys=fresh))
+    keys, fresh = max(2, int(share * options.most_keys(robots))), max(1, int(share * options.fresh_keys))
+    return coarsened(graph, camera, replace(options, max_keys=keys, further_keys=0, fresh_keys=fresh))

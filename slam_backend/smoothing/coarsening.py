@@ -23,7 +23,7 @@ OF_POINTS = ("points", "point_noises", "given", "point_frames", "point_landmarks
 
 
 def coarsened(graph: PathGraph, camera: FloatArray, options: SmoothingOptions) -> PathGraph:
-    """Return the graph with old keys condensed and at most `max_keys` of them, if the fresh ones allow.
+    """Return the graph with old keys condensed and at most `most_keys` of them, if the fresh ones allow.
 
     Args:
         graph: At its mode, with what paths drawn there say of its spreads; see `at_mode`.
@@ -35,7 +35,7 @@ def coarsened(graph: PathGraph, camera: FloatArray, options: SmoothingOptions) -
     for robot in range(len(graph.tips)):
         fresh[np.flatnonzero(graph.robots == robot)[-share:]] = True
     condensed = _without_blind(_condensed(graph, fresh, camera, options), fresh)
-    representatives, slack = _representatives(condensed, graph.spreads, fresh, options.max_keys)
+    representatives, slack = _representatives(condensed, graph.spreads, fresh, options.most_keys(len(graph.tips)))
     return compacted(_joined(replace(condensed, slack=slack), representatives))
 
 
@@ -91,7 +91,7 @@ def _without_blind(graph: PathGraph, fresh: BoolArray) -> PathGraph:
 
 
 def _representatives(
-    graph: PathGraph, cost: FloatArray, fresh: BoolArray, max_keys: int
+    graph: PathGraph, cost: FloatArray, fresh: BoolArray, most_keys: int
 ) -> tuple[IntArray, FloatArray]:
     """Return (k,) the key that each stands rigidly to, itself or an earlier one, or `NONE`; and new slacks (k,)."""
     k = graph.num_keys
@@ -102,7 +102,7 @@ def _representatives(
     needed = np.ones(k, dtype=np.bool_)
     needed[linked] = following[graph.previous[linked]] == linked
     representative[~needed] = NONE
-    surplus = int(needed.sum()) - max_keys
+    surplus = int(needed.sum()) - most_keys
     slack, previous = graph.slack.copy(), graph.previous.copy()
     heap = [(cost[b] + slack[b] + slack[previous[b]], int(b)) for b in linked if needed[b] and not fresh[b]]
     heapq.heapify(heap)

@@ -10,9 +10,11 @@ class SmoothingOptions:
     """All that decides a rejuvenation.
 
     Attributes:
-        max_keys: Most key poses; where there are more, the most rigid neighbours become one. Effort grows with its cube
-            at worst, memory with its product with the landmarks in view.
-        fresh_keys: Newest keys of each robot that keep their raw measurements, which are linearised anew each time.
+        max_keys: Most key poses of one robot; where there are more, the most rigid neighbours become one. Effort grows
+            with its cube at worst, memory with its product with the landmarks in view.
+        further_keys: So many more for each further robot of the filter.
+        fresh_keys: Newest keys, of all robots together, that keep their raw measurements, which are linearised anew
+            each time.
         kernel: Squared Mahalanobis distance of a measurement (3 degrees of freedom) above which it loses weight; 0:
             none does.
         noise_scale: Factor on the covariance of all measurements.
@@ -34,6 +36,7 @@ class SmoothingOptions:
     """
 
     max_keys: int = 120
+    further_keys: int = 30
     fresh_keys: int = 60
     kernel: float = 16.0
     noise_scale: float = 1.0
@@ -48,6 +51,7 @@ class SmoothingOptions:
 
     def __post_init__(self) -> None:
         check_int("max_keys", self.max_keys, 2, "Two poses are the least that can be smoothed.")
+        check_int("further_keys", self.further_keys, 0, "Use 0 to let all robots share those of one.")
         check_int("fresh_keys", self.fresh_keys, 1, "The newest pose is always fresh.")
         check_int("more_draws", self.more_draws, 1, "Use 1 to draw no more than M.")
         if self.slice_keys is not None:
@@ -60,3 +64,7 @@ class SmoothingOptions:
         check_float("noise_scale", self.noise_scale, "Use 1 for the noise as it is.", above=0.0)
         check_float("tolerance", self.tolerance, "Use 0.1.", above=0.0)
         check_float("least_ess", self.least_ess, "Give a share of M.", at_least=0.0, at_most=1.0)
+
+    def most_keys(self, num_robots: int) -> int:
+        """Return how many key poses the paths of K robots may have together."""
+        return self.max_keys + (num_robots - 1) * self.further_keys

@@ -99,7 +99,7 @@ def rejuvenate(
 ) -> Rejuvenation:
     """Take in what the robots did since, smooth, and draw particles.
 
-    A long log is taken in part by part, so that the effort stays that of `max_keys` poses each time. Nothing is raised
+    A long log is taken in part by part, so that the effort stays that of `most_keys` poses each time. Nothing is raised
     for what may happen in a run: the reason says why there are no new particles.
 
     Args:
@@ -115,7 +115,7 @@ def rejuvenate(
     """
     if any((log.kinds == EXACT).any() for log in logs):
         return Rejuvenation(graph, "poses that were given as exact", float("nan"), 0, None)
-    share = max(1, 2 * options.max_keys // len(logs))
+    share = max(1, 2 * options.most_keys(len(logs)) // len(logs))
     near = replace(options, tolerance=NEAR * options.tolerance)
     rest = list(logs)
     while True:
@@ -134,7 +134,7 @@ def settled(
     graph: PathGraph, mode: Mode, camera: FloatArray, options: SmoothingOptions, rng: np.random.Generator
 ) -> PathGraph:
     """Return the graph at its mode; if it has too many keys some are joined, the most rigid of a few paths drawn."""
-    if graph.num_keys <= options.max_keys:
+    if graph.num_keys <= options.most_keys(len(graph.tips)):
         return at_mode(graph, mode)
     return coarsened(at_mode(graph, mode, scouted(graph, mode, SCOUTS, rng)), camera, options)
 

@@ -126,6 +126,20 @@ def test_a_long_run_stays_bounded():
     assert sizes[-1][2] < 1.5 * sizes[5][2]
 
 
+def test_further_robots_have_further_keys():
+    """Two robots may have more keys than one, and have them; without further ones they share those of one."""
+    run = small_run(robots=2, length=10.0)
+    for further, most in ((0, 20), (6, 26)):
+        options = SmoothingOptions(max_keys=20, further_keys=further, fresh_keys=8)
+        assert options.most_keys(1) == 20
+        assert options.most_keys(2) == most
+        result = rejuvenate(
+            PathGraph.at_starts(run.true_paths[:, 0]), [log.arrays() for log in logs_of(run)], run.spec.noise.motion,
+            camera_of(run), 20, np.random.default_rng(3), options,
+        )  # fmt: skip
+        assert result.graph.num_keys == most
+
+
 def test_a_graph_is_not_changed_by_what_is_made_of_it():
     """Snapshots may share graphs: extending, solving, drawing and coarsening leave every array as it was."""
     run = small_run()

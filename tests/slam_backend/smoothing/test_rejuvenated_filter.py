@@ -180,6 +180,7 @@ def test_bad_options_are_refused(options, message):
     ("options", "message"),
     [
         ({"max_keys": 1}, "max_keys: expected an int >= 2"),
+        ({"further_keys": -1}, "further_keys: expected an int >= 0"),
         ({"fresh_keys": 0}, "fresh_keys: expected an int >= 1"),
         ({"max_iterations": 0}, "max_iterations: expected an int >= 1"),
         ({"effort": 0.0}, "effort: expected a finite number > 0"),
