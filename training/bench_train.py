@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any
@@ -13,11 +14,12 @@ from pettingzoo import ParallelEnv
 from sb3_contrib import MaskablePPO
 
 from slam_backend.errors import bad_argument, check_int
-from training.env_timing import StepTimes, time_steps
+from training.env_timing import time_steps
 from training.learn_config import SPLIT_TRAIN, TrainConfig
 from training.learn_network import GoalPolicy
 from training.machine_rates import describe_machine
 from training.plain_config import PlainConfig
+from training.step_timing import no_garbage_collection
 from training.timed_bench import goal, run_in_turn
 from training.vec_env import ExplorationVecEnv, make_vec_env
 from vslam_env import vslam_v0
@@ -25,6 +27,7 @@ from vslam_env.config import EnvConfig
 
 GOAL_ADAPTER_US, GOAL_TWO_WORKERS = 5.0, 1.8
 ADAPTER_STEPS = 400
+WARM_UP = 3
 RECORDED = 20  # steps of an environment that are played again and again
 
 
@@ -43,7 +46,7 @@ class TrainBenchConfig(PlainConfig):
 
     world: str = "office"
     robots: int = 3
-    envs: int = 4
+    envs: int = 16
     workers: tuple[int, ...] = (0, 1, 2)
     steps: int = 40
     seed: int = 100
@@ -73,11 +76,12 @@ class Part:
 
 @dataclass(frozen=True, slots=True)
 class WorkerRow:
-    """Decisions of robots per second with a number of workers, from the median and from the fastest step."""
+    """Decisions of robots per second with a number of workers: by the median step, by the fastest, and by all."""
 
     workers: int
     per_second: float
     best_per_second: float
+    mean_per_second: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -173,7 +177,8 @@ def run_bench(
         ("adapter", lambda: parts.extend(time_adapter(config))),
         ("learner", lambda: parts.extend(time_learner(config))),
     ]
-    trials += [(f"{n} workers", lambda n=n: rows.append(time_workers(config, n))) for n in config.workers]  # type: ignore[misc]
+    if config.workers:
+        trials.append(("workers", lambda: rows.extend(time_workers(config))))
     complete = run_in_turn(trials, on_trial, should_stop)
     for row in rows:
         if row.workers == 0:
@@ -183,7 +188,7 @@ def run_bench(
 
 def count_trials(config: TrainBenchConfig) -> int:
     """Return how often `run_bench` calls `on_trial`."""
-    return 2 + len(config.workers)
+    return 2 + bool(config.workers)
 
 
 def time_adapter(config: TrainBenchConfig) -> list[Part]:
@@ -234,20 +239,39 @@ def time_learner(config: TrainBenchConfig) -> list[Part]:
     ]
 
 
-def time_workers(config: TrainBenchConfig, workers: int) -> WorkerRow:
-    """Time the environments under random valid goals, in this process or over workers."""
-    env = make_vec_env(config.environment(), config.envs, workers, config.seed)
-    try:
-        env.reset()
+def time_workers(config: TrainBenchConfig) -> list[WorkerRow]:
+    """Time the environments under random valid goals, in this process or over workers.
+
+    All of them play the same episodes, and take turns at each step: what else the machine does meets them all alike.
+    """
+    with ExitStack() as open_now:
+        envs = []
+        for workers in config.workers:
+            env = make_vec_env(config.environment(), config.envs, workers, config.seed)
+            open_now.callback(env.close)
+            env.reset()
+            envs.append(env)
         rng = np.random.default_rng(config.seed)
-
-        def step(_: Any) -> None:
-            env.step(_drawn(env.env_method("action_masks"), rng))
-
-        times = StepTimes.of(time_steps(step, range(config.steps + 5), 5))
-    finally:
-        env.close()
-    return WorkerRow(workers, env.num_envs * 1e6 / times.median_us, env.num_envs * 1e6 / times.min_us)
+        seconds = np.empty((len(envs), config.steps + WARM_UP))
+        with no_garbage_collection():
+            for step in range(config.steps + WARM_UP):
+                actions: NDArray[np.int64] | None = None
+                for row, env in enumerate(envs):
+                    begin = time.perf_counter()
+                    masks = env.env_method("action_masks")
+                    actions = _drawn(masks, rng) if actions is None else actions
+                    env.step(actions)
+                    seconds[row, step] = time.perf_counter() - begin
+    slots = config.envs * config.robots
+    return [
+        WorkerRow(
+            workers,
+            slots / float(np.median(times)),
+            slots / float(times.min()),
+            slots * len(times) / float(times.sum()),
+        )
+        for workers, times in zip(config.workers, seconds[:, WARM_UP:], strict=True)
+    ]
 
 
 def _drawn(masks: Sequence[NDArray[Any]], rng: np.random.Generator) -> NDArray[np.int64]:

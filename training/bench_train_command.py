@@ -18,7 +18,7 @@ COMMAND = "bench train"
 def bench_train(
     world: Annotated[str | None, typer.Option(help="A family or a path.", show_default="office")] = None,
     robots: Annotated[int | None, typer.Option(help="How many, 1 to 8.", show_default="3")] = None,
-    envs: Annotated[int | None, typer.Option(help="Environments side by side.", show_default="4")] = None,
+    envs: Annotated[int | None, typer.Option(help="Environments side by side.", show_default="16")] = None,
     workers: Annotated[
         str | None, typer.Option(help="Numbers of processes, 0: this one.", show_default="0,1,2")
     ] = None,
@@ -69,10 +69,11 @@ def _print(console: Console, result: "TrainBenchResult") -> None:
         )
     console.print(table)
     table = Table("workers", title="Environments alone", title_justify="left")
-    for column in ("decisions/s", "of the fastest step"):
+    for column in ("decisions/s", "of the fastest step", "of all steps"):
         table.add_column(column, justify="right")
     for row in result.workers:
-        table.add_row(str(row.workers), f"{row.per_second:,.0f}", f"{row.best_per_second:,.0f}")
+        rates = (row.per_second, row.best_per_second, row.mean_per_second)
+        table.add_row(str(row.workers), *(f"{rate:,.0f}" for rate in rates))
     console.print(table)
     print_goals(console, result.goals())
     print_caveats(console, result.machine, result.complete)

@@ -34,7 +34,7 @@ def test_a_replay_gives_what_was_recorded() -> None:
 
 def test_goals_are_judged() -> None:
     """The adapter must stay below its limit, and two workers must gain what was asked for."""
-    rows = (WorkerRow(1, 100.0, 110.0), WorkerRow(2, 170.0, 200.0))
+    rows = (WorkerRow(1, 100.0, 110.0, 95.0), WorkerRow(2, 170.0, 200.0, 160.0))
     result = TrainBenchResult({}, (Part("adapter", 4.0, 3.0),), rows, True)
     adapter, gain = result.goals()
     assert (adapter["measured"], adapter["met"]) == (4.0, True)
