@@ -18,7 +18,7 @@ Bits = NDArray[np.uint64]
 
 WORD = 64
 ONE = np.uint64(1)
-# Multiplied with a power of two, its upper six bits tell which one: a de Bruijn sequence, read in `_POSITION`.
+# Multiplied with a power of two, its upper six bits tell which one: a de Bruijn sequence, read in `POSITION`.
 _DE_BRUIJN = 0x03F79D71B4CB0A89
 DE_BRUIJN = np.uint64(_DE_BRUIJN)
 SHIFT = np.uint64(58)

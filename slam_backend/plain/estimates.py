@@ -12,7 +12,12 @@ from slam_backend.reports import PoseEstimate
 
 
 def pose_mixture(beliefs: Sequence[PoseBelief], weights: FloatArray) -> PoseEstimate:
-    """Return mean and covariance of a weighted mixture of Gaussian poses; headings are averaged on the circle."""
+    """Return mean and covariance of a weighted mixture of Gaussian poses; headings are averaged on the circle.
+
+    Args:
+        beliefs: M Gaussians, all in one frame.
+        weights: (M,) float64, summing to 1.
+    """
     means = np.array([belief.mean for belief in beliefs])
     theta = np.arctan2(weights @ np.sin(means[:, 2]), weights @ np.cos(means[:, 2]))
     mean = np.array([weights @ means[:, 0], weights @ means[:, 1], wrap_angle(theta)])
@@ -25,9 +30,14 @@ def pose_mixture(beliefs: Sequence[PoseBelief], weights: FloatArray) -> PoseEsti
 
 
 def landmark_mixture(landmarks: Sequence[Landmark], weights: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return mean (3,) and covariance (3, 3) of a weighted mixture of the particles' estimates of one landmark.
+    """Return the mixture of the particles' estimates of one landmark (Sec. 3.2, see `docs/errata.md`).
 
-    sum w_m (Sigma_m + (mu_m - mu)(mu_m - mu)^T), with the weights scaled to sum to 1.
+    Args:
+        landmarks: Those of the particles that hold it (n).
+        weights: (n,) float64, of these particles; they are scaled to sum to 1.
+
+    Returns:
+        Mean mu (3,) [m] and covariance (3, 3) [m^2], sum w_m (Sigma_m + (mu_m - mu)(mu_m - mu)^T), map frame.
     """
     shares = weights / weights.sum()
     mean: FloatArray = sum((share * one.mean for share, one in zip(shares, landmarks, strict=True)), np.zeros(3))

@@ -58,7 +58,14 @@ def weigh_existence(
 
 
 def is_expected(pose: FloatArray, landmark: Landmark, model: ExistenceModel, camera: StereoCamera) -> bool:
-    """Tell whether a landmark would lie well inside the image, and near enough, from a pose (3,) in the map frame."""
+    """Tell whether a landmark would lie well inside the image, and near enough, to be seen.
+
+    Args:
+        pose: (3,) of the robot [m, m, rad], map frame.
+        landmark: Whose mean counts.
+        model: Its margins say what is well inside.
+        camera: The robot's.
+    """
     offset = landmark.mean - [pose[0], pose[1], 0.0]
     point = camera.camera_from_robot(turn_about_vertical(pose[2]).T @ offset)
     if point[2] <= model.nearest or np.linalg.norm(point) > model.range_share * camera.max_range:

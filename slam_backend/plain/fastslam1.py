@@ -20,6 +20,9 @@ def fastslam1_turn(
         frame: What the robot measured.
         candidates: Per measurement the landmarks of the particle that may have caused it.
         options: Of the filter.
+
+    Returns:
+        The choices, the pose as it was given, and the log-likelihood of the frame.
     """
     chosen: list[int] = []
     distances: list[float] = []

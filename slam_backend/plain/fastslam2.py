@@ -39,6 +39,9 @@ def fastslam2_turn(
         normals: (3,) standard normal numbers, from which the pose is sampled.
         options: Of the filter.
         is_exact: Whether the caller gave the pose, which is then never doubted.
+
+    Returns:
+        The choices, the sampled pose and the log-evidence of the frame.
     """
     predicted = WhitenedPose.of(prior)
     iterations = 1 + MORE_ITERATIONS * bool(prior.covariance[2, 2] > WIDE_HEADING**2)
@@ -69,7 +72,14 @@ def fastslam2_turn(
 
 
 def gates_at(here: WhitenedPose, landmarks: Landmarks, frame: Frame, candidates: Candidates) -> Gates:
-    """Compare each measurement with each of its candidates that can be seen, the doubt about the pose included."""
+    """Compare each measurement with each of its candidates that can be seen, the doubt about the pose included.
+
+    Args:
+        here: Where the robot may be, map frame.
+        landmarks: The particle's map.
+        frame: What the robot measured (n measurements).
+        candidates: Per measurement the landmarks of the particle that may have caused it.
+    """
     gates: Gates = {}
     for b, possible in enumerate(candidates):
         for _, name in possible:
@@ -83,6 +93,12 @@ def is_lost(gates: Gates, wide_gates: Gates, candidates: Candidates, options: Fi
     """Tell whether a wide prior explains three or more, and most, of what it can explain better than the pose's own.
 
     A measurement that even the wide prior cannot explain says nothing about the pose: it may be of a new landmark.
+
+    Args:
+        gates: Under the pose's own prior.
+        wide_gates: Under the wide one.
+        candidates: As in `gates_at`.
+        options: Of the filter; `position_gate` says what is explained.
     """
     verdicts = []
     for b, possible in enumerate(candidates):
@@ -96,7 +112,16 @@ def is_lost(gates: Gates, wide_gates: Gates, candidates: Candidates, options: Fi
 
 
 def beyond_doubt(gates: Gates, frame: Frame, candidates: Candidates, options: FilterOptions) -> dict[int, int]:
-    """Match, at the predicted pose, each measurement that has one good candidate and no good second."""
+    """Match, at the predicted pose, each measurement that has one good candidate and no good second.
+
+    Args:
+        gates: At the predicted pose.
+        frame, candidates: As in `gates_at`.
+        options: Of the filter: its gates, its ambiguity, and whether matches are one-to-one.
+
+    Returns:
+        Landmark by measurement.
+    """
     matches: dict[int, int] = {}
     for b, possible in enumerate(candidates):
         costs = []
@@ -124,6 +149,14 @@ def refine(
     """Go towards the mode of p(pose, matched measurements) by Gauss-Newton, with weights 1 / (1 + D / scale) (Cauchy).
 
     D counts what is known of the pose so far: one wrong match hardly counts once the right ones agree.
+
+    Args:
+        predicted: The pose before the measurements, where it starts.
+        landmarks: The particle's map.
+        frame: What the robot measured.
+        matches: Landmark by measurement.
+        iterations: Steps of Gauss-Newton.
+        scale: Squared Mahalanobis distance [-] at which a match has half its weight.
     """
     here = predicted
     for _ in range(iterations):
@@ -144,6 +177,11 @@ def decide(
     refined: WhitenedPose, landmarks: Landmarks, frame: Frame, candidates: Candidates, options: FilterOptions
 ) -> tuple[list[int], float]:
     """Match, hold back, pass over or start a landmark, measurement by measurement, at the refined pose.
+
+    Args:
+        refined: The pose that `refine` found.
+        landmarks, frame, candidates: As in `gates_at`.
+        options: Of the filter: its gates, its ambiguity, its dead zone, and whether matches are one-to-one.
 
     Returns:
         The choices, and the log-likelihood of the measurements that were not matched.
@@ -180,6 +218,12 @@ def pose_given(
     refined: WhitenedPose, landmarks: Landmarks, frame: Frame, matches: dict[int, int]
 ) -> tuple[WhitenedPose, float]:
     """Return the posterior of the pose given the matched measurements, linearised at the refined pose.
+
+    Args:
+        refined: The pose that `refine` found.
+        landmarks: The particle's map, before it is updated.
+        frame: What the robot measured.
+        matches: Landmark by measurement; each can be seen from the refined pose.
 
     Returns:
         The posterior, and the log-evidence of the measurements: of the linearised model, without approximation.

@@ -101,6 +101,7 @@ class PlainFastSlam:
         return self._map_of(self.particles[self.best_particle], estimate)
 
     def _map_of(self, best: Particle, estimate: str) -> LandmarkMap:
+        """Return the landmarks that one particle holds, as `map` says."""
         names = sorted(best.landmarks)
         if not names:
             return LandmarkMap.empty(self._descriptor_size)
@@ -123,7 +124,17 @@ class PlainFastSlam:
         identities: Sequence[ArrayLike | None] | None = None,
         poses: Sequence[ArrayLike | None] | None = None,
     ) -> StepReport:
-        """Move the robots, match what they see, weigh, update, and resample if needed; all as of `FastSlam.step`."""
+        """Move the robots, match what they see, weigh, update, and resample if needed.
+
+        Args:
+            odometry, measurements, identities, poses: As of `FastSlam.step`, one entry per robot.
+
+        Returns:
+            What was matched and created, as of `FastSlam.step`.
+
+        Raises:
+            ValueError: If an argument is ill-formed; the filter is then as before.
+        """
         k = len(self.is_blind)
         arguments = check_step(k, self._descriptor_size, self.options.camera, odometry, measurements, identities, poses)
         records = []
@@ -133,10 +144,10 @@ class PlainFastSlam:
                 best = self.particles[self.best_particle]  # weights change once all robots have had their turns
                 model, camera = self.options.existence, self.options.camera
                 weigh_existence(self.particles, best, robot, records[robot], model, camera)
-        for record in records:  # Algorithm 1, l. 9; Eqs. 3, 11, in logarithms; weights of before are kept
+        for record in records:  # Algorithm 1, l. 9, in logarithms; weights of before are kept
             for particle, value in zip(self.particles, record.log_likelihoods, strict=True):
                 particle.path_log_weight += value  # Eq. 12, along the ancestral line
-                particle.log_weight += value
+                particle.log_weight += value  # Eqs. 3, 11
         log_weights = np.array([particle.log_weight for particle in self.particles])
         log_weights -= log_weights.max()  # first, so that rounding is relative to the differences
         log_weights -= np.log(np.sum(np.exp(log_weights)))
@@ -245,6 +256,7 @@ class PlainFastSlam:
     # ------------------------------------------------------------------ all particles
 
     def _mixture(self, robot: int) -> PoseEstimate:
+        """Return a robot's pose over all particles, map frame."""
         return pose_mixture([particle.posteriors[robot] for particle in self.particles], self.weights)
 
     def _report(self, records: list[RobotStep], best: int) -> StepReport:

@@ -65,11 +65,18 @@ class Innovation:
         return log_density(self.distance, self.log_det)
 
     def widened(self, pose_covariance: FloatArray) -> "Innovation":
-        """Return the same where the pose is uncertain too: S + H P H^T."""
+        """Return the same where the pose is uncertain too: S + H P H^T.
+
+        Args:
+            pose_covariance: (3, 3) P of (x, y, theta) [m, m, rad], map frame.
+        """
         return replace(self, covariance=self.covariance + self.by_pose @ pose_covariance @ self.by_pose.T)
 
     def in_terms_of(self, root: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return what the measurement tells of xi, where pose = x + root xi, at xi = 0.
+
+        Args:
+            root: (3, 3) factor of the pose's covariance [m, m, rad].
 
         Returns:
             The information (3, 3) A^T S^-1 A, A = H root, and the gradient (3,) of D / 2, -A^T S^-1 (z - z^).
@@ -80,8 +87,13 @@ class Innovation:
 
 
 def log_density(distance: float, log_det: float) -> float:
-    """Return the log of a Gaussian density in three dimensions, by D and log|S|."""
-    return -0.5 * (distance + log_det + 3.0 * LOG_2PI)
+    """Return the log of a Gaussian density in three dimensions.
+
+    Args:
+        distance: D, the squared Mahalanobis distance from its mean.
+        log_det: log|S| of its covariance.
+    """
+    return -0.5 * (distance + log_det + 3.0 * LOG_2PI)  # Eq. 11
 
 
 class Frame:
@@ -92,6 +104,14 @@ class Frame:
         kept: Indices of the measurements to be used.
         names: Of the landmarks measured, by the caller's word; None: unknown.
         camera: Its assumed model.
+
+    Attributes:
+        points: (n, 3) float64 [m], camera frame. As measured.
+        descriptors: (n, d) float64.
+        in_image: Whether z is (u, v, disparity) [px]; otherwise it is `points`.
+        z: (n, 3) float64, the measurements.
+        noises: (n, 3, 3) float64, R of each, in the units of z.
+        log_unit: See `Innovation`.
     """
 
     def __init__(
@@ -122,7 +142,16 @@ class Frame:
         return len(self.z)
 
     def predict(self, pose: FloatArray, mean: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray] | None:
-        """Return z^ (Eq. 5) and its Jacobians by landmark (G, Eq. 6) and by pose (H); None if it cannot be seen."""
+        """Predict the measurement of a landmark.
+
+        Args:
+            pose: (3,) of the robot [m, m, rad], map frame.
+            mean: (3,) of the landmark [m], map frame.
+
+        Returns:
+            z^ (3,), and its Jacobians by landmark (G) and by pose (H), (3, 3) each, all in the units of `z`; None if
+            the landmark cannot be seen, as it lies less than `MIN_DEPTH` ahead of a stereo camera.
+        """
         turn = turn_about_vertical(pose[2])
         c, s = np.cos(pose[2]), np.sin(pose[2])
         by_heading = np.array([[-s, -c, 0.0], [c, -s, 0.0], [0.0, 0.0, 0.0]])  # of turn
@@ -131,7 +160,7 @@ class Frame:
         g = ROBOT_FROM_CAMERA.T @ turn.T
         h = np.column_stack([-g[:, :2], ROBOT_FROM_CAMERA.T @ by_heading.T @ offset])
         if not self.in_image:
-            return point, g, h
+            return point, g, h  # Eqs. 5, 6
         x, y, depth = point
         if depth < MIN_DEPTH:
             return None
@@ -139,10 +168,16 @@ class Frame:
         by_point = scale * np.array(
             [[1.0, 0.0, -x / depth], [0.0, 1.0, -y / depth], [0.0, 0.0, -self.camera.baseline / depth]]
         )
-        return self.camera.project(point), by_point @ g, by_point @ h
+        return self.camera.project(point), by_point @ g, by_point @ h  # Eqs. 5, 6
 
     def compare(self, pose: FloatArray, landmark: Landmark, b: int) -> Innovation | None:
-        """Return how measurement b differs from what a known pose predicts (Eqs. 5-7); None if it cannot be seen."""
+        """Return how a measurement differs from what a known pose predicts (Eqs. 5-7); None if it cannot be seen.
+
+        Args:
+            pose: (3,) of the robot [m, m, rad], map frame.
+            landmark: Of which it may be.
+            b: Number of the measurement.
+        """
         prediction = self.predict(pose, landmark.mean)
         if prediction is None:
             return None
@@ -151,30 +186,53 @@ class Frame:
         return Innovation(self.z[b] - z_hat, covariance, h, self.log_unit)
 
     def metres(self, pose: FloatArray, landmark: Landmark, b: int) -> float:
-        """Return how far a measured point lies from a landmark [m]; a camera's are scaled to the landmark's depth."""
+        """Return how far a measured point lies from a landmark [m]; a camera's are scaled to the landmark's depth.
+
+        Args:
+            pose: (3,) of the robot [m, m, rad], map frame.
+            landmark: Any.
+            b: Number of the measurement.
+        """
         offset = landmark.mean - [pose[0], pose[1], 0.0]
         point = self.camera.camera_from_robot(turn_about_vertical(pose[2]).T @ offset)
         scale = point[2] / self.points[b, 2] if self.in_image else 1.0
         return float(scale * np.linalg.norm(self.points[b] - point))
 
     def log_clutter(self, b: int, p0: float) -> float:
-        """Return the log-density of a measurement that matches nothing: p0 per m^3, where it was measured (l. 32)."""
+        """Return the log-density of a measurement that matches nothing, where it was measured (l. 32).
+
+        Args:
+            b: Number of the measurement.
+            p0: Density of new landmarks [1/m^3].
+        """
         jacobian = 4.0 * np.log(self.points[b, 2]) if self.in_image else 0.0
         return float(np.log(p0) + jacobian)
 
     def new_landmark(self, pose: FloatArray, b: int, walk: float = 0.0) -> Landmark:
-        """Place what was never seen before (l. 30-31): mean g^-1(x, v), covariance G^-1 R G^-T + walk I."""
+        """Place what was never seen before (l. 30-31): mean g^-1(x, v), covariance G^-1 R G^-T + walk I.
+
+        Printed is the inverse of G^-1 R G^-T; see `docs/errata.md`.
+
+        Args:
+            pose: (3,) of the robot [m, m, rad], map frame.
+            b: Number of the measurement.
+            walk: Variance [m^2] by which the landmark may have moved, along each axis, when it is seen the next time.
+        """
         turn = turn_about_vertical(pose[2])
-        mean = turn @ self.camera.robot_from_camera(self.points[b]) + [pose[0], pose[1], 0.0]
+        mean = turn @ self.camera.robot_from_camera(self.points[b]) + [pose[0], pose[1], 0.0]  # l. 30
         noise = self.camera.covariance(self.points[b]) if self.in_image else self.noises[b]
         to_map = turn @ ROBOT_FROM_CAMERA
-        return Landmark(mean, to_map @ noise @ to_map.T + walk * np.eye(3))
+        return Landmark(mean, to_map @ noise @ to_map.T + walk * np.eye(3))  # l. 31 *
 
     def update(self, pose: FloatArray, landmark: Landmark, b: int, walk: float = 0.0, iterations: int = 1) -> None:
         """Improve a landmark by its measurement at a known pose (iterated EKF); what cannot be seen is only counted.
 
-        Afterwards it may walk by a variance `walk` [m^2] along each axis until it is measured the next time. From the
-        second iteration on the model is linearised where the one before has led.
+        Args:
+            pose: (3,) of the robot [m, m, rad], map frame.
+            landmark: Changed.
+            b: Number of the measurement.
+            walk: As in `new_landmark`.
+            iterations: From the second on the model is linearised where the one before has led.
         """
         landmark.count += 1
         mean, sigma = landmark.mean, landmark.covariance

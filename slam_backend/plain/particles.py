@@ -12,10 +12,19 @@ from slam_backend.plain.turn import Landmarks
 
 @dataclass
 class Particle:
-    """One hypothesis (Eq. 19): the poses of the K robots and the map conditioned on their paths."""
+    """One hypothesis (Eq. 19): the poses of the K robots and the map conditioned on their paths.
+
+    Attributes:
+        poses: Of each robot (3,) [m, m, rad], map frame.
+        posteriors: Of these poses, before they were sampled.
+        starts: Of each robot (3,) [m, m, rad], map frame.
+        log_weight: Since the last resampling, normalised.
+        path_log_weight: Accumulated along the ancestral line (Eq. 12).
+        landmarks: The map, by name.
+    """
 
     poses: list[FloatArray]
-    posteriors: list[PoseBelief]  # of the poses, before they were sampled
+    posteriors: list[PoseBelief]
     starts: list[FloatArray]
     log_weight: float
     path_log_weight: float = 0.0
@@ -37,7 +46,12 @@ def settled(ancestors: IntArray) -> IntArray:
 
 
 def descendants(particles: list[Particle], ancestors: IntArray) -> list[Particle]:
-    """Return the particles that were drawn, equally weighted; no two of them share anything that a step writes."""
+    """Return the particles that were drawn, equally weighted; no two of them share anything that a step writes.
+
+    Args:
+        particles: M; those that keep their place are used again.
+        ancestors: (M,) int64, the index of each one's ancestor, in any order.
+    """
     parents = settled(ancestors)
     drawn = [
         particles[parent] if parent == place else copy.deepcopy(particles[parent])

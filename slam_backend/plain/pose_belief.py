@@ -62,7 +62,14 @@ class PoseBelief:
 
 @dataclass(frozen=True)
 class WhitenedPose:
-    """A pose written as start + root xi, where xi ~ N(0, 1) before the measurements and N(xi, information^-1) now."""
+    """A pose written as start + root xi, where xi ~ N(0, 1) before the measurements and N(xi, information^-1) now.
+
+    Attributes:
+        start: (3,) [m, m, rad], map frame, heading on any branch.
+        root: (3, 3) [m, m, rad], factor of the covariance before the measurements.
+        xi: (3,) [-].
+        information: (3, 3) [-], of xi.
+    """
 
     start: FloatArray
     root: FloatArray
@@ -71,7 +78,7 @@ class WhitenedPose:
 
     @classmethod
     def before_measurements(cls, start: FloatArray, root: FloatArray) -> "WhitenedPose":
-        """Return N(start, root root^T): xi = 0 with unit information."""
+        """Return N(start, root root^T): xi = 0 with unit information; (3,) and (3, 3)."""
         return cls(start, root, np.zeros(3), np.eye(3))
 
     @classmethod
@@ -81,7 +88,7 @@ class WhitenedPose:
         return cls.before_measurements(belief.mean, turn @ lower_root(turn.T @ belief.covariance @ turn))
 
     def at(self, xi: FloatArray, information: FloatArray) -> "WhitenedPose":
-        """Return the same prior with something else known of xi."""
+        """Return the same prior with something else known of xi: its mean (3,) and its information (3, 3)."""
         return WhitenedPose(self.start, self.root, xi, information)
 
     @property
