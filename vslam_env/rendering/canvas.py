@@ -39,7 +39,12 @@ class Viewport:
 
     @classmethod
     def around(cls, points: FloatArray, width: int, height: int) -> Self:
-        """Fit points (n, 2) [m], n >= 1, with a margin into an image, centred and undistorted."""
+        """Fit points with a margin into an image, centred and undistorted.
+
+        Args:
+            points: (n, 2) float64 [m], world frame, n >= 1.
+            width, height: Of the image [px].
+        """
         low, high = points.min(axis=0) - MARGIN_M, points.max(axis=0) + MARGIN_M
         scale = float(min(width / (high[0] - low[0]), height / (high[1] - low[1])))
         centre = 0.5 * (low + high)
@@ -52,7 +57,7 @@ class Viewport:
 
 
 def fixed(points: FloatArray) -> NDArray[np.int32]:
-    """Return pixel positions as OpenCV's fixed-point numbers; the centre of the first pixel is (0, 0) there."""
+    """Return positions (..., 2) [px] as OpenCV's fixed-point numbers; the centre of the first pixel is (0, 0) there."""
     return np.rint((points - 0.5) * (1 << SHIFT)).astype(np.int32)
 
 
@@ -62,27 +67,57 @@ def fill(image: Image, colour: Colour) -> None:
 
 
 def lines(image: Image, points: Sequence[FloatArray] | FloatArray, colour: Colour, width: int, closed: bool) -> None:
-    """Draw polylines, each (n, 2) [px], anti-aliased."""
+    """Draw polylines, anti-aliased.
+
+    Args:
+        image: (H, W, 3) uint8; changed in place.
+        points: Of each line (n, 2) float64 [px]; an array (lines, n, 2) if all are as long.
+        colour: RGB.
+        width: [px].
+        closed: Whether the last point is joined to the first.
+    """
     if len(points):
         paths: Any = list(fixed(points)) if isinstance(points, np.ndarray) else [fixed(line) for line in points]
         cv2.polylines(image, paths, closed, colour, width, cv2.LINE_AA, SHIFT)
 
 
 def path(image: Image, points: FloatArray, colour: Colour, width: int) -> None:
-    """Draw a long polyline (n, 2) [px] without the corners that nobody would see."""
+    """Draw a long polyline without the corners that nobody would see.
+
+    Args:
+        image: (H, W, 3) uint8; changed in place.
+        points: (n, 2) float64 [px].
+        colour: RGB.
+        width: [px].
+    """
     if len(points) > 1:
         corners = cv2.approxPolyDP(points.astype(np.float32)[:, None], UNSEEN_PX, closed=False)
         lines(image, corners[:, 0].astype(np.float64)[None], colour, width, False)
 
 
 def disc(image: Image, centre: FloatArray, radius: float, colour: Colour, width: int = -1) -> None:
-    """Draw a circle around `centre` (2,) [px]; a `width` of -1 fills it."""
+    """Draw a circle.
+
+    Args:
+        image: (H, W, 3) uint8; changed in place.
+        centre: (2,) float64 [px].
+        radius: [px].
+        colour: RGB.
+        width: Of the line [px]; -1 fills the circle.
+    """
     x, y = fixed(centre).tolist()
     cv2.circle(image, (x, y), max(1, round(radius * (1 << SHIFT))), colour, width, cv2.LINE_AA, SHIFT)
 
 
 def dots(image: Image, centres: FloatArray, radius: float, colour: Colour) -> None:
-    """Draw small equal filled discs around `centres` (n, 2) [px]: polygons, as OpenCV's small circles are diamonds."""
+    """Draw small equal filled discs: polygons, as OpenCV's small circles are diamonds.
+
+    Args:
+        image: (H, W, 3) uint8; changed in place.
+        centres: (n, 2) float64 [px].
+        radius: [px].
+        colour: RGB.
+    """
     # Anti-aliasing adds half a pixel all around.
     for outline in fixed(centres[:, None] + (radius - 0.5) * _CIRCLE[::2]):
         cv2.fillConvexPoly(image, outline, colour, cv2.LINE_AA, SHIFT)
@@ -152,6 +187,15 @@ def text_width(text: str, size: float) -> float:
 
 
 def write(image: Image, text: str, left: float, middle: float, size: float, colour: Colour) -> None:
-    """Write one line that starts at x = `left` and is centred at y = `middle` [px]."""
+    """Write one line of text.
+
+    Args:
+        image: (H, W, 3) uint8; changed in place.
+        text: ASCII, as OpenCV's font has no more.
+        left: Where it starts, x [px].
+        middle: Where it is centred, y [px].
+        size: Height of a capital [px].
+        colour: RGB.
+    """
     where = (round(left), round(middle + 0.5 * size))
     cv2.putText(image, text, where, FONT, size / 21.0, colour, 1, cv2.LINE_AA)

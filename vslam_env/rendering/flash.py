@@ -14,13 +14,20 @@ RING_M = 2.2  # [m] how far the rings run
 
 
 def draw_flashes(plot: Image, view: Viewport, scene: Scene, unit: float) -> None:
-    """Draw rings and lines of the merges that are younger than `FLASH_TICKS`."""
+    """Draw rings and lines of the merges that are younger than `FLASH_TICKS`.
+
+    Args:
+        plot: (H, W, 3) uint8, the part of the picture that shows the world; changed in place.
+        view: From metres to its pixels.
+        scene: What is to be seen.
+        unit: Size of the picture, 1 for 960 x 720.
+    """
     for merge in _young(scene):
         _draw_glow(plot, view, scene, merge, unit)
 
 
 def draw_captions(plot: Image, scene: Scene, unit: float) -> None:
-    """Write who merged, the youngest merge on top."""
+    """Write who merged, the youngest merge on top; the arguments are those of `draw_flashes`."""
     for line, merge in enumerate(_young(scene)):
         _draw_caption(plot, merge, line, unit)
 

@@ -27,7 +27,7 @@ ROBOTS: tuple[Colour, ...] = (
 
 
 def robot_colour(index: int) -> Colour:
-    """Return the colour of a robot; they repeat after eight."""
+    """Return the colour (RGB) of the robot of an index >= 0; they repeat after eight."""
     return ROBOTS[index % len(ROBOTS)]
 
 

@@ -9,7 +9,12 @@ from vslam_env.rendering.scene import Scene
 
 
 def draw_header(strip: Image, scene: Scene) -> None:
-    """Write the simulated time and how many maps there are, and draw the coverage as a bar."""
+    """Write the simulated time and how many maps there are, and draw the coverage as a bar.
+
+    Args:
+        strip: (H, W, 3) uint8, the top of the picture; changed in place, sizes go by its height.
+        scene: What is to be seen.
+    """
     height, width = strip.shape[:2]
     fill(strip, palette.STRIP)
     strip[-1] = palette.RULE
@@ -35,7 +40,12 @@ def _bar(strip: Image, left: float, right: float, middle: float, half: float, co
 
 
 def draw_footer(strip: Image, scene: Scene) -> None:
-    """Give each robot a card, those of one group side by side on one plate."""
+    """Give each robot a card with its map error [m], those of one group side by side on one plate.
+
+    Args:
+        strip: (H, W, 3) uint8, the foot of the picture; changed in place, sizes go by its height.
+        scene: What is to be seen.
+    """
     height, width = strip.shape[:2]
     fill(strip, palette.STRIP)
     strip[0] = palette.RULE

@@ -58,7 +58,13 @@ class Blueprint:
     doors: list[tuple[float, float]] = field(default_factory=list)
 
     def wall(self, x0: float, y0: float, x1: float, y1: float, spans: tuple[tuple[float, float], ...] = ()) -> None:
-        """Draw a wall along an axis, with a door somewhere in each of `spans` (from, to), coordinates along it [m]."""
+        """Draw a wall along an axis, with doors in it.
+
+        Args:
+            x0, y0: Where it begins [m], world frame.
+            x1, y1: Where it ends [m]; x1 = x0 or y1 = y0.
+            spans: A door is put somewhere in each (from, to), coordinates along the wall [m].
+        """
         upright = x0 == x1
         begin, end = (y0, y1) if upright else (x0, x1)
         cuts = [begin]
@@ -72,14 +78,18 @@ class Blueprint:
             self.segments.append((x0, a, x0, b) if upright else (a, y0, b, y0))
 
     def split(self, begin: float, end: float, parts: int) -> list[float]:
-        """Draw where to cut [begin, end] into parts of similar length; return all their ends."""
+        """Draw where to cut [begin, end] [m] into parts of similar length; return all their ends [m]."""
         shares = self.rng.uniform(0.75, 1.25, parts)
         return [begin, *(begin + (end - begin) * np.cumsum(shares)[:-1] / shares.sum()).tolist(), end]
 
     def pilasters(self, begin: float, end: float, low: float, high: float) -> None:
-        """Let columns jut out alternately from the walls y = `low` and y = `high` of a corridor [m].
+        """Let columns jut out alternately from both walls of a corridor along x, where no door is near.
 
         Seen along a corridor its walls are too oblique to show anything; the columns face the traveller.
+
+        Args:
+            begin, end: Of the corridor along x [m], world frame.
+            low, high: The y of its walls [m].
         """
         x = begin + self.rng.uniform(1.0, 3.0)
         upper = self.rng.random() < 0.5

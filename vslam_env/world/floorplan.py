@@ -42,9 +42,17 @@ def load_floorplan(
 
 
 def trace(free: Any, metres_per_pixel: float, tolerance_px: float, robot_radius: float, path: str) -> FloatArray:
-    """Trace the outlines of a free part (H, W) uint8, 1 = free; return walls (S, 4) [m].
+    """Trace the outlines of the free part of a plan.
 
-    The origin is the image's lower left corner, y upwards; `path` is what an error names.
+    Args:
+        free: (H, W) uint8, 1 = free, rows downwards; all of it hangs together.
+        metres_per_pixel: Side of a pixel [m].
+        tolerance_px: As in `load_floorplan`.
+        robot_radius: Likewise.
+        path: What an error names.
+
+    Returns:
+        Walls (S, 4) float64 [m]. The origin is the image's lower left corner, y upwards.
 
     Raises:
         ValueError: If no robot fits.
@@ -70,6 +78,9 @@ def trace(free: Any, metres_per_pixel: float, tolerance_px: float, robot_radius:
 def load_walls_json(path: str | Path) -> World:
     """Read `{"walls": [[x1, y1, x2, y2], ...], "start_poses": [[x, y, theta], ...]}`, in metres and radians.
 
+    Args:
+        path: The file; its stem is the world's name, unless the file has a `name`.
+
     Raises:
         ValueError: If the file is missing, no JSON, or has other keys; `start_poses` and `name` may be left out.
     """
@@ -91,6 +102,10 @@ def load_walls_json(path: str | Path) -> World:
 def save_walls_json(world: World, path: str | Path) -> None:
     """Write walls, start poses and name as `load_walls_json` reads them; landmarks are left out.
 
+    Args:
+        world: Its walls are rounded to micrometres.
+        path: Written over, if it exists.
+
     Raises:
         ValueError: If the file cannot be written.
     """
@@ -106,6 +121,13 @@ def save_walls_json(world: World, path: str | Path) -> None:
 def read_image(path: Path, flags: int) -> Any:
     """Return an image as OpenCV reads it.
 
+    Args:
+        path: Of a file.
+        flags: `cv2.IMREAD_COLOR` and the like.
+
+    Returns:
+        (H, W) or (H, W, 3) uint8, BGR.
+
     Raises:
         ValueError: If it is none.
     """
@@ -116,7 +138,11 @@ def read_image(path: Path, flags: int) -> Any:
 
 
 def existing(path: str | Path) -> Path:
-    """Return the path of a file that is there."""
+    """Return the path of a file that is there.
+
+    Raises:
+        ValueError: If there is no such file.
+    """
     path = Path(path)
     if not path.is_file():
         raise bad_argument("world", "a file", str(path), "Check the path: there is no such file.")
@@ -142,7 +168,15 @@ def _free_part(image: Any, path: str) -> Any:
 
 
 def largest_part(free: Any, marked_cells: Any = None) -> Any:
-    """Return the largest part of a mask (H, W) bool that hangs together, or that with the most marked cells, uint8."""
+    """Return the largest part of a mask that hangs together, or that with the most marked cells.
+
+    Args:
+        free: (H, W) bool; cells hang together by their sides.
+        marked_cells: (H, W) bool, or None.
+
+    Returns:
+        (H, W) uint8, 1 in the part.
+    """
     count, labels, stats, _ = cv2.connectedComponentsWithStats(free.astype(np.uint8), connectivity=4)
     marked = np.zeros(count) if marked_cells is None else np.bincount(labels[marked_cells], minlength=count)
     sizes = stats[:, cv2.CC_STAT_AREA].astype(np.int64)

@@ -116,10 +116,18 @@ def _draw_offsets(length: float, config: LandmarkConfig, rng: np.random.Generato
 
 
 def draw_descriptors(count: int, config: LandmarkConfig, rng: np.random.Generator) -> NDArray[np.float32]:
-    """Draw unit descriptors (count, d) float32 around a common mean, as those of real images are.
+    """Draw unit descriptors around a common mean, as those of real images are.
 
     With a share a^2 of the common mean and 1 - a^2 of its own, two descriptors have the cosine a^2 on average and thus
     the distance sqrt(2 (1 - a^2)).
+
+    Args:
+        count: How many, at least 1.
+        config: Their size d, their distinctness, and how many are repeated.
+        rng: Source of the draws.
+
+    Returns:
+        (count, d) float32 [-].
     """
     own_share = 0.5 * config.distinctness**2
     common = rng.standard_normal(config.descriptor_size)

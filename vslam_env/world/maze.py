@@ -58,6 +58,7 @@ def _tree(rows: int, columns: int, rng: np.random.Generator) -> Iterator[tuple[C
 
 
 def _neighbours(cell: Cell, rows: int, columns: int) -> list[Cell]:
+    """Return the cells beside one."""
     row, column = cell
     around = [(row - 1, column), (row + 1, column), (row, column - 1), (row, column + 1)]
     return [(r, c) for r, c in around if 0 <= r < rows and 0 <= c < columns]
@@ -70,11 +71,13 @@ def _side(right: BoolArray, above: BoolArray, a: Cell, b: Cell) -> tuple[BoolArr
 
 
 def _is_wall(right: BoolArray, above: BoolArray, a: Cell, b: Cell) -> bool:
+    """Tell whether two neighbours are parted."""
     walls, where = _side(right, above, a, b)
     return bool(walls[where])
 
 
 def _open(right: BoolArray, above: BoolArray, a: Cell, b: Cell) -> None:
+    """Take away the wall between two neighbours."""
     walls, where = _side(right, above, a, b)
     walls[where] = False
 

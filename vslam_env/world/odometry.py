@@ -33,6 +33,11 @@ class OdometryNoise:
 def draw_bias(noise: OdometryNoise, num_robots: int, rng: np.random.Generator) -> FloatArray:
     """Draw what each robot misreads throughout an episode.
 
+    Args:
+        noise: Standard deviations.
+        num_robots: K.
+        rng: Source of the draws, 2 K of them.
+
     Returns:
         (K, 2) float64. Share of the distance [m/m] and turn per metre [rad/m].
     """

@@ -19,6 +19,10 @@ TURN = 10  # of ten files in a row the first is for tests, the second for valida
 def draw_world_seed(split: str, rng: np.random.Generator) -> int:
     """Draw a world seed of a split.
 
+    Args:
+        split: A key of `SPLITS`.
+        rng: Source of the draw.
+
     Raises:
         ValueError: If there is no such split.
     """
@@ -28,6 +32,10 @@ def draw_world_seed(split: str, rng: np.random.Generator) -> int:
 
 def files_of_split(files: Sequence[Path], split: str) -> list[Path]:
     """Return the files of a folder, in order, that belong to a split.
+
+    Args:
+        files: All of the folder, in a fixed order; at least one.
+        split: A key of `SPLITS`.
 
     Raises:
         ValueError: If there is no such split, or it has no file.

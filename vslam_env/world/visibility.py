@@ -15,7 +15,15 @@ TOUCH = 1e-6  # [m] what a ray meets this close to its target does not hide the 
 
 
 def view_limits(camera: StereoCamera, max_incidence: float) -> FloatArray:
-    """Return what a camera can see in the order that `visible_landmarks` expects it, (4,) float64."""
+    """Return what a camera can see in the order that `visible_landmarks` expects it.
+
+    Args:
+        camera: The robots'.
+        max_incidence: Between the line of sight and a face's normal [rad]; more oblique faces show nothing.
+
+    Returns:
+        (4,) float64: its range [m], tangents of half its fields of view across and upright, cosine of `max_incidence`.
+    """
     return np.array(
         [
             camera.max_range,
@@ -28,11 +36,19 @@ def view_limits(camera: StereoCamera, max_incidence: float) -> FloatArray:
 
 @jit
 def walls_in_wedge(pose: FloatArray, walls: FloatArray, tan_half: float, reach: float) -> tuple[FloatArray, IntArray]:
-    """Return the walls (n, 4) [m], in the frame of `pose`, that may cut a wedge ahead, and their indices (n,).
+    """Return the walls that may cut a wedge ahead.
 
-    The wedge opens by +-atan(`tan_half`) around the x axis of `pose` (3,); `tan_half` <= 0 stands for all round. A
-    wall is dropped only if both its ends lie beyond the same side of the wedge or of the circle's bounding box, so
+    A wall is dropped only if both its ends lie beyond the same side of the wedge or of the circle's bounding box, so
     none that matters is lost.
+
+    Args:
+        pose: (3,) float64 [m, m, rad], world frame. Where the wedge begins; its axis is the pose's x axis.
+        walls: (S, 4) float64 [m], world frame.
+        tan_half: The wedge opens by +-atan of this around its axis; <= 0 stands for all round.
+        reach: Its length [m].
+
+    Returns:
+        Walls (n, 4) float64 [m], in the frame of `pose`, and their indices (n,) int64.
     """
     c, s = np.cos(pose[2]), np.sin(pose[2])
     local = np.empty((len(walls), 4))
@@ -250,7 +266,12 @@ def seen_from_somewhere(
 
 @jit
 def distances_to_walls(points: FloatArray, walls: FloatArray) -> FloatArray:
-    """Return the distance (P,) [m] from each point (P, 2) to the nearest wall (S, 4) [m], world frame."""
+    """Return the distance (P,) float64 [m] from each point to the nearest wall.
+
+    Args:
+        points: (P, 2) float64 [m], world frame.
+        walls: (S, 4) float64 [m], world frame.
+    """
     nearest = np.full(len(points), np.inf)
     for i in range(len(walls)):
         ex, ey = walls[i, 2] - walls[i, 0], walls[i, 3] - walls[i, 1]
