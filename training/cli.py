@@ -9,6 +9,7 @@ from rich.markup import escape
 from training.bench_alignment_command import bench_alignment
 from training.bench_command import bench
 from training.bench_env_command import bench_env
+from training.bench_exploration_command import bench_exploration
 from training.bench_filter_command import bench_filter
 from training.bench_stereo_command import bench_stereo
 from training.bench_train_command import bench_train
@@ -45,6 +46,7 @@ app.add_typer(replay, name="replay")
 bench.command("filter")(bench_filter)
 bench.command("stereo")(bench_stereo)
 bench.command("env")(bench_env)
+bench.command("exploration")(bench_exploration)
 bench.command("train")(bench_train)
 bench.command("alignment")(bench_alignment)
 bench.command("mrclam")(bench_mrclam)

@@ -1,0 +1,165 @@
+"""Trials of `vslam bench exploration` summed up: means, paired differences, curves, and what is asked of them."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from slam_backend.errors import FloatArray
+from training.bench_exploration import ALL_ORACLES, NO_ORACLE
+from training.exploration_trials import CURVES, TEAM
+from training.seed_means import ahead_by, mean_of
+
+Rows = Sequence[Mapping[str, Any]]
+PLACE = ("world", "robots", "oracle")
+CONDITION = (*PLACE, "policy")
+FIGURES = (
+    "coverage", "mean_coverage", "below_90_s", "reached_90", *TEAM, "pose_error", "way_m", "right_merges",
+    "false_merges", "undone_merges", "first_merge_s", "last_merge_s", "one_group", "attempts", "collisions",
+    "invalid_actions", "decision_ms",
+)  # fmt: skip
+# What policies are compared by, and whether more of it is better.
+COMPARED = {
+    "mean_coverage": True, "below_90_s": False, "map_error": False, "map_rmse_m": False, "pose_error": False,
+}  # fmt: skip
+MOST_FALSE = 0.02  # of all merges that were not undone
+TOLD_M = 1e-3  # an oracle's merge is sure to a tenth of a millimetre
+
+
+def summarise(rows: Rows) -> list[dict[str, Any]]:
+    """Return a line for each of `CONDITION`, in the order in which they first come: its seeds and means.
+
+    Of each figure the mean over the seeds that have it, and with `_low` and `_high` its 95 % bootstrap interval. Where
+    90 % of the floor are not always reached, the mean of `below_90_s` is a restricted one: of the time spent below.
+    """
+    lines = []
+    for key, own in _grouped(rows, CONDITION).items():
+        line: dict[str, Any] = dict(zip(CONDITION, key, strict=True)) | {"seeds": len(own)}
+        for figure in FIGURES:
+            line |= mean_of(figure, [row[figure] for row in own])
+        lines.append(line)
+    return lines
+
+
+def compare_policies(rows: Rows) -> list[dict[str, Any]]:
+    """Return how each policy differs from the first, in each place and by each figure, on common seeds.
+
+    Fields: those of `PLACE`, `policy`, `than`, `figure`, `seeds`, `more` with `more_low` and `more_high` (95 %,
+    bootstrap over the seeds), `better`: the share of seeds in which the policy is the better one.
+    """
+    found = []
+    for key, own in _grouped(rows, PLACE).items():
+        by_policy = _grouped(own, ("policy",))
+        (first,), *others = by_policy
+        for (policy,) in others:
+            told = dict(zip(PLACE, key, strict=True)) | {"policy": policy, "than": first}
+            found += _differences(told, by_policy[policy,], by_policy[first,])
+    return found
+
+
+def compare_oracles(rows: Rows) -> list[dict[str, Any]]:
+    """Return how each policy with an oracle differs from itself without, in the same form; `than` is `"none"`."""
+    found = []
+    for (world, robots, policy), own in _grouped(rows, ("world", "robots", "policy")).items():
+        by_oracle = _grouped(own, ("oracle",))
+        for (oracle,) in by_oracle:
+            if oracle != NO_ORACLE and (NO_ORACLE,) in by_oracle:
+                told = {"world": world, "robots": robots, "oracle": oracle, "policy": policy, "than": NO_ORACLE}
+                found += _differences(told, by_oracle[oracle,], by_oracle[NO_ORACLE,])
+    return found
+
+
+def curves(rows: Rows) -> list[dict[str, Any]]:
+    """Return a row for each of `CONDITION` and time: means of `CURVES` over seeds, with intervals.
+
+    Policies that decide at other times may have other times.
+    """
+    found = []
+    for key, own in _grouped(rows, CONDITION).items():
+        for point, when in enumerate(own[0]["curves"]["time_s"]):
+            line: dict[str, Any] = dict(zip(CONDITION, key, strict=True)) | {"time_s": when}
+            for name in CURVES:
+                line |= mean_of(name, [row["curves"][name][point] for row in own])
+            found.append(line)
+    return found
+
+
+def check_goals(rows: Rows) -> list[dict[str, Any]]:
+    """Ask what must hold of scripted policies, as far as they were played.
+
+    Random goals show more floor over time than a random walk, and the nearest frontier more than random goals. Robots
+    that are told everything know where they are, and have better maps of what they see, in the mean over the policies.
+    Hardly a merge is false.
+
+    Returns:
+        Per goal: `goal`, `limit`, `reached`, `low` and `high` of its interval, `seeds`, `met`: whether the whole
+        interval is within the limit.
+    """
+    found = []
+    places = _grouped(rows, PLACE)
+    for (world, robots, oracle), own in places.items():
+        where = f"{Path(world).name}, K={robots}"
+        by_policy = _grouped(own, ("policy",))
+        for less, more in (("random_walk", "random_goals"), ("random_goals", "frontier")):
+            if oracle == NO_ORACLE and (less,) in by_policy and (more,) in by_policy:
+                values = ahead_by(*(_by_seed(by_policy[name,], "mean_coverage") for name in (less, more)))
+                found.append(_goal(f"{where}: floor over time, {less} - {more}", 0.0, values))
+        if oracle == ALL_ORACLES:
+            worst = np.array([max(row["pose_error"] for row in own)])
+            found.append(
+                _goal(f"{where}, told all: worst pose error [m]", TOLD_M, worst, len(_by_seed(own, "coverage")))
+            )
+            untold = {
+                (row["seed"], row["policy"]): row["map_rmse_m"] for row in places.get((world, robots, NO_ORACLE), ())
+            }
+            by_seed: dict[int, list[float]] = {}
+            for row in own:
+                before, after = untold.get((row["seed"], row["policy"])), row["map_rmse_m"]
+                if before is not None and after is not None:
+                    by_seed.setdefault(row["seed"], []).append(after - before)
+            if by_seed:
+                values = np.array([np.mean(differences) for differences in by_seed.values()])
+                found.append(_goal(f"{where}: map RMSE, told - not told [m]", 0.0, values))
+    made = sum(row["right_merges"] + row["false_merges"] for row in rows)
+    if made:
+        share = sum(row["false_merges"] for row in rows) / made
+        seeds = len({row["seed"] for row in rows})
+        found.append(_goal("false merges, of all that were not undone", MOST_FALSE, np.array([share]), seeds))
+    return found
+
+
+def _goal(name: str, limit: float, values: FloatArray, seeds: int | None = None) -> dict[str, Any]:
+    """Return a goal: the mean of values over seeds, with all of its interval where it has one, is at most `limit`."""
+    mean = mean_of("reached", values)
+    reached, low, high = (mean[name] for name in ("reached", "reached_low", "reached_high"))
+    most = reached if high is None else high
+    return {
+        "goal": name, "limit": limit, "reached": reached, "low": low, "high": high,
+        "seeds": len(values) if seeds is None else seeds, "met": most is not None and most <= limit,
+    }  # fmt: skip
+
+
+def _differences(told: Mapping[str, Any], own: Rows, other: Rows) -> list[dict[str, Any]]:
+    """Return a line for each of `COMPARED` that both have on common seeds."""
+    found = []
+    for figure, more_is_better in COMPARED.items():
+        more = ahead_by(_by_seed(own, figure), _by_seed(other, figure))
+        if len(more):
+            better = float(((more > 0.0) if more_is_better else (more < 0.0)).mean())
+            line = dict(told) | {"figure": figure, "seeds": len(more)} | mean_of("more", more) | {"better": better}
+            found.append(line)
+    return found
+
+
+def _by_seed(rows: Rows, figure: str) -> dict[int, float]:
+    """Return a figure by seed, of the trials that have it."""
+    return {row["seed"]: row[figure] for row in rows if row[figure] is not None}
+
+
+def _grouped(rows: Rows, names: Sequence[str]) -> dict[tuple[Any, ...], list[Mapping[str, Any]]]:
+    """Return the rows by the values of some fields."""
+    groups: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
+    for row in rows:
+        groups.setdefault(tuple(row[name] for name in names), []).append(row)
+    return groups
