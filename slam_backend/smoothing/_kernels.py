@@ -26,6 +26,7 @@ WORK_ROWS = 10
 
 @jit
 def _wrapped(angle: float) -> float:
+    """Return an angle [rad] in [-pi, pi)."""
     return angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
 
 
@@ -59,7 +60,10 @@ def _inverse(a: FloatArray, out: FloatArray) -> float:
 
 @jit
 def invert(matrices: FloatArray, out: FloatArray) -> bool:
-    """Write the inverses of symmetric matrices (n, 3, 3); return whether all of these are positive definite."""
+    """Write the inverses of symmetric matrices (n, 3, 3) to `out`, likewise; return whether all are positive definite.
+
+    Where one is not, those after it are not written.
+    """
     upper, inverse = np.empty(6), np.empty(6)
     for n in range(len(matrices)):
         a = matrices[n]
@@ -85,6 +89,14 @@ def linearise(
 
     Stereo: an error of (u, v, disparity) at the predicted point e is, in metres, that of y = e + k (v - e),
     k = e_x / v_x, under the information J^T diag(1/su^2, 1/su^2, 1/sd^2) J with J = d(u, v, d)/de.
+
+    Args:
+        point: (3,) as measured [m], robot axes, from the camera centre.
+        noise: (6,) its covariance [m^2], if the sensor gave it.
+        given: Whether it did.
+        camera: (focal, baseline, sigma_px, sigma_disparity, mount (3)).
+        e: (3,) as predicted [m], likewise.
+        y, info: Results.
     """
     if given:
         _inverse(noise, info)
@@ -327,7 +339,13 @@ def move_landmarks(
     landmarks: FloatArray, columns: IntArray, keys: IntArray, starts: IntArray, cross: FloatArray, spreads: FloatArray,
     forces: FloatArray, change: FloatArray,
 ) -> None:  # fmt: skip
-    """Add to the landmarks, in place, what a change (n,) of the poses asks of them."""
+    """Add to the landmarks, in place, what a change of the poses asks of them.
+
+    Args:
+        landmarks: (l, 3) [m], map frame; changed.
+        columns, keys, starts, cross, spreads, forces: As of `assemble`, which formed the equations.
+        change: (n,) of the poses sought [m, m, rad], by columns.
+    """
     for landmark in range(len(landmarks)):
         r0, r1, r2 = forces[landmark, 0], forces[landmark, 1], forces[landmark, 2]
         for q in range(starts[landmark], starts[landmark + 1]):

@@ -67,6 +67,7 @@ def _condensed(graph: PathGraph, fresh: BoolArray, camera: FloatArray, options: 
 
 
 def _linearised(graph: PathGraph, camera: FloatArray, options: SmoothingOptions) -> Sightings:
+    """Return all that was measured as forms, linearised where the graph's poses and landmarks are."""
     seen = Sightings.of(graph)
     seen.linearise(graph, graph.poses, graph.landmarks, camera, options.noise_scale, options.kernel)
     return seen
@@ -159,10 +160,12 @@ def _joined(graph: PathGraph, representative: IntArray) -> PathGraph:
 
 
 def _full(upper: FloatArray) -> FloatArray:
+    """Return symmetric matrices (n, 3, 3) of upper triangles (n, 6)."""
     return upper[:, [[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
 
 
 def _upper(full: FloatArray) -> FloatArray:
+    """Return the upper triangles (n, 6) of symmetric matrices (n, 3, 3)."""
     return full[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
 
 
@@ -200,7 +203,7 @@ def _combined(
 
 
 def compacted(graph: PathGraph) -> PathGraph:
-    """Drop frames and landmarks from which, and of which, nothing is measured."""
+    """Return the graph without the frames from which, and the landmarks of which, nothing was measured."""
     frames = np.unique(graph.point_frames)
     landmarks = np.unique(np.concatenate([graph.point_landmarks, graph.frozen_landmarks]))
     return replace(

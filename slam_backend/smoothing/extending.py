@@ -93,10 +93,12 @@ def scatter(noises: FloatArray) -> FloatArray:
 
 
 def _given(log: LogArrays, part: _Part) -> BoolArray:
+    """Return (n,) whether the sensor gave the covariances of the measurements taken."""
     return np.repeat(log.given, np.diff(log.starts))[part.rows]
 
 
 def _noises(log: LogArrays, part: _Part) -> FloatArray:
+    """Return these covariances (n, 6) [m^2], robot axes; zeros where none were given."""
     return np.zeros((len(part.rows), 6)) if log.covariances is None else log.covariances[part.rows]
 
 
@@ -154,7 +156,17 @@ def _part(
 def chained(
     chain: FloatArray, noise: FloatArray, move: FloatArray, move_noise: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return a motion followed by another, and its covariance, to first order."""
+    """Return a motion followed by another, and its covariance, to first order.
+
+    Args:
+        chain: (3,) the first motion [m, m, rad].
+        noise: (3, 3) its covariance, in the frame in which it begins.
+        move: (3,) the second motion, in the frame to which the first one led.
+        move_noise: (3, 3) its covariance, likewise.
+
+    Returns:
+        (3,) and (3, 3), in the frame in which the first begins.
+    """
     by_first, by_second = np.eye(3), np.eye(3)
     by_second[:2, :2] = rotation(chain[2])
     by_first[:2, 2] = by_second[:2, :2] @ [-move[1], move[0]]
@@ -163,7 +175,7 @@ def chained(
 
 
 def first_rows(log: LogArrays, count: int) -> LogArrays:
-    """Return the first steps of a log; the arrays are views."""
+    """Return the first `count` steps of a log, all if it has no more; the arrays are views."""
     end = int(log.starts[min(count, len(log))])
     return LogArrays(
         steps=log.steps[:count], kinds=log.kinds[:count], motions=log.motions[:count], given=log.given[:count],

@@ -15,10 +15,12 @@ RIGID = 1e-4  # [m, rad]; starts that scatter less against each other do not mov
 
 
 def _empty(*shape: int) -> FloatArray:
+    """Return an array of its own with no rows."""
     return np.zeros(shape)
 
 
 def _no_index() -> IntArray:
+    """Return an index of its own with no rows."""
     return np.zeros(0, dtype=np.int64)
 
 
@@ -87,16 +89,19 @@ class PathGraph:
 
     @classmethod
     def at_starts(cls, starts: FloatArray) -> "PathGraph":
-        """Return the graph of K robots that stand at `starts` (K, 3), map frame, and have seen nothing."""
+        """Return the graph of K robots that stand at `starts` (K, 3) [m, m, rad], map frame, and have seen nothing."""
         return cls.at_uncertain_starts(np.asarray(starts, dtype=np.float64)[:, :, None])
 
     @classmethod
     def at_uncertain_starts(cls, starts: FloatArray) -> "PathGraph":
-        """Return the graph of K robots whose starts (K, 3, M) particles may hold to be different, as after a merge.
+        """Return the graph of K robots whose starts particles may hold to be different, as after a merge.
 
         A start on which all particles agree is given. Another is sought: nothing but measurements shall say where it
         is, for what particles think of it stems from these. Where two robots' starts do not change against each other,
         the second hangs on the first.
+
+        Args:
+            starts: (K, 3, M) float64 [m, m, rad], map frame.
         """
         k = len(starts)
         loose = [i for i in range(k) if (starts[i] != starts[i, :, :1]).any()]
@@ -131,7 +136,7 @@ class PathGraph:
         return replace(self, robots=robots, heads=self.heads[order], tips=self.tips[order], latest=self.latest[order])
 
     def known_as(self, ids: IntArray) -> IntArray:
-        """Return the names by which landmarks go."""
+        """Return the names by which landmarks `ids` (n,) int64 go, `aliases` applied."""
         result = ids.copy()
         for old, new in self.aliases:  # in the order in which they were found
             result[result == old] = new

@@ -112,6 +112,9 @@ def rejuvenate(
         options: What decides the rest.
         guesses: Per robot where it may be after some of the new steps (3,), map frame.
         looks: For landmarks that turn out to be one. None: all are what they are called.
+
+    Returns:
+        The graph to go on with, and M particles, or why there are none.
     """
     if any((log.kinds == EXACT).any() for log in logs):
         return Rejuvenation(graph, "poses that were given as exact", float("nan"), 0, None)
@@ -133,7 +136,14 @@ def rejuvenate(
 def settled(
     graph: PathGraph, mode: Mode, camera: FloatArray, options: SmoothingOptions, rng: np.random.Generator
 ) -> PathGraph:
-    """Return the graph at its mode; if it has too many keys some are joined, the most rigid of a few paths drawn."""
+    """Return the graph at its mode; if it has too many keys some are joined, the most rigid of a few paths drawn.
+
+    Args:
+        graph: Which has the mode.
+        mode: Of use, with an empty `reason`.
+        camera, options: As of `rejuvenate`.
+        rng: Source of these draws.
+    """
     if graph.num_keys <= options.most_keys(len(graph.tips)):
         return at_mode(graph, mode)
     return coarsened(at_mode(graph, mode, scouted(graph, mode, SCOUTS, rng)), camera, options)
@@ -148,7 +158,13 @@ def drawn(
     options: SmoothingOptions,
     looks: Looks | None = None,
 ) -> Rejuvenation:
-    """Draw particles about the mode of a graph; arguments are those of `rejuvenate`."""
+    """Draw particles about the mode of a graph.
+
+    Args:
+        grown: The graph with all that the logs hold.
+        mode: Of it, of use.
+        camera, num_particles, rng, options, looks: As of `rejuvenate`.
+    """
     draws = draw_paths(grown, mode, num_particles, rng)
     graph = coarsened(at_mode(grown, mode, draws.spreads), camera, options)
     weights, ess = _weighed(draws)

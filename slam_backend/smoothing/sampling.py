@@ -84,7 +84,17 @@ def _weighed(graph: PathGraph, mode: Mode, poses: FloatArray, log_proposals: Flo
 
 
 def scouted(graph: PathGraph, mode: Mode, num_paths: int, rng: np.random.Generator) -> FloatArray:
-    """Return how far the motions between keys scatter (k,) [m^2], from paths that are drawn but not replayed."""
+    """Return how far the motions between keys scatter, from paths that are drawn but not replayed.
+
+    Args:
+        graph: Odometry.
+        mode: Of it, with the factor of its information.
+        num_paths: How many are drawn.
+        rng: Source of the draws.
+
+    Returns:
+        (k,) float64 [m^2], see `Draws.spreads`.
+    """
     return weigh_odometry(graph, mode, lane_rows(_poses(mode, num_paths, rng)[0]), num_paths)[1]
 
 
@@ -100,7 +110,14 @@ def _poses(mode: Mode, num_paths: int, rng: np.random.Generator) -> tuple[FloatA
 
 
 def lane_rows(poses: FloatArray) -> FloatArray:
-    """Return paths (k, 3, M) as (P / 64, k, 5, 64): x, y, cos, sin, heading; filled up with copies."""
+    """Return paths as kernels take them, in blocks of lanes; surplus lanes are copies of the first path.
+
+    Args:
+        poses: (k, 3, M) float64 [m, m, rad], map frame.
+
+    Returns:
+        (P / 64, k, 5, 64) float64: x, y, cos, sin, heading.
+    """
     k, _, m = poses.shape
     blocks = -(-m // LANES)
     padded = np.empty((k, POSE_ROWS, blocks * LANES))
@@ -133,7 +150,18 @@ def replay(mode: Mode, rows: FloatArray, num_particles: int) -> tuple[FloatArray
 
 
 def weigh_odometry(graph: PathGraph, mode: Mode, rows: FloatArray, num_particles: int) -> tuple[FloatArray, FloatArray]:
-    """Return log p(path given odometry) up to a constant (M,), and how far motions between keys scatter (k,) [m^2]."""
+    """Weigh M paths by the odometry.
+
+    Args:
+        graph: The odometry between keys.
+        mode: Motions are compared about those of the mode.
+        rows: Of `lane_rows`.
+        num_particles: M.
+
+    Returns:
+        (M,) log p(path given odometry) up to a constant, and (k,) [m^2] how far the motions from the keys before
+        scatter, headings felt at `LEVER`.
+    """
     blocks, k = rows.shape[:2]
     log_density, spreads = np.zeros(blocks * LANES), np.zeros(k)
     moved = between(mode.poses[np.maximum(graph.previous, 0)], mode.poses)

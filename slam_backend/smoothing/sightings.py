@@ -70,7 +70,19 @@ class Sightings:
         self, graph: PathGraph, poses: FloatArray, landmarks: FloatArray, camera: FloatArray, scale: float,
         kernel: float,
     ) -> float:  # fmt: skip
-        """Linearise raw measurements; return half their (robust) squared distances."""
+        """Linearise the raw measurements, whose forms and `squares` are written.
+
+        Args:
+            graph: Which these sightings are of.
+            poses: (k, 3) float64 [m, m, rad], map frame. Where to linearise.
+            landmarks: (l, 3) float64 [m], map frame. Likewise.
+            camera: (7,) focal length, baseline, sigma_px, sigma_disparity, mount.
+            scale: Of all measurement covariances.
+            kernel: Squared distance above which a measurement loses weight, 0: none does.
+
+        Returns:
+            Half the sum of their (robust) squared distances.
+        """
         return _kernels.condense(
             graph.points, graph.point_noises, graph.given, graph.point_frames, self.of_points, graph.frame_keys,
             graph.frame_offsets, poses, landmarks, self.keys, self.landmarks, self.frozen, camera, scale, kernel,

@@ -59,13 +59,29 @@ class Smoother:
     def take_in(
         self, graph: PathGraph, logs: Sequence[LogArrays], guesses: Sequence[Mapping[int, FloatArray]]
     ) -> PathGraph | Draft | str:
-        """Take in all rows of the logs, which are few, and do one step; see `descend`."""
+        """Take in all rows of the logs, which are few, and do one step.
+
+        Args:
+            graph: At its mode.
+            logs: Per robot, of the steps after `graph.latest`.
+            guesses: Per robot where it may be after some of these steps (3,), map frame.
+
+        Returns:
+            As of `descend`.
+        """
         grown = extended(graph, logs, self.motion, self.camera[4:], guesses)
         return self.descend(Draft(graph=grown))
 
     @on_one_thread
     def descend(self, draft: Draft) -> PathGraph | Draft | str:
-        """Do one step; return the graph if that ended the descent, how it now stands if not, or what is wrong."""
+        """Do one step of a descent.
+
+        Args:
+            draft: How it stands.
+
+        Returns:
+            The graph if that ended the descent, how it now stands if not, or what is wrong.
+        """
         near = replace(self.options, tolerance=NEAR * self.options.tolerance)
         mode = find_mode(draft.graph, self.camera, near, 1, draft.damping)
         return self._after(draft, mode)
@@ -79,7 +95,16 @@ class Smoother:
         num_particles: int,
         looks: Looks,
     ) -> Rejuvenation | PathGraph | Draft | str:
-        """Take in the logs' last rows, and draw particles, if so few steps end the descent."""
+        """Take in the logs' last rows, and draw particles, if so few steps end the descent.
+
+        Args:
+            graph, logs, guesses: As of `take_in`.
+            num_particles: M.
+            looks: For landmarks that turn out to be one.
+
+        Returns:
+            What came of the draws, or else as of `descend`.
+        """
         grown = extended(graph, logs, self.motion, self.camera[4:], guesses)
         draft = Draft(graph=grown)
         mode = find_mode(grown, self.camera, self.options, LAST_STEPS)
@@ -94,6 +119,7 @@ class Smoother:
         return extended(graph, blind, self.motion, self.camera[4:])
 
     def _after(self, draft: Draft, mode: Mode) -> PathGraph | Draft | str:
+        """Return what a step came to, as of `descend`."""
         if not mode.reason:
             return settled(draft.graph, mode, self.camera, self.options, self.rng)
         steps = draft.steps + mode.iterations

@@ -135,7 +135,7 @@ class _System:
         self.forces = np.zeros((len(graph.landmark_ids), 3))
 
     def form(self, poses: FloatArray, landmarks: FloatArray) -> float:
-        """Form the equations; return the cost."""
+        """Form the equations at poses (k, 3) and landmarks (l, 3), map frame; return the cost there."""
         seen, graph = self.sightings, self.graph
         loss = seen.linearise(graph, poses, landmarks, self.camera, self.options.noise_scale, self.options.kernel)
         self.matrix.fill(0.0)
@@ -153,7 +153,7 @@ class _System:
         return upper if info == 0 else None
 
     def move(self, landmarks: FloatArray, change: FloatArray) -> None:
-        """Move landmarks with the poses, in place."""
+        """Move landmarks (l, 3), in place, with a change (n,) of the poses from where the equations were formed."""
         seen = self.sightings
         _kernels.move_landmarks(
             landmarks, self.columns, seen.keys, seen.starts, self.cross, self.spreads, self.forces, change
