@@ -1,4 +1,4 @@
-"""All that a filter holds, from the particles to the random stream: made, copied with ancestors, renumbered, kept."""
+"""All that a filter holds, from the particles to the random stream: begun, changed as a whole, written down, kept."""
 
 import copy
 from collections.abc import Mapping, Sequence
@@ -7,15 +7,17 @@ from typing import Any
 import numpy as np
 
 from slam_backend._existence_step import ExistenceStep
-from slam_backend._frame_buffers import FrameBuffers
+from slam_backend._frame_buffers import FrameBuffers, Turn
 from slam_backend._mixtures import pose_mixture
 from slam_backend._particle_maps import ParticleMaps, aligned
+from slam_backend._rejuvenated_maps import write_maps
 from slam_backend._rejuvenation_step import RejuvenationStep
 from slam_backend._turns import Assumed
-from slam_backend.errors import IntArray, bad_argument, check_int, check_seed
+from slam_backend.errors import FloatArray, IntArray, bad_argument, check_int, check_seed
 from slam_backend.filter_options import FilterOptions
-from slam_backend.reports import PoseEstimate
+from slam_backend.reports import PoseEstimate, StepReport
 from slam_backend.run_log import RobotLog
+from slam_backend.smoothing.rejuvenation import Particles
 
 POSES = ("_poses", "_starts", "_means", "_covariances")  # (K, 3 or 6, P), of each robot
 KEPT = (*POSES, "_blind", "_log_weights", "_path_log_weights", "_weights")
@@ -70,6 +72,11 @@ class FilterState:
         self._estimates = [self._mixture(robot) for robot in range(k)]
 
     @property
+    def best_particle(self) -> int:
+        """Index of the most probable particle, by accumulated log-weight (Eq. 12)."""
+        return int(self._path_log_weights.argmax())
+
+    @property
     def num_robots(self) -> int:
         """K."""
         return len(self._poses)
@@ -98,6 +105,18 @@ class FilterState:
         self._log_weights = np.full(len(ancestors), -np.log(len(ancestors)))
         self._buffers = FrameBuffers(self._maps.padded)
 
+    def _renew(self, new: Particles) -> None:
+        """Go on with M particles from smoothed paths; the old ones' most probable says which landmarks there are."""
+        m = self.num_particles
+        write_maps(self._maps, self.best_particle, new, self.options.landmark_walk)
+        self._poses[:, :, :m], self._starts[:, :, :m] = new.poses, new.starts
+        self._means[:] = self._poses
+        self._covariances.fill(0.0)
+        self._blind.fill(False)
+        self._log_weights[:], self._path_log_weights[:] = new.log_weights, new.log_densities
+        self._weights[:] = np.exp(new.log_weights)
+        self._estimates = [PoseEstimate(*of_robot) for of_robot in zip(new.means, new.covariances, strict=True)]
+
     def reorder(self, order: IntArray) -> None:
         """Renumber the robots: robot i becomes the one that was `order[i]`; (K,) a permutation."""
         for name in POSES:
@@ -108,6 +127,26 @@ class FilterState:
         self._estimates = [self._estimates[robot] for robot in order]
         if self._rejuvenation is not None:
             self._rejuvenation.reorder(order)
+
+    # ------------------------------------------------------------------ what a step leaves behind
+
+    def _write_down(
+        self,
+        turns: Sequence[Turn],
+        moves: Sequence[FloatArray | None],
+        exact: Sequence[FloatArray | None],
+        report: StepReport,
+    ) -> None:
+        """Log what the robots did and measured in the step before `_steps`, and what that was taken for."""
+        for robot, turn in enumerate(turns):
+            if turn.size or moves[robot] is not None or exact[robot] is not None:
+                ids = report.associations[robot]
+                self._logs[robot].append(
+                    self._steps - 1, moves[robot], exact[robot], turn.points,
+                    ids if len(turn.keep) == turn.size else ids[turn.keep], turn.noises if turn.given else None,
+                )  # fmt: skip
+                if self._rejuvenation is not None:
+                    self._rejuvenation.note(robot, self._steps - 1, self._estimates[robot], exact[robot] is not None)
 
     # ------------------------------------------------------------------ snapshots
 

@@ -14,7 +14,6 @@ from numpy.typing import ArrayLike
 
 from slam_backend import _kernels
 from slam_backend._frame_buffers import Turn
-from slam_backend._rejuvenated_maps import write_maps
 from slam_backend._rejuvenation_step import RejuvenationStep
 from slam_backend._step_input import check_step
 from slam_backend._turns import RobotParticles, report_of, take_turn
@@ -27,7 +26,7 @@ from slam_backend.filter_options import FilterOptions
 from slam_backend.geometry import wrap_angle
 from slam_backend.measurements import Measurements
 from slam_backend.motion import OdometryModel
-from slam_backend.reports import PoseEstimate, RejuvenationReport, StepReport
+from slam_backend.reports import RejuvenationReport, StepReport
 from slam_backend.resampling import RESAMPLING
 from slam_backend.smoothing.options import SmoothingOptions
 
@@ -118,7 +117,16 @@ class FastSlam(FilterKnowledge):
     def from_options(
         cls, num_robots: int, options: FilterOptions, seed: int | np.random.SeedSequence | np.random.Generator = 0
     ) -> "FastSlam":
-        """Build a filter from ready-made options."""
+        """Build a filter from ready-made options, all robots at the origin of the map frame.
+
+        Args:
+            num_robots: K.
+            options: What it assumes and how it decides.
+            seed: As of the class.
+
+        Raises:
+            ValueError: If `num_robots` or `seed` is out of its range.
+        """
         self = cls.__new__(cls)
         self._set_up(num_robots, options, seed)
         return self
@@ -204,19 +212,12 @@ class FastSlam(FilterKnowledge):
 
     def _rejuvenate(self, smoother: RejuvenationStep) -> RejuvenationReport | None:
         """Draw the particles anew from the posterior of whole paths, if it is time and that can be found."""
-        m = self.num_particles
-        result = smoother.run(self._logs, self._starts[:, :, :m], self._maps, self._assumed.camera, self._rng)
+        starts = self._starts[:, :, : self.num_particles]
+        result = smoother.run(self._logs, starts, self._maps, self._assumed.camera, self._rng)
         if result is None:
             return None
-        if (new := result.particles) is not None:
-            write_maps(self._maps, self.best_particle, new, self.options.landmark_walk)
-            self._poses[:, :, :m], self._starts[:, :, :m] = new.poses, new.starts
-            self._means[:] = self._poses
-            self._covariances.fill(0.0)
-            self._blind.fill(False)
-            self._log_weights[:], self._path_log_weights[:] = new.log_weights, new.log_densities
-            self._weights[:] = np.exp(new.log_weights)
-            self._estimates = [PoseEstimate(*of_robot) for of_robot in zip(new.means, new.covariances, strict=True)]
+        if result.particles is not None:
+            self._renew(result.particles)
         return RejuvenationReport(result.reason, result.ess, result.iterations, result.graph.num_keys)
 
     def _take_turn(
@@ -237,24 +238,6 @@ class FastSlam(FilterKnowledge):
             normals = self._rng.standard_normal((self.num_particles, 3))
             self._blind[robot] = take_turn(self._assumed, own, self._maps, self._buffers, turn, move, exact, normals)
         return turn
-
-    def _write_down(
-        self,
-        turns: Sequence[Turn],
-        moves: Sequence[FloatArray | None],
-        exact: Sequence[FloatArray | None],
-        report: StepReport,
-    ) -> None:
-        """Log what the robots did and measured in the step before `_steps`, and what that was taken for."""
-        for robot, turn in enumerate(turns):
-            if turn.size or moves[robot] is not None or exact[robot] is not None:
-                ids = report.associations[robot]
-                self._logs[robot].append(
-                    self._steps - 1, moves[robot], exact[robot], turn.points,
-                    ids if len(turn.keep) == turn.size else ids[turn.keep], turn.noises if turn.given else None,
-                )  # fmt: skip
-                if self._rejuvenation is not None:
-                    self._rejuvenation.note(robot, self._steps - 1, self._estimates[robot], exact[robot] is not None)
 
     def _resample(self) -> None:
         """Draw the particles anew in proportion to their weights; all that a particle holds goes with it."""

@@ -16,7 +16,7 @@ from slam_backend.run_log import RobotLog
 
 
 class FilterKnowledge(FilterState):
-    """All that can be asked of a filter."""
+    """All that can be asked of a filter; what names a robot raises a ValueError if there is none of that index."""
 
     @property
     def num_landmarks(self) -> int:
@@ -49,28 +49,23 @@ class FilterKnowledge(FilterState):
         """(M,) weights, summing to 1. A copy."""
         return np.asarray(np.exp(self._log_weights))
 
-    @property
-    def best_particle(self) -> int:
-        """Index of the most probable particle, by accumulated log-weight (Eq. 12)."""
-        return int(self._path_log_weights.argmax())
-
     def pose(self, robot: int = 0) -> PoseEstimate:
-        """Return the mean and covariance of a robot's pose over all particles, map frame.
+        """Return the mean and covariance of a robot's pose [m, m, rad] over all particles, map frame.
 
         They are those of the mixture of N(x^, P^) before sampling, which scatters less than the samples.
         """
         return self._estimates[self._check_robot(robot)]
 
     def particles(self, robot: int = 0) -> tuple[FloatArray, FloatArray]:
-        """Return poses (M, 3), map frame, and normalised log-weights (M,) of a robot. Copies."""
+        """Return a robot's poses (M, 3) [m, m, rad], map frame, and the normalised log-weights (M,). Copies."""
         return self._columns(self._poses[self._check_robot(robot)]), self._log_weights.copy()
 
     def start_pose(self, robot: int = 0) -> FloatArray:
-        """Return (3,) where the robot started, map frame, by the most probable particle. A copy."""
+        """Return (3,) [m, m, rad] where the robot started, map frame, by the most probable particle. A copy."""
         return np.array(self._starts[self._check_robot(robot), :, self.best_particle])
 
     def pose_from_start(self, robot: int = 0) -> PoseEstimate:
-        """Return the mean and covariance of a robot's pose in its own start frame.
+        """Return the mean and covariance of a robot's pose [m, m, rad] in its own start frame.
 
         Each particle's pose is seen from where the robot started in that particle, so that what the filter does not
         know of the start, after a merge, does not blur it.
@@ -90,7 +85,7 @@ class FilterKnowledge(FilterState):
         return pose_mixture(*seen, self.weights), start
 
     def particles_from_start(self, robot: int = 0) -> FloatArray:
-        """Return a robot's poses (M, 3), each seen from where it started in that particle."""
+        """Return a robot's poses (M, 3) [m, m, rad], each seen from where it started in that particle."""
         starts = self._columns(self._starts[self._check_robot(robot)])
         return between(starts, self._columns(self._poses[robot]))
 
@@ -99,14 +94,17 @@ class FilterKnowledge(FilterState):
         return rows[:, : self.num_particles].T.copy()
 
     def map(self, estimate: Literal["best", "mixture"] = "best", min_count: int = 1) -> LandmarkMap:
-        """Return the map in the map frame, landmarks by ascending id.
+        """Return the map [m, m^2] in the map frame, landmarks by ascending id. A copy.
 
         Args:
             estimate: "best": means and conditional covariances of the most probable particle (Eq. 12). "mixture":
                 mean and covariance over all particles that hold the landmark, path uncertainty included,
                 sum w_m (Sigma_m + (mu_m - mu)(mu_m - mu)^T) (Sec. 3.2, see `docs/errata.md`); the landmarks are
                 those of the most probable particle.
-            min_count: Landmarks measured fewer times are left out.
+            min_count: Landmarks that the most probable particle measured fewer times are left out.
+
+        Raises:
+            ValueError: If `estimate` is neither.
         """
         check_choice("estimate", estimate, ("best", "mixture"))
         best, least = self.best_particle, max(min_count, 1)
@@ -132,12 +130,13 @@ class FilterKnowledge(FilterState):
         return self._maps.ids[slots], 1.0 / (1.0 + np.exp(-self._maps.odds_of_particle(self.best_particle, slots)))
 
     def _dense(self) -> tuple[IntArray, FloatArray, FloatArray, IntArray]:
-        """Return ids (n,), means (n, 3, M), covariances (n, 6, M) and counts (n, M), 0 where a particle lacks it."""
+        """Return ids (n,), means (n, 3, M) [m], covariances (n, 6, M) [m^2] and counts (n, M), 0 where one lacks it."""
         slots = self._maps.used_slots()
         values, counts = self._maps.dense(slots)
         return self._maps.ids[slots], values[:, :3], values[:, 3:], counts.astype(np.int64)
 
     def _check_robot(self, robot: int) -> int:
+        """Return the index of a robot that there is."""
         if isinstance(robot, bool) or not isinstance(robot, (int, np.integer)) or not 0 <= robot < self.num_robots:
             raise bad_argument("robot", f"an index from 0 to {self.num_robots - 1}", robot, "Count robots from 0.")
         return int(robot)
