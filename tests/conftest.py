@@ -1,5 +1,6 @@
 """Fixtures and settings shared by all tests."""
 
+import gc
 import os
 from pathlib import Path
 
@@ -8,6 +9,12 @@ from hypothesis import settings
 
 settings.register_profile("default", deadline=None, derandomize=True, max_examples=60)
 settings.load_profile("default")
+
+
+def pytest_collection_finish() -> None:
+    """Spare the garbage collector the million objects of imported packages: tests that time or trace collect often."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="session")

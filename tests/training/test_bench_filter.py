@@ -41,7 +41,7 @@ def _result(milliseconds: Any, loads: list[FilterLoad], plain: tuple[PlainRow, .
 
 
 def test_a_bench_leaves_a_folder_that_repeats_it(vslam: Any, tmp_path: Path) -> None:
-    """One row for each combination, in table, metrics.json and the copy; the config repeats them all."""
+    """One row for each combination, in table, metrics.json and the copy; the config repeats them, as far as asked."""
     first, second, copy = tmp_path / "first", tmp_path / "second", tmp_path / "copy.json"
     status, shown, _ = vslam("bench", "filter", *TINY, "--out", str(first), "--json", str(copy))
     assert status == 0
@@ -59,9 +59,11 @@ def test_a_bench_leaves_a_folder_that_repeats_it(vslam: Any, tmp_path: Path) -> 
         assert row["bytes_per_landmark"] >= 76.0
     assert [row["plain_ms"] is None for row in metrics["rows"]] == [False, True] * 4  # with one robot only
     assert (first / "speed.png").read_bytes().startswith(b"\x89PNG")
-    assert vslam("bench", "filter", "--config", str(first), "--out", str(second), "--no-plain").status == 0
+    fewer = ("--no-plain", "--particles", "5", "--robots", "1")
+    assert vslam("bench", "filter", "--config", str(first), "--out", str(second), *fewer).status == 0
     configs = [tomllib.loads((folder / "config.toml").read_text())["config"] for folder in (first, second)]
-    assert configs[1] == configs[0] | {"plain": False}
+    assert configs[1] == configs[0] | {"plain": False, "particles": [5], "robots": [1]}
+    assert configs[0]["steps"] == 4
 
 
 @pytest.mark.parametrize(
