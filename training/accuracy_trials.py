@@ -106,7 +106,7 @@ def play(trial: Trial) -> dict[str, Any]:
     elif trial.method == "dead_reckoning":
         answer = Answer(BatchProblem.of_run(run).dead_reckoning().paths)
     else:
-        answer = _optimal(run, trial.method)
+        answer = optimal(run, trial.method)
     row = asdict(trial) | score(run, answer)
     return row | {"seconds": time.perf_counter() - begin}
 
@@ -227,8 +227,13 @@ def follow(run: StereoRun, slam: FastSlam) -> Answer:
     )
 
 
-def _optimal(run: StereoRun, method: str) -> Answer:
-    """Return the batch or the ideal online estimate; both know which landmark is behind each measurement."""
+def optimal(run: StereoRun, method: str) -> Answer:
+    """Return the batch or the ideal online estimate; both know which landmark is behind each measurement.
+
+    Args:
+        run: Whatever its association is, names are told.
+        method: "batch_ml" or "ideal_online".
+    """
     problem, batch = _batch_of(run)
     if method == "ideal_online":
         online = ideal_online(problem, batch)

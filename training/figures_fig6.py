@@ -12,12 +12,12 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator
 
 from slam_backend.errors import FloatArray
-from training.paper_regimes import REGIMES
+from training.paper_regimes import BOUND, REGIMES
 from training.png import save_png
 from vslam_env.rendering.palette import robot_colour
 
 MARKERS = ("o", "s", "^")  # of one, two and three robots, as in the paper
-STYLES = {"fastslam1": "-", "fastslam2": "--", "fastslam2+rejuvenation": ":"}
+STYLES = {"fastslam1": "-", "fastslam2": "--", "fastslam2+rejuvenation": ":", BOUND: (0, (6, 1.5, 1, 1.5))}
 Lines = Sequence[Mapping[str, Any]]
 
 
@@ -48,15 +48,18 @@ def draw_fig6(file: Path, lines: Lines) -> None:
         proposals = [name for name in STYLES if any(line["proposal"] == name for line in lines)]
         figure.legend(
             handles=_legend(robots, proposals), loc="outside lower center", ncols=len(robots) + len(proposals),
-            frameon=False,
+            frameon=False, columnspacing=1.2,
         )  # fmt: skip
         save_png(figure, file, 150)
 
 
 def _draw_panel(ax: Axes, lines: Lines, key: str) -> None:
-    """Draw a curve for each proposal and number of robots over M."""
+    """Draw a curve for each proposal and number of robots over M; the bound, which has no M, as a level."""
     robots = sorted({line["robots"] for line in lines})
-    for proposal, k in sorted({(line["proposal"], line["robots"]) for line in lines}):
+    for line in lines:
+        if line["proposal"] == BOUND and line[key] is not None:
+            ax.axhline(line[key], color=_colour(line["robots"]), lw=0.9, ls=STYLES[BOUND])
+    for proposal, k in sorted({(line["proposal"], line["robots"]) for line in lines if line["proposal"] != BOUND}):
         own = [line for line in lines if (line["proposal"], line["robots"]) == (proposal, k) and line[key] is not None]
         x, mean, low, high = _columns(own, key)
         x = x * 1.03 ** (robots.index(k) - 0.5 * (len(robots) - 1))  # so that intervals stand side by side
@@ -87,7 +90,9 @@ def _legend(robots: Sequence[int], proposals: Sequence[str]) -> list[Line2D]:
     handles = [
         Line2D([], [], color=_colour(k), marker=_marker(k), mfc="white", ms=4.5, label=f"K = {k}") for k in robots
     ]
-    return handles + [Line2D([], [], color="0.4", ls=STYLES[name], label=name) for name in proposals]
+    return handles + [
+        Line2D([], [], color="0.4", ls=STYLES[name], label="batch ML" if name == BOUND else name) for name in proposals
+    ]
 
 
 def _marker(robots: int) -> str:

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from slam_backend.errors import check_choice, check_int
-from training.paper_regimes import FEW, REGIMES
+from training.paper_regimes import BOUND, FEW, REGIMES, Regime
 from training.paper_trials import ErrorTrial, TimeTrial
 from training.plain_config import PlainConfig, check_each_once
 from training.stereo_office import start_crossings
@@ -16,6 +16,7 @@ ERRORS_FILE, TIMES_FILE = "errors.jsonl", "times.jsonl"
 PARTICLES = (1, 10, 50, 100, 200, 300, 400, 500, 1000, 1500, 2000)  # of the paper's figure
 QUICK: dict[str, Any] = {"particles": (1, 10, 100), "seeds": 3, "length": 25.0}
 FIXED_COST = 200  # a step costs about as much as that of so many particles, however few there are
+BOUND_COST = 4000  # in the same unit, of batch maximum likelihood
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -67,9 +68,12 @@ class Fig6Config(PlainConfig):
             for name in self.regimes
             for robots in self.robots
             for proposal in REGIMES[name].proposals
-            for particles in self.particles
-            if not REGIMES[name].few or particles in FEW
+            for particles in ((0,) if proposal == BOUND else self._particles_in(REGIMES[name]))
         ]
+
+    def _particles_in(self, regime: Regime) -> tuple[int, ...]:
+        """Return the numbers M that are run in a regime."""
+        return tuple(m for m in self.particles if not regime.few or m in FEW)
 
     def time_trials(self) -> list[TimeTrial]:
         """Return the trials of the time per step, seed by seed; none without the paper's regime."""
@@ -89,4 +93,6 @@ class Fig6Config(PlainConfig):
 
 def cost(trial: ErrorTrial | TimeTrial) -> int:
     """Return about how long a trial takes, in an arbitrary unit: what a progress bar counts."""
-    return (trial.particles + FIXED_COST) * (len(trial.robots) if isinstance(trial, TimeTrial) else 1)
+    if isinstance(trial, TimeTrial):
+        return (trial.particles + FIXED_COST) * len(trial.robots)
+    return BOUND_COST if trial.proposal == BOUND else trial.particles + FIXED_COST

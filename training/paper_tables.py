@@ -33,7 +33,7 @@ def print_result(
         table = console_table(f"Map error, K={many} over K={few} (95 %)", ("regime", "M", "as it is", "aligned"))
         for row in ratios:
             name = f"{REGIMES[row['regime']].title}, {row['proposal']}"
-            table.add_row(escape(name), str(row["particles"]), *(_interval(row[key]) for key in ("raw", "aligned")))
+            table.add_row(escape(name), _number(row["particles"]), *(_interval(row[key]) for key in ("raw", "aligned")))
         console.print(table)
     if claims:
         table = console_table("The paper's claims", ("claim", "ratio (95 %)", ""))
@@ -56,8 +56,13 @@ def _print_points(console: Console, title: str, lines: Sequence[Mapping[str, Any
     for m in dict.fromkeys(line["particles"] for line in lines):
         own = {line["robots"]: line for line in lines if line["particles"] == m}
         cells = [_cell(own.get(k), figure, digits, bool(wide)) for _, figure, digits, wide in parts for k in robots]
-        table.add_row(str(m), *cells)
+        table.add_row(_number(m), *cells)
     console.print(table)
+
+
+def _number(particles: int) -> str:
+    """Show M; the bound has none."""
+    return str(particles) if particles else "-"
 
 
 def _cell(line: Mapping[str, Any] | None, figure: str, digits: int, with_interval: bool) -> str:

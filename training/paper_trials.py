@@ -9,8 +9,8 @@ import numpy as np
 
 from slam_backend.errors import BoolArray, FloatArray, bad_argument, check_choice, check_int
 from slam_backend.filter import FastSlam
-from training.accuracy_trials import Answer, follow, score
-from training.paper_regimes import FILTER_OPTIONS, REGIMES, Proposal
+from training.accuracy_trials import Answer, follow, optimal, score
+from training.paper_regimes import BOUND, FILTER_OPTIONS, REGIMES, Proposal
 from training.step_timing import no_garbage_collection
 from training.stereo_runs import FALSE_POINT, RunSpec, StereoRun, simulate_run
 
@@ -27,9 +27,9 @@ class ErrorTrial:
 
     Attributes:
         regime: Key of `REGIMES`.
-        proposal: Of the filter.
+        proposal: Of the filter, or `BOUND`.
         robots: K.
-        particles: M.
+        particles: M; 0 of the bound.
         measurements: B, of all robots together.
         length: Of each robot's path [m].
         seed: Of the run, and of the filter's draws.
@@ -46,7 +46,8 @@ class ErrorTrial:
     def __post_init__(self) -> None:
         check_choice("regime", self.regime, tuple(REGIMES))
         check_choice("proposal", self.proposal, REGIMES[self.regime].proposals)
-        check_int("particles", self.particles, 1, "Use at least one particle; 100 is a good start.")
+        least = 0 if self.proposal == BOUND else 1
+        check_int("particles", self.particles, least, "Use at least one particle; 100 is a good start.")
         check_int("seed", self.seed, 0, "Use 0 or a positive number.")
         _ = self.spec  # refuses the rest
 
@@ -96,9 +97,13 @@ def play_error(trial: ErrorTrial) -> dict[str, Any]:
     Returns:
         The trial's own fields, the figures that `accuracy_trials.play` explains, and `map_all_rmse_m`: that of all
         landmarks of the map which a true landmark caused, duplicates included, where `map_rmse_m` takes the nearest.
+        What only filters have is NaN of the bound.
     """
     run = _run_of(trial.spec, trial.seed)
-    answer = follow(run, _build(run, trial.proposal, trial.particles, trial.seed))
+    if trial.proposal == BOUND:
+        answer = optimal(run, BOUND)
+    else:
+        answer = follow(run, _build(run, trial.proposal, trial.particles, trial.seed))
     row = score(run, answer) | {"map_all_rmse_m": rms_of_all(run, answer)}
     return asdict(trial) | {name: row[name] for name in FIGURES}
 
