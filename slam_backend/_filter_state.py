@@ -8,8 +8,9 @@ import numpy as np
 
 from slam_backend._existence_step import ExistenceStep
 from slam_backend._frame_buffers import FrameBuffers, Turn
+from slam_backend._map_store import aligned
 from slam_backend._mixtures import pose_mixture
-from slam_backend._particle_maps import ParticleMaps, aligned
+from slam_backend._particle_maps import ParticleMaps
 from slam_backend._rejuvenated_maps import write_maps
 from slam_backend._rejuvenation_step import RejuvenationStep
 from slam_backend._turns import Assumed

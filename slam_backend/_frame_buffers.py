@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from slam_backend import _kernels
 from slam_backend._kernels import LANES
-from slam_backend._particle_maps import aligned
+from slam_backend._map_store import aligned
 from slam_backend.errors import FloatArray, IntArray
 from slam_backend.measurements import Measurements
 

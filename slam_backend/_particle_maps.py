@@ -15,135 +15,19 @@ from numpy.typing import NDArray
 
 from slam_backend import _existence_kernels, _kernels
 from slam_backend._kernels import LANES
+from slam_backend._map_store import MapStore
 from slam_backend.errors import FloatArray, IntArray
 
 MAX_MAPS = 512  # slots whose map is the oldest are brought up to date rather than keep more maps than this
-LINE = 64  # [bytes]; vectors that straddle cache lines are slow
 
 
-def aligned(shape: tuple[int, ...], dtype: Any) -> Any:
-    """Return zeros that start at a cache line."""
-    kind = np.dtype(dtype)
-    size = int(np.prod(shape)) * kind.itemsize
-    raw = np.zeros(size + LINE, dtype=np.uint8)
-    start = -raw.ctypes.data % LINE
-    return raw[start : start + size].view(kind).reshape(shape)
-
-
-def _num_heads(descriptor_size: int) -> int:
-    """Return how many components of a descriptor are compared first: a quarter where they are many."""
-    return descriptor_size // 4 if descriptor_size >= 32 and descriptor_size % 4 == 0 else descriptor_size
-
-
-class ParticleMaps:
-    """Landmark Gaussians, counts, descriptors and names of all particles.
+class ParticleMaps(MapStore):
+    """The landmarks of all particles, each of which has its own values of them.
 
     Args:
         num_particles: M.
         log_odds_prior: Of the existence of a new landmark; None: existence is not kept.
-
-    Attributes:
-        values: (rows * 9 * P,) float64, each row [block][x, y, z, Sxx, Sxy, Sxz, Syy, Syz, Szz][lane], map frame.
-        counts: (rows, P) int32. How often the particle matched the landmark, its start included; 0: it lacks it.
-        row_of, map_of: (slots,) int64.
-        maps: (maps, P) int32. users: (maps,) int64, how many slots read by each.
-        odds: (slots, P) float64. Log-odds that the landmark exists, read through its map as a row is; (0, P) without.
-        ids: (slots,) int64. Stable names of the landmarks, -1 = free slot.
-        identities: (slots,) int64. The caller's own names, -1 = none.
-        descriptors: (slots, d) float32. heads: (h, slots) every (d / h)-th component of them, `FAR` where free.
-        free_rows, free_slots: Stacks; `tops` = (their heights, the name of the next landmark).
     """
-
-    def __init__(self, num_particles: int, log_odds_prior: float | None = None) -> None:
-        self.num_particles = num_particles
-        self.log_odds_prior = log_odds_prior
-        self.padded = -(-num_particles // LANES) * LANES
-        self.values: FloatArray = aligned((0,), np.float64)
-        self.counts: NDArray[np.int32] = aligned((0, self.padded), np.int32)
-        self.odds: FloatArray = aligned((0, self.padded), np.float64)
-        self.maps: NDArray[np.int32] = np.zeros((1, self.padded), dtype=np.int32)
-        self.users: IntArray = np.zeros(1, dtype=np.int64)
-        self.row_of: IntArray = np.zeros(0, dtype=np.int64)
-        self.map_of: IntArray = np.zeros(0, dtype=np.int64)
-        self.ids: IntArray = np.zeros(0, dtype=np.int64)
-        self.identities: IntArray = np.zeros(0, dtype=np.int64)
-        self.descriptors: NDArray[np.float32] = np.zeros((0, 0), dtype=np.float32)
-        self.heads: NDArray[np.float32] = np.zeros((0, 0), dtype=np.float32)
-        self._free_maps = 0
-        self.free_rows: IntArray = np.zeros(0, dtype=np.int64)
-        self.free_slots: IntArray = np.zeros(0, dtype=np.int64)
-        self.tops: IntArray = np.zeros(3, dtype=np.int64)
-
-    @property
-    def next_id(self) -> int:
-        """The name that the next landmark will get."""
-        return int(self.tops[2])
-
-    @property
-    def nbytes(self) -> int:
-        """Memory held [bytes]."""
-        arrays = (
-            self.values, self.counts, self.maps, self.users, self.row_of, self.map_of, self.ids, self.identities,
-            self.descriptors, self.heads, self.free_rows, self.free_slots, self.odds,
-        )  # fmt: skip
-        return sum(array.nbytes for array in arrays)
-
-    @property
-    def blocks(self) -> FloatArray:
-        """`values` as (rows, blocks, 9, lanes). A view."""
-        return self.values.reshape(-1, self.padded // LANES, 9, LANES)
-
-    def used_slots(self) -> IntArray:
-        """Return the slots that hold a landmark of at least one particle, by ascending id."""
-        used = np.flatnonzero(self.ids >= 0)
-        return used[np.argsort(self.ids[used])]
-
-    # ------------------------------------------------------------------ room
-
-    def make_room(self, new: int, descriptor_size: int) -> None:
-        """See to it that `new` landmarks can start, and a row is left to bring landmarks up to date."""
-        if self.tops[1] < new:
-            self._grow_slots(max(64, len(self.ids), new - int(self.tops[1])), descriptor_size)
-        if self.tops[0] < new + 1:
-            self._grow_rows(max(64, len(self.counts) // 2, new + 1))
-
-    def _grow_slots(self, extra: int, descriptor_size: int) -> None:
-        old = len(self.ids)
-        for name, fill in (("row_of", 0), ("map_of", 0), ("ids", -1), ("identities", -1)):
-            setattr(self, name, np.concatenate([getattr(self, name), np.full(extra, fill, dtype=np.int64)]))
-        descriptors = aligned((old + extra, descriptor_size), np.float32)
-        if old and self.descriptors.shape[1]:
-            descriptors[:old] = self.descriptors
-        self.descriptors = descriptors
-        heads = aligned((_num_heads(descriptor_size), old + extra), np.float32)
-        heads[:] = _kernels.FAR
-        if old and len(self.heads):
-            heads[:, :old] = self.heads
-        self.heads = heads
-        if self.log_odds_prior is not None:
-            odds = aligned((old + extra, self.padded), np.float64)
-            odds[:old] = self.odds
-            self.odds = odds
-        top = int(self.tops[1])
-        free = np.zeros(old + extra, dtype=np.int64)
-        free[:extra] = np.arange(old + extra - 1, old - 1, -1)  # the lowest is taken first once the old ones are gone
-        free[extra : extra + top] = self.free_slots[:top]
-        self.free_slots = free
-        self.tops[1] = extra + top
-
-    def _grow_rows(self, extra: int) -> None:
-        old, padded = len(self.counts), self.padded
-        values = aligned(((old + extra) * 9 * padded,), np.float64)
-        values[: len(self.values)] = self.values
-        counts = aligned((old + extra, padded), np.int32)
-        counts[:old] = self.counts
-        self.values, self.counts = values, counts
-        top = int(self.tops[0])
-        free = np.zeros(old + extra, dtype=np.int64)
-        free[:extra] = np.arange(old + extra - 1, old - 1, -1)
-        free[extra : extra + top] = self.free_rows[:top]
-        self.free_rows = free
-        self.tops[0] = extra + top
 
     # ------------------------------------------------------------------ resampling
 
@@ -217,7 +101,7 @@ class ParticleMaps:
     # ------------------------------------------------------------------ reading and writing whole maps
 
     def of_particle(self, m: int, slots: IntArray) -> tuple[FloatArray, NDArray[np.int32]]:
-        """Return values (n, 9) and counts (n,) of one particle."""
+        """Return values (n, 9) and counts (n,) of the slots (n,) of particle m. Copies."""
         places = np.where(self.map_of[slots] > 0, self.maps[self.map_of[slots], m], m)
         rows = self.row_of[slots]
         blocks = self.blocks
@@ -255,7 +139,7 @@ class ParticleMaps:
         Where rows of `tiles` are `chosen` (n,), all else is of these, in their order.
         """
         n, m = len(ids), self.num_particles
-        self.__init__(m, self.log_odds_prior)  # type: ignore[misc]
+        self._clear(m)
         self.tops[2] = next_id
         if not n:
             return
@@ -287,12 +171,6 @@ class ParticleMaps:
         )  # fmt: skip
         return result
 
-    def _set_heads(self, n: int) -> None:
-        """Write the heads of the first n slots; the others are free."""
-        if len(self.heads):
-            self.heads[:, :n] = self.descriptors[:n, :: self.descriptors.shape[1] // len(self.heads)].T
-            self.heads[:, n:] = _kernels.FAR
-
     # ------------------------------------------------------------------ snapshots
 
     def get_state(self) -> dict[str, Any]:
@@ -321,7 +199,7 @@ class ParticleMaps:
         n, m, maps = len(state["ids"]), int(state["num_particles"]), state["maps"]
         size = state["descriptors"].shape[1]
         if m != self.num_particles or len(self.counts) < n or len(self.ids) < n or self.descriptors.shape[1] != size:
-            self.__init__(m, self.log_odds_prior)  # type: ignore[misc]
+            self._clear(m)
             if n:
                 self.make_room(n, size)
         slots, rows = len(self.ids), len(self.counts)
