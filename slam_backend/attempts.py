@@ -1,6 +1,7 @@
 """Which pair of groups tries to align its maps, and when: alignment is dear, and the same evidence fails twice."""
 
 import copy
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -10,6 +11,8 @@ from slam_backend.errors import bad_argument, check_int
 from slam_backend.landmark_map import LandmarkMap
 
 PairKey = tuple[tuple[int, ...], tuple[int, ...]]  # two groups, as tuples of robots
+GROWN = 0.125  # of all that was read has to be new before logs are smoothed once more for the same pair
+HELPS = 0.7  # waiting has helped where no more of a doubt is left
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,6 +63,7 @@ class AttemptSchedule:
         self._records: dict[PairKey, _Record] = {}
         self._proposed: dict[PairKey, set[tuple[int, int]]] = {}
         self._bars: list[tuple[PairKey, int]] = []
+        self._doubts: dict[tuple[int, int], float] = {}  # robot of either side -> the least that there has been
 
     def is_due(self, step: int) -> bool:
         """Tell whether a pair may try at this step."""
@@ -91,16 +95,41 @@ class AttemptSchedule:
                 self._proposed = {pair: found}
         return best
 
-    def record(self, pair: PairKey, step: int, success: bool) -> None:
-        """Remember an attempt of the pair that `choose` returned: its evidence, and how long it now waits."""
+    def should_wait(self, pair: PairKey, doubt: float) -> bool:
+        """Tell whether a pair whose maps align had better try again later, and remember its doubt.
+
+        It had at first, and as long as the doubt falls by a good part from one attempt to the next. Where it does not,
+        the ways of the robots to what they have in common are as uncertain as they will ever be, the particles of the
+        merge know it, and the joint filter is the first that may find out more.
+
+        Args:
+            pair: That tries; what either group's robots went through before they were in it counts.
+            doubt: How uncertain the motion between its maps is, 1 = just sure enough [-].
+        """
+        robots = [(a, b) for a in pair[0] for b in pair[1]]
+        before = min(self._doubts.get(key, math.inf) for key in robots)
+        self._doubts |= {key: min(doubt, self._doubts.get(key, math.inf)) for key in robots}
+        return 1.0 < doubt < HELPS * before
+
+    def record(self, pair: PairKey, step: int, success: bool, straightened: bool = False) -> None:
+        """Remember an attempt of the pair that `choose` returned: its evidence, and how long it now waits.
+
+        Args:
+            pair: Which tried.
+            step: When.
+            success: Whether it merges.
+            straightened: Whether its logs were smoothed, because its candidates did fit: they need no new ones then to
+                try again. But smoothing may cost in proportion to all that was read, so that a refused pair waits until
+                an eighth of that is new: however long it goes on, it costs a multiple of it.
+        """
         if success:
             gone = set(pair[0]) | set(pair[1])
             self._records = {key: value for key, value in self._records.items() if not gone & set(key[0] + key[1])}
             return
         record = self._records.setdefault(pair, _Record(self._options.every))
-        record.tried = self._proposed.get(pair, set())
+        record.tried = set() if straightened else self._proposed.get(pair, set())
         record.last_step = step
-        record.next_step = step + record.wait
+        record.next_step = step + max(record.wait, math.ceil(GROWN * step) if straightened else 0)
         record.wait = min(2 * record.wait, self._options.longest_wait)
 
     def bar(self, pair: PairKey, until: int) -> None:
@@ -109,7 +138,7 @@ class AttemptSchedule:
 
     def get_state(self) -> dict[str, Any]:
         """Return the options and a copy of the memory."""
-        memory = {"records": copy.deepcopy(self._records), "bars": tuple(self._bars)}
+        memory = {"records": copy.deepcopy(self._records), "bars": tuple(self._bars), "doubts": dict(self._doubts)}
         return {"options": self._options, "alignment": self._alignment} | memory
 
     def set_state(self, state: Mapping[str, Any]) -> None:
@@ -117,6 +146,7 @@ class AttemptSchedule:
         self._options, self._alignment = state["options"], state["alignment"]
         self._records = copy.deepcopy(state["records"])
         self._bars = list(state["bars"])
+        self._doubts = dict(state["doubts"])
 
 
 def _touches(pair: PairKey, barred: PairKey) -> bool:

@@ -1,14 +1,19 @@
 """Two groups become one, a merge is doubted, and taken back."""
 
+import math
+from copy import deepcopy
+
 import numpy as np
 
-from slam_backend.alignment import Alignment, AlignmentOptions
+from slam_backend.alignment import RIVAL_ANGLE, RIVAL_DISTANCE, Alignment, AlignmentOptions
 from slam_backend.branches import Branch, fork
+from slam_backend.errors import IntArray
+from slam_backend.filter import FastSlam
 from slam_backend.fusion import check_inliers
 from slam_backend.groups import Group
 from slam_backend.landmark_map import LandmarkMap
 from slam_backend.merge_options import MergeOptions
-from slam_backend.merging import merge_filters
+from slam_backend.merging import merge_filters, motion_covariance
 from slam_backend.mixture_merging import merge_mixtures
 from slam_backend.records import Records
 from slam_backend.reports import MergeUndone, Renaming
@@ -27,6 +32,33 @@ def straightened(group_a: Group, group_b: Group) -> tuple[LandmarkMap, LandmarkM
     filters = group_a.trunk.filter, group_b.trunk.filter
     reports = [slam.rejuvenate() for slam in filters]
     return None if all(report.reason for report in reports) else (filters[0].map("mixture"), filters[1].map("mixture"))
+
+
+def doubt_about(group_a: Group, group_b: Group, alignment: Alignment, rng: np.random.Generator) -> float:
+    """Return how uncertain the motion between two maps is, as the particles of a merge would have it.
+
+    Landmarks of one map err together where its paths are uncertain. Their covariances, and the alignment's, do not say
+    so; that particles differ in the motion does.
+
+    Args:
+        group_a, group_b, alignment: As of `merge_groups`.
+        rng: As the merge would get it, here only looked at: the particles are the very ones.
+
+    Returns:
+        The standard deviation of the motion in its least certain direction over 0.5 m, or in heading over 5 degrees,
+        whichever is more [-].
+    """
+    a, b = group_a.trunk.filter, group_b.trunk.filter
+    covariance = motion_covariance(a, b, alignment, _named(alignment, a, b), deepcopy(rng))
+    position, heading = math.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1]), math.sqrt(covariance[2, 2])
+    return max(position / RIVAL_DISTANCE, heading / RIVAL_ANGLE)
+
+
+def _named(alignment: Alignment, a: FastSlam, b: FastSlam) -> IntArray:
+    """Return the inliers (k, 2), which are rows of the filters' maps, as landmark ids."""
+    ids_a, ids_b = a.map().ids, b.map().ids
+    check_inliers(alignment.inliers, len(ids_a), len(ids_b))
+    return np.column_stack([ids_a[alignment.inliers[:, 0]], ids_b[alignment.inliers[:, 1]]])
 
 
 def merge_groups(
@@ -53,9 +85,7 @@ def merge_groups(
         ValueError: If the inliers name rows that do not exist or the same one twice; nothing has changed then.
     """
     a, b = group_a.trunk, group_b.trunk
-    ids_a, ids_b = a.filter.map().ids, b.filter.map().ids
-    check_inliers(alignment.inliers, len(ids_a), len(ids_b))
-    pairs = np.column_stack([ids_a[alignment.inliers[:, 0]], ids_b[alignment.inliers[:, 1]]])
+    pairs = _named(alignment, a.filter, b.filter)
     combine = merge_filters if merging.method == "particles" else merge_mixtures
     joint, renamed = combine(a.filter, b.filter, alignment, pairs, rng, merging.merged_particles)
     robots, live = a.robots + b.robots, a.live + b.live

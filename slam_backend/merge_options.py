@@ -20,6 +20,8 @@ class MergeOptions:
         straighten: Before a merge both sides' particles are drawn anew from the posterior of whole paths
             (`FastSlam.rejuvenate`), and their maps have to align once more. False: maps are taken as the filters bent
             them.
+        sure: An attempt is refused, as long as waiting helps, while so many standard deviations of the motion among the
+            particles that the merge would make reach 0.5 m or 5 degrees; 0: never for that.
         watch_steps: A merge is watched for so many steps in which robots of both sides are in contact, and can be
             undone so long; then its snapshot is freed. 0: merges are final.
         watch_every: In so many steps the evidence is weighed once.
@@ -31,6 +33,7 @@ class MergeOptions:
     method: Literal["particles", "mixture"] = "particles"
     merged_particles: int | None = None
     straighten: bool = True
+    sure: float = 5.0
     watch_steps: int = 200
     watch_every: int = 20
     barred_steps: int = 200
@@ -42,6 +45,7 @@ class MergeOptions:
             check_int("merging.merged_particles", self.merged_particles, 1, "Use None for the larger of the two.")
         if not isinstance(self.straighten, bool):
             raise bad_argument("merging.straighten", "True or False", self.straighten, "Give a bool.")
+        check_float("merging.sure", self.sure, "Use 5, or 0 to merge however uncertain it is.", at_least=0.0)
         check_int("merging.watch_steps", self.watch_steps, 0, "Use 0 to make merges final.")
         check_int("merging.watch_every", self.watch_every, 1, "Weigh the evidence at every step or less often.")
         check_int("merging.barred_steps", self.barred_steps, 0, "Use 0 to let them try at once.")

@@ -32,7 +32,7 @@ from slam_backend.errors import BoolArray, FloatArray, IntArray
 from slam_backend.existence import ExistenceModel
 from slam_backend.filter import FastSlam
 from slam_backend.fusion import fuse_descriptors, fuse_landmarks
-from slam_backend.geometry import compose, inverse, rotation
+from slam_backend.geometry import compose, inverse, rotation, wrap_angle
 from slam_backend.resampling import systematic
 
 MIN_PAIRS = 3  # fewer shared landmarks in a particle do not fix a motion better than the consensus does
@@ -78,23 +78,9 @@ def merge_filters(
         landmarks.
     """
     count = max(a.num_particles, b.num_particles) if num_particles is None else num_particles
-    dense_a, dense_b = _Dense.of(a), _Dense.of(b)
-    shared_a, shared_b = np.searchsorted(dense_a.ids, pairs[:, 0]), np.searchsorted(dense_b.ids, pairs[:, 1])
-    from_a = systematic(a.weights, rng, CANDIDATES * count)
-    from_b = rng.permutation(systematic(b.weights, rng, CANDIDATES * count))
-    common = (
-        dense_a.values[shared_a], dense_a.counts[shared_a] > 0, dense_b.values[shared_b], dense_b.counts[shared_b] > 0
-    )  # fmt: skip
-    extra = _unexplained(*common, from_a[::CANDIDATES], from_b[::CANDIDATES], alignment.transform)
-    aligned = _align_pairs(*common, from_a, from_b, alignment.transform, extra)
-    motions, informations, chi2, log_dets, shared = aligned
-    scale = _contradiction(chi2, shared) if extra == MOST_EXTRA else 1.0
-    evidence, factors = _weigh(motions, informations, chi2, log_dets, shared, scale, alignment)
-    weights = np.exp(evidence - evidence.max())
-    chosen = systematic(weights / weights.sum(), rng, count)
-    from_a, from_b, evidence = from_a[chosen], from_b[chosen], evidence[chosen]
-    draws = rng.standard_normal((count, 3))
-    motion = motions[chosen] + np.einsum("mij,mj->mi", factors[chosen], draws)
+    side_a, side_b = _side(a, pairs[:, 0]), _side(b, pairs[:, 1])
+    from_a, from_b, motion, evidence, extra, scale = _pair_up(side_a, side_b, alignment, count, rng)
+    (_, dense_a, shared_a), (_, dense_b, shared_b) = side_a, side_b
 
     joint = joined_robots(a, from_a, b, from_b, motion, rng)
     joint._path_log_weights[:] = a._path_log_weights[from_a] + b._path_log_weights[from_b] + evidence
@@ -133,6 +119,69 @@ def merge_filters(
     renamed = np.concatenate([pairs[:, ::-1], np.column_stack([dense_b.ids[own], new_ids])]).astype(np.int64)
     finish(joint, a, b, renamed)
     return joint, renamed
+
+
+class _Pairing(NamedTuple):
+    """Which particles of a and of b become joint ones (M,), their motions (M, 3), and their log-evidences (M,).
+
+    Before it moves, each landmark that is shared takes half of `extra` [m^2], then all are scaled by `scale`.
+    """
+
+    from_a: IntArray
+    from_b: IntArray
+    motion: FloatArray
+    evidence: FloatArray
+    extra: float
+    scale: float
+
+
+def _side(slam: FastSlam, shared: IntArray) -> "tuple[FloatArray, _Dense, IntArray]":
+    """Return a filter's weights (M,), its landmarks, and the rows (k,) of those with these ids."""
+    dense = _Dense.of(slam)
+    return slam.weights, dense, np.searchsorted(dense.ids, shared)
+
+
+def _pair_up(
+    side_a: "tuple[FloatArray, _Dense, IntArray]", side_b: "tuple[FloatArray, _Dense, IntArray]",
+    alignment: Alignment, count: int, rng: np.random.Generator,
+) -> _Pairing:  # fmt: skip
+    """Draw pairs of particles and their motions; a side is its weights, its landmarks, and the rows shared."""
+    (weights_a, dense_a, shared_a), (weights_b, dense_b, shared_b) = side_a, side_b
+    from_a = systematic(weights_a, rng, CANDIDATES * count)
+    from_b = rng.permutation(systematic(weights_b, rng, CANDIDATES * count))
+    common = (
+        dense_a.values[shared_a], dense_a.counts[shared_a] > 0, dense_b.values[shared_b], dense_b.counts[shared_b] > 0
+    )  # fmt: skip
+    extra = _unexplained(*common, from_a[::CANDIDATES], from_b[::CANDIDATES], alignment.transform)
+    aligned = _align_pairs(*common, from_a, from_b, alignment.transform, extra)
+    motions, informations, chi2, log_dets, shared = aligned
+    scale = _contradiction(chi2, shared) if extra == MOST_EXTRA else 1.0
+    evidence, factors = _weigh(motions, informations, chi2, log_dets, shared, scale, alignment)
+    weights = np.exp(evidence - evidence.max())
+    chosen = systematic(weights / weights.sum(), rng, count)
+    draws = rng.standard_normal((count, 3))
+    motion = motions[chosen] + np.einsum("mij,mj->mi", factors[chosen], draws)
+    return _Pairing(from_a[chosen], from_b[chosen], motion, evidence[chosen], extra, scale)
+
+
+def motion_covariance(
+    a: FastSlam, b: FastSlam, alignment: Alignment, pairs: IntArray, rng: np.random.Generator
+) -> FloatArray:
+    """Return how the motions between the maps differ among the particles that `merge_filters` would make.
+
+    Where paths are uncertain this is more than the alignment of the two maps claims: landmarks of one map err together.
+
+    Args:
+        a, b, alignment, pairs: As of `merge_filters`.
+        rng: For the pairing and the draws.
+
+    Returns:
+        (3, 3) covariance of (tx, ty, theta) [m, m, rad].
+    """
+    side_a, side_b = _side(a, pairs[:, 0]), _side(b, pairs[:, 1])
+    motion = _pair_up(side_a, side_b, alignment, max(a.num_particles, b.num_particles), rng).motion
+    turns = wrap_angle(motion[:, 2] - alignment.theta)
+    return np.asarray(np.cov(np.column_stack([motion[:, :2], turns]).T, bias=True))
 
 
 def joined_robots(

@@ -24,7 +24,7 @@ from slam_backend.contacts import check_contacts, reach
 from slam_backend.errors import IntArray, bad_argument, check_int, check_seed
 from slam_backend.filter import FastSlam
 from slam_backend.filter_options import FilterOptions
-from slam_backend.group_changes import contradicted, merge_groups, straightened, undone
+from slam_backend.group_changes import contradicted, doubt_about, merge_groups, straightened, undone
 from slam_backend.groups import Group
 from slam_backend.input_log import RobotInput
 from slam_backend.landmark_map import LandmarkMap
@@ -280,8 +280,12 @@ class TeamSlam(TeamKnowledge):
                 alignment = Alignment.refused("too few inliers", alignment.ratio)
                 for group, state in zip((a, b), before, strict=True):  # the smoother has lost its way
                     group.trunk.filter.set_state(state)
+        if alignment.success and self._merging.sure:
+            doubt = self._merging.sure * doubt_about(a, b, alignment, self._rng)
+            if self._schedule.should_wait(chosen, doubt):
+                alignment = Alignment.refused("too uncertain", alignment.ratio)
         self._events.append(MergeEvent(self._step, "attempt", a.robots, b.robots, alignment, bent))
-        self._schedule.record(chosen, self._step, alignment.success)
+        self._schedule.record(chosen, self._step, alignment.success, straightened=straight is not None)
         return (self.merge(*speakers, alignment),) if alignment.success else ()
 
     def _dropped(self) -> list[MapDropped]:

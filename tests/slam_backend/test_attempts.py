@@ -47,6 +47,47 @@ def test_a_refused_pair_waits_twice_as_long_each_time() -> None:
     assert waits == [25, 50, 100, 200, 200, 200]
 
 
+def test_a_pair_whose_logs_were_smoothed_waits_until_an_eighth_is_new() -> None:
+    """Refused 800 steps on it tries again after 100, with the same candidates; early on it waits as any other does."""
+    same = {FIRST: pair_of([0, 1, 2, 3, 4])}
+    for step, wait in ((799, 100), (24, 25)):
+        plan = schedule()
+        assert plan.choose(same, step) == FIRST
+        plan.record(FIRST, step, success=False, straightened=True)
+        assert not plan.may_try(FIRST, step + wait - 1)
+        assert plan.may_try(FIRST, step + wait)
+        assert plan.choose(same, step + wait) == FIRST
+
+
+def test_smoothing_for_a_pair_that_is_always_refused_costs_a_multiple_of_the_log() -> None:
+    """Where an attempt costs as much as all that was read, all of them cost less than ten times it, however long."""
+    for end in (2_000, 20_000):
+        plan, total = schedule(every=1), 0
+        for step in range(end):
+            if plan.may_try(FIRST, step):
+                plan.record(FIRST, step, success=False, straightened=True)
+                total += step
+        assert total < 10 * end
+
+
+def test_a_doubtful_pair_waits_as_long_as_that_helps() -> None:
+    """It waits where it is not sure enough, the first time and while the doubt falls by three tenths each time."""
+    plan = schedule()
+    assert [plan.should_wait(FIRST, doubt) for doubt in (4.0, 2.7, 1.8, 1.3)] == [True, True, True, False]
+    assert [plan.should_wait(SECOND, doubt) for doubt in (4.0, 0.9, 4.0)] == [True, False, False]
+
+
+def test_what_a_pair_has_waited_counts_in_larger_groups() -> None:
+    """Robots that waited for each other do not begin anew in other company, others do; a snapshot knows it, too."""
+    plan = schedule()
+    assert plan.should_wait(((0,), (2,)), 4.0)
+    other = schedule()
+    other.set_state(plan.get_state())
+    for known in (plan, other):
+        assert not known.should_wait(((0, 1), (2, 3)), 4.0)
+        assert known.should_wait(((0,), (4,)), 4.0)
+
+
 def test_a_barred_pair_does_not_try_in_larger_groups_either() -> None:
     """Robots of the one side do not try with robots of the other until the bar ends; others do, and each side may."""
     plan = schedule()

@@ -17,6 +17,7 @@ from slam_backend.geometry import between
 from slam_backend.groups import Group
 from slam_backend.landmark_map import LandmarkMap
 from slam_backend.merge_options import MergeOptions
+from slam_backend.merging import merge_filters, motion_covariance
 from slam_backend.team import TeamSlam
 
 STEPS = 80
@@ -161,3 +162,43 @@ def test_whether_to_straighten_is_a_bool() -> None:
     """A number is refused."""
     with pytest.raises(ValueError, match=r"merging\.straighten: expected True or False, got 1\. Give a bool"):
         MergeOptions(straighten=1)  # type: ignore[arg-type]
+
+
+def test_the_spread_of_motions_is_that_of_the_particles_that_a_merge_makes() -> None:
+    """It is the scatter of where the joint filter's particles let the other robot start, told before the merge."""
+    _, team = driven(112, NEVER)
+    a, b = (team._find(robot)[0].filter for robot in range(2))
+    alignment = align_maps(*both_maps(team), rng=np.random.default_rng(1))
+    pairs = np.column_stack([a.map().ids[alignment.inliers[:, 0]], b.map().ids[alignment.inliers[:, 1]]])
+    foretold = motion_covariance(a, b, alignment, pairs, np.random.default_rng(2))
+    joint, _ = merge_filters(a, b, alignment, pairs, np.random.default_rng(2))
+    starts = joint._starts[1, :, : joint.num_particles].T
+    np.testing.assert_allclose(foretold, np.cov(starts.T, bias=True), atol=1e-12)
+
+
+def test_a_pair_too_uncertain_to_merge_waits_and_merges_later() -> None:
+    """Where particles differ in the motion by more than is sure the attempt is refused, until waiting helps no more."""
+    rhythm = AttemptOptions(every=20)
+    _, team = driven(112, rhythm, merging=MergeOptions(sure=0.0))
+    assert [event.kind for event in team.events] == ["attempt", "merge"]
+    simulation, team = driven(112, rhythm, merging=MergeOptions(sure=1e4))  # 0.05 mm
+    assert {event.alignment.reason for event in team.events} == {"too uncertain"}
+    simulation.run(team, STEPS)
+    *attempts, merge = team.events
+    reasons = [event.alignment.reason for event in attempts]
+    assert reasons.count("too uncertain") == len(reasons) - 1 >= 1
+    assert reasons[-1] == ""
+    assert merge.kind == "merge"
+    assert len(team.groups) == 1
+
+
+def test_being_sure_leaves_no_trace() -> None:
+    """Whether particles agree is only looked at: the merge is bit for bit that of a team which does not ask."""
+    states = [driven(112, AT_LAST, merging=MergeOptions(sure=sure))[1].get_state() for sure in (0.0, 1e-6)]
+    assert_same(*({"filter": state["groups"], "rng": state["rng"]} for state in states))
+
+
+def test_how_sure_a_merge_has_to_be_is_a_number_of_deviations() -> None:
+    """Fewer than none are refused."""
+    with pytest.raises(ValueError, match=r"merging\.sure: expected a finite number >= 0, got -1\.0\. Use 5, or 0"):
+        MergeOptions(sure=-1.0)
