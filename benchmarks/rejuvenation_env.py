@@ -1,7 +1,7 @@
 """What rejuvenation does for an environment, and what its steps cost: episodes of `vslam run` with it and without.
 
     python benchmarks/rejuvenation_env.py --first-seed 100 --seeds 10
-    python benchmarks/rejuvenation_env.py --every 100 --keys 120 --slice-keys 60
+    python benchmarks/rejuvenation_env.py --every 100 --keys 120 --slice-steps 60
 
 Each seed is played without and with, one after the other in this process; times are this thread's processor times of
 `env.step`, [ms]. Without options the filters of the environment's default are taken.
@@ -58,12 +58,12 @@ def main(
     robots: Annotated[int, typer.Option(help="How many.")] = 3,
     every: Annotated[int | None, typer.Option(help="Ticks between rejuvenations.")] = None,
     keys: Annotated[int | None, typer.Option(help="Most key poses.")] = None,
-    slice_keys: Annotated[int | None, typer.Option(help="New keys of a slice.")] = None,
+    slice_steps: Annotated[int | None, typer.Option(help="New steps of a slice.")] = None,
 ) -> None:
     """Play, and print figures by seed and their means and medians."""
     check_int("seeds", seeds, 1, "Play at least one.")
     warm_up()
-    smoothing = {name: value for name, value in (("max_keys", keys), ("slice_keys", slice_keys)) if value is not None}
+    smoothing = {name: value for name, value in (("max_keys", keys), ("slice_steps", slice_steps)) if value is not None}
     with_it = ({} if every is None else {"rejuvenate_every": every}) | ({"smoothing": smoothing} if smoothing else {})
     console = Console(highlight=False, soft_wrap=True)
     found: dict[str, list[dict[str, float]]] = {"never": [], "rejuvenated": []}

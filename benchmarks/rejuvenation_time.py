@@ -69,11 +69,11 @@ def long_run(
     every: Annotated[int, typer.Option(help="Steps between rejuvenations.")] = 50,
     effort: Annotated[float, typer.Option(help="See SmoothingOptions.")] = SmoothingOptions().effort,
     keys: Annotated[int, typer.Option(help="Most key poses.")] = SmoothingOptions().max_keys,
-    slice_keys: Annotated[int | None, typer.Option(help="New keys taken in at once; left away: all.")] = None,
+    slice_steps: Annotated[int | None, typer.Option(help="New steps taken in at once; left away: all.")] = None,
     seed: Annotated[int, typer.Option(help="Of the run and of the filters.")] = 100,
 ) -> None:
     """Time a run with rejuvenation and without, interleaved, and say how far off poses and maps are."""
-    smoothing = SmoothingOptions(effort=effort, max_keys=keys, slice_keys=slice_keys)
+    smoothing = SmoothingOptions(effort=effort, max_keys=keys, slice_steps=slice_steps)
     warm_up()
     run = simulate_run(RunSpec(length=STEP * steps, landmarks=landmarks), seed)
     filters = [

@@ -112,7 +112,7 @@ class RejuvenationStep:
             rng: Source of the draws.
         """
         due, options = self.due, self._options
-        whole = options.smoothing.slice_keys is None
+        whole = options.smoothing.slice_steps is None
         if not due and (whole or self._held or self._exact):
             return None
         graph = PathGraph.at_uncertain_starts(starts) if self._graph is None else self._graph
@@ -125,7 +125,7 @@ class RejuvenationStep:
         self._graph, self._held = graph, False
         if (draft := self._draft) is not None:
             return self._after(draft.graph, smoother.descend(draft), _since(logs, graph, draft.graph), smoother)
-        share = max(LEAST_ROWS, (options.smoothing.slice_keys or 0) // len(logs))
+        share = max(LEAST_ROWS, (options.smoothing.slice_steps or 0) // len(logs))
         waiting = max(log.num_since(int(step) + 1) for log, step in zip(logs, graph.latest, strict=True))
         if waiting > 2 * share or not due:
             if waiting < share:
@@ -165,12 +165,12 @@ class RejuvenationStep:
             for step, where in zip((a, b), starts[:2], strict=True)
         )
         robots, options = len(starts[2]), self._options.smoothing
-        if options.slice_keys is not None and own.num_keys + other.num_keys > options.most_keys(robots):
+        if options.slice_steps is not None and own.num_keys + other.num_keys > options.most_keys(robots):
             own, other = (_thinned(graph, robots, camera, options) for graph in (own, other))
         robot = int(np.flatnonzero(other.previous[other.heads] < 0)[0])  # one that defines b's frame
         motion = compose(mean_pose(starts[2][len(starts[0]) + robot]), inverse(other.poses[other.heads[robot]]))
         self._graph = joined(own, other, motion, renamed)
-        self._draft = None if options.slice_keys is None else Draft(graph=self._graph)
+        self._draft = None if options.slice_steps is None else Draft(graph=self._graph)
         moved = [{step: compose(motion, guess) for step, guess in guesses.items()} for guesses in b._guesses]
         self._guesses = [dict(guesses) for guesses in a._guesses] + moved
         self._read, self._exact = a._read + b._read, a._exact or b._exact

@@ -8,8 +8,9 @@ import numpy as np
 
 from slam_backend.errors import BoolArray, FloatArray, IntArray, bad_argument
 from slam_backend.geometry import compose, rotation
-from slam_backend.log_arrays import EXACT, ODOMETRY, REJECTED, LogArrays
+from slam_backend.log_arrays import EXACT, REJECTED, LogArrays
 from slam_backend.motion import OdometryModel
+from slam_backend.smoothing._walking import walk
 from slam_backend.smoothing.graph import LEVER, PathGraph
 
 
@@ -19,7 +20,9 @@ class _Part(NamedTuple):
     poses: FloatArray
     motions: FloatArray
     noises: FloatArray
+    slack: FloatArray  # first of the old tip, then of the new keys
     frame_keys: IntArray
+    offsets: FloatArray
     rows: IntArray  # of the log's measurements that are taken
     frames: IntArray  # of these
 
@@ -30,11 +33,13 @@ def extended(
     motion: OdometryModel,
     mount: FloatArray,
     guesses: Sequence[Mapping[int, FloatArray]] | None = None,
+    rigid_within: float = 0.0,
 ) -> PathGraph:
     """Return the graph with what the robots did since.
 
-    Each step that measured something, and each robot's last, becomes a key. Odometry over steps without measurements is
-    chained, and its noise to first order: those poses are eliminated, not approximated.
+    Each step that measured something, and each robot's last, becomes a key, unless it is near enough to the key before
+    to stand rigidly to it. Odometry over steps without measurements is chained, and its noise to first order: those
+    poses are eliminated, not approximated.
 
     Args:
         graph: As it stood.
@@ -42,11 +47,14 @@ def extended(
         motion: Noise of the odometry.
         mount: (3,) [m] of the camera on the robot.
         guesses: Per robot where it may be after some of these steps (3,), map frame; else odometry says.
+        rigid_within: [m]. See `SmoothingOptions`.
 
     Raises:
         ValueError: If a log holds a pose that was given as exact: there is nothing to smooth.
     """
-    parts = [_part(graph, i, log, motion, {} if guesses is None else guesses[i]) for i, log in enumerate(logs)]
+    parts = [
+        _part(graph, i, log, motion, rigid_within, {} if guesses is None else guesses[i]) for i, log in enumerate(logs)
+    ]
     keys = np.cumsum([graph.num_keys, *(len(part.poses) for part in parts)])
     frames = np.cumsum([len(graph.frame_keys), *(len(part.frame_keys) for part in parts)])
     previous, frame_keys, tips = [graph.previous], [graph.frame_keys], graph.tips.copy()
@@ -60,7 +68,10 @@ def extended(
     frame_keys_now = np.concatenate(frame_keys)
     points = np.concatenate([log.points[part.rows] for log, part in zip(logs, parts, strict=True)])
     ids = graph.known_as(np.concatenate([log.ids[part.rows] for log, part in zip(logs, parts, strict=True)]))
-    at = poses[frame_keys_now[new_frames]]  # a new frame is a key itself
+    offsets = np.concatenate([graph.frame_offsets, *(part.offsets for part in parts)])
+    at = compose(poses[frame_keys_now[new_frames]], offsets[new_frames])
+    slack = np.concatenate([graph.slack, *(part.slack[1:] for part in parts)])
+    slack[graph.tips] = np.maximum(slack[graph.tips], [part.slack[0] for part in parts])
     first_seen = np.column_stack([points[:, :2] + mount[:2], points[:, 2] + mount[2]])
     first_seen[:, :2] = at[:, :2] + np.einsum("nij,nj->ni", rotation(at[:, 2]), first_seen[:, :2])
     landmark_ids, landmarks, rows = _with_new(graph, ids, first_seen)
@@ -72,9 +83,9 @@ def extended(
         motions=np.concatenate([graph.motions, *(part.motions for part in parts)]),
         noises=np.concatenate([graph.noises, *(part.noises for part in parts)]),
         spreads=np.concatenate([graph.spreads, *(scatter(part.noises) for part in parts)]),
-        slack=np.concatenate([graph.slack, *(np.zeros(len(part.poses)) for part in parts)]),
+        slack=slack,
         frame_keys=frame_keys_now,
-        frame_offsets=np.concatenate([graph.frame_offsets, np.zeros((len(frame_keys_now) - len(graph.frame_keys), 3))]),
+        frame_offsets=offsets,
         points=np.concatenate([graph.points, points]),
         point_noises=np.concatenate([graph.point_noises, *map(_noises, logs, parts)]),
         given=np.concatenate([graph.given, *map(_given, logs, parts)]),
@@ -116,41 +127,40 @@ def _with_new(graph: PathGraph, ids: IntArray, seen: FloatArray) -> tuple[IntArr
 
 
 def _part(
-    graph: PathGraph, robot: int, log: LogArrays, motion: OdometryModel, guesses: Mapping[int, FloatArray]
+    graph: PathGraph,
+    robot: int,
+    log: LogArrays,
+    motion: OdometryModel,
+    rigid_within: float,
+    guesses: Mapping[int, FloatArray],
 ) -> _Part:
     """Walk through a robot's new steps."""
-    tip = graph.tips[robot]
-    pose = graph.poses[tip]
-    poses, motions, noises = [], [], []
-    frame_keys: list[int] = []
-    rows: list[IntArray] = []
-    frames: list[IntArray] = []
-    chain, noise, moved = np.zeros(3), np.zeros((3, 3)), False
-    for t in range(len(log)):
-        if log.kinds[t] == EXACT:
-            raise bad_argument("logs", "odometry", "a pose that was given as exact", "There is nothing to smooth.")
-        if log.kinds[t] == ODOMETRY:
-            step, step_noise = log.motions[t], np.diag(motion.sigmas(log.motions[t]) ** 2)
-            chain, noise = chained(chain, noise, step, step_noise) if moved else (step, step_noise)
-            pose = compose(pose, step)
-            moved = True
-        pose = guesses.get(int(log.steps[t]), pose)
-        taken = log.starts[t] + np.flatnonzero(log.ids[log.starts[t] : log.starts[t + 1]] != REJECTED)
-        if moved and (len(taken) or t == len(log) - 1):
-            poses.append(pose)
-            motions.append(chain)
-            noises.append(noise)
-            chain, noise, moved = np.zeros(3), np.zeros((3, 3)), False
-        if len(taken):
-            rows.append(taken)
-            frames.append(np.full(len(taken), len(frame_keys)))
-            frame_keys.append(len(poses) - 1)  # NONE: it has not moved from the old tip
-    return _Part(
-        np.array(poses).reshape(-1, 3), np.array(motions).reshape(-1, 3), np.array(noises).reshape(-1, 3, 3),
-        np.array(frame_keys, dtype=np.int64),
-        np.concatenate(rows) if rows else np.zeros(0, dtype=np.int64),
-        np.concatenate(frames) if frames else np.zeros(0, dtype=np.int64),
+    if (log.kinds == EXACT).any():
+        raise bad_argument("logs", "odometry", "a pose that was given as exact", "There is nothing to smooth.")
+    n = len(log)
+    known = np.concatenate([[0], np.cumsum(log.ids != REJECTED)])[log.starts]
+    where = [guesses.get(step) for step in log.steps.tolist()] if guesses else [None] * n
+    guessed = np.array([pose is not None for pose in where], dtype=np.bool_)
+    supposed = np.zeros((n, 3))
+    if guessed.any():
+        supposed[guessed] = [pose for pose in where if pose is not None]
+    counts = np.diff(known)
+    poses, motions, offsets = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3))
+    noises, slack, frame_keys = np.empty((n, 3, 3)), np.empty(n + 1), np.empty(n, dtype=np.int64)
+    keys, frames = walk(
+        log.kinds, log.motions, motion.variances(log.motions), counts, guessed, supposed,
+        graph.poses[graph.tips[robot]], rigid_within, LEVER, poses, motions, noises, slack, frame_keys, offsets,
     )  # fmt: skip
+    return _Part(
+        poses=poses[:keys],
+        motions=motions[:keys],
+        noises=noises[:keys],
+        slack=slack[: keys + 1],
+        frame_keys=frame_keys[:frames],
+        offsets=offsets[:frames],
+        rows=np.flatnonzero(log.ids != REJECTED),
+        frames=np.repeat(np.arange(frames), counts[counts > 0]),
+    )
 
 
 def chained(

@@ -28,9 +28,12 @@ class SmoothingOptions:
         least_ess: Share of M that the effective sample size of the importance weights must reach.
         more_draws: Where M paths do not reach it, but so many times M may, so many are drawn and M of them chosen by
             their weights; 1: never.
-        slice_keys: So many new keys, of all robots together but at least eight of each, are taken in as soon as they
-            wait, and no step does more than one slice of the work, see `slices`; None: all of it is done in the step in
-            which it is due.
+        slice_steps: So many new steps, of all robots together but at least eight of each, are taken in as soon as they
+            wait, and no step of the filter does more than one slice of the work, see `slices`; None: all of it is done
+            in the step in which it is due.
+        rigid_within: [m]. A new step stands rigidly to the key before, as odometry says, while that scatters less over
+            the steps between than this (the root of the mean square of position and of heading at 3 m); 0: each step
+            that measured something is a key.
         max_iterations: Of Gauss and Newton.
         tolerance: The descent ends when the cost is expected to fall by less than this (half a squared distance).
     """
@@ -45,7 +48,8 @@ class SmoothingOptions:
     free_sightings: int = 3000
     least_ess: float = 0.3
     more_draws: int = 8
-    slice_keys: int | None = None
+    slice_steps: int | None = None
+    rigid_within: float = 0.0
     max_iterations: int = 15
     tolerance: float = 0.1
 
@@ -54,8 +58,9 @@ class SmoothingOptions:
         check_int("further_keys", self.further_keys, 0, "Use 0 to let all robots share those of one.")
         check_int("fresh_keys", self.fresh_keys, 1, "The newest pose is always fresh.")
         check_int("more_draws", self.more_draws, 1, "Use 1 to draw no more than M.")
-        if self.slice_keys is not None:
-            check_int("slice_keys", self.slice_keys, 1, "Use 30, or None for all at once.")
+        if self.slice_steps is not None:
+            check_int("slice_steps", self.slice_steps, 1, "Use 90, or None for all at once.")
+        check_float("rigid_within", self.rigid_within, "Use 0.01, or 0 for a key at each step.", at_least=0.0)
         check_int("max_iterations", self.max_iterations, 1, "Ten are enough as a rule.")
         check_float("effort", self.effort, "Use 1.5; more is dearer.", above=0.0)
         check_int("free_sightings", self.free_sightings, 0, "Use 0 to count them all.")

@@ -123,7 +123,8 @@ def rejuvenate(
     rest = list(logs)
     while True:
         last = all(len(log) <= share for log in rest)
-        grown = extended(graph, [first_rows(log, share) for log in rest], motion, camera[4:], guesses)
+        first = [first_rows(log, share) for log in rest]
+        grown = extended(graph, first, motion, camera[4:], guesses, options.rigid_within)
         mode = find_mode(grown, camera, options if last else near)
         if mode.reason:
             return Rejuvenation(graph, mode.reason, float("nan"), mode.iterations, None)

@@ -1,6 +1,6 @@
 """The work of a smoother in slices, each of them bounded, so that no step of a filter waits for more than one.
 
-A slice either takes in a few new keys and does one step of Gauss and Newton; or does one more such step, until the
+A slice either takes in a few new steps and does one step of Gauss and Newton; or does one more such step, until the
 descent has ended, and then joins surplus keys; or, when all is at its mode, takes in the very last keys, ends the
 descent and draws. Between slices there is nothing but a graph, and how damped its next step is.
 """
@@ -18,9 +18,10 @@ from slam_backend.smoothing.coarsening import at_mode
 from slam_backend.smoothing.extending import extended
 from slam_backend.smoothing.graph import PathGraph
 from slam_backend.smoothing.options import SmoothingOptions
-from slam_backend.smoothing.rejuvenation import NEAR, Looks, Rejuvenation, drawn, settled
+from slam_backend.smoothing.rejuvenation import Looks, Rejuvenation, drawn, settled
 from slam_backend.smoothing.solving import Mode, find_mode
 
+NEAR = 100.0  # times the tolerance: slices that do not draw need not end a descent that the next one goes on with
 LAST_STEPS = 3  # of Gauss and Newton in the slice that draws: the graph was at its mode but for the last few keys
 
 
@@ -69,7 +70,7 @@ class Smoother:
         Returns:
             As of `descend`.
         """
-        grown = extended(graph, logs, self.motion, self.camera[4:], guesses)
+        grown = extended(graph, logs, self.motion, self.camera[4:], guesses, self.options.rigid_within)
         return self.descend(Draft(graph=grown))
 
     @on_one_thread
@@ -105,7 +106,7 @@ class Smoother:
         Returns:
             What came of the draws, or else as of `descend`.
         """
-        grown = extended(graph, logs, self.motion, self.camera[4:], guesses)
+        grown = extended(graph, logs, self.motion, self.camera[4:], guesses, self.options.rigid_within)
         draft = Draft(graph=grown)
         mode = find_mode(grown, self.camera, self.options, LAST_STEPS)
         if not mode.reason:
@@ -116,7 +117,7 @@ class Smoother:
     def without_measurements(self, graph: PathGraph, logs: Sequence[LogArrays]) -> PathGraph:
         """Return the graph after all rows of the logs, of which only the odometry is believed."""
         blind = [replace(log, ids=np.full_like(log.ids, REJECTED)) for log in logs]
-        return extended(graph, blind, self.motion, self.camera[4:])
+        return extended(graph, blind, self.motion, self.camera[4:], rigid_within=self.options.rigid_within)
 
     def _after(self, draft: Draft, mode: Mode) -> PathGraph | Draft | str:
         """Return what a step came to, as of `descend`."""

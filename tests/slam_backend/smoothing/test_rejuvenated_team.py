@@ -18,19 +18,19 @@ from slam_backend.smoothing.solving import find_mode
 from slam_backend.team import TeamSlam
 
 
-def build(simulation, every=20, slice_keys=None):
+def build(simulation, every=20, slice_steps=None):
     """Return a team that merges early."""
     return simulation.build(
         alignment=AlignmentOptions(min_inliers=9), attempts=AttemptOptions(every=20, new_candidates=2),
-        rejuvenate_every=every, smoothing=SmoothingOptions(slice_keys=slice_keys),
+        rejuvenate_every=every, smoothing=SmoothingOptions(slice_steps=slice_steps),
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("slice_keys", [None, 24])
-def test_a_merged_team_is_rejuvenated_and_knows_where_it_started(slice_keys):
+@pytest.mark.parametrize("slice_steps", [None, 24])
+def test_a_merged_team_is_rejuvenated_and_knows_where_it_started(slice_steps):
     """Soon after a merge the joint filter is smoothed, at once or in slices; the other starts are then known."""
     simulation = SimulatedTeam(seed=101)
-    team = build(simulation, slice_keys=slice_keys)
+    team = build(simulation, slice_steps=slice_steps)
     joint = []
     for _ in range(100):
         told = team.step(*simulation.read()).rejuvenations
@@ -44,11 +44,11 @@ def test_a_merged_team_is_rejuvenated_and_knows_where_it_started(slice_keys):
     assert simulation.position_errors(team).max() < 0.2
 
 
-@pytest.mark.parametrize("slice_keys", [None, 12])
-def test_a_snapshot_of_a_team_goes_on_through_merges_and_rejuvenations(slice_keys):
+@pytest.mark.parametrize("slice_steps", [None, 12])
+def test_a_snapshot_of_a_team_goes_on_through_merges_and_rejuvenations(slice_steps):
     """A restored team does, bit for bit, the same as the one that went on, its smoothers included."""
     simulation = SimulatedTeam(seed=101)
-    team = build(simulation, slice_keys=slice_keys)
+    team = build(simulation, slice_steps=slice_steps)
     simulation.run(team, 50)
     state = pickle.loads(pickle.dumps(team.get_state()))
     restored, readings = TeamSlam(3, seed=99), copy.deepcopy(simulation)
@@ -65,7 +65,7 @@ def test_a_snapshot_of_a_team_goes_on_through_merges_and_rejuvenations(slice_key
 def test_a_merge_goes_on_from_what_both_groups_have_smoothed():
     """Just after a merge the joint smoother has all that the groups' smoothers had: nothing is done again."""
     simulation = SimulatedTeam(seed=101)
-    team = build(simulation, slice_keys=12)
+    team = build(simulation, slice_steps=12)
     before = {}
     for _ in range(90):
         known = {group: state["latest"] for group, state in before.items()}
@@ -88,7 +88,7 @@ def smoother_of(group):
 def test_no_two_filters_work_on_their_smoothers_in_one_step(monkeypatch):
     """Robots that do not look for each other have steps of their own in which their filters may smooth."""
     simulation = SimulatedTeam(seed=101)
-    smoothing = SmoothingOptions(slice_keys=4)
+    smoothing = SmoothingOptions(slice_steps=4)
     team = simulation.build(attempts=AttemptOptions(enabled=False), rejuvenate_every=20, smoothing=smoothing)
     worked = []
 
@@ -104,7 +104,7 @@ def test_no_two_filters_work_on_their_smoothers_in_one_step(monkeypatch):
 
 def test_after_an_undo_smoothers_are_as_if_they_had_never_been_joined():
     """Filters with all that their smoothers know are bit for bit those of a team that never merged, and stay so."""
-    smoothing = SmoothingOptions(slice_keys=16, max_keys=40)
+    smoothing = SmoothingOptions(slice_steps=16, max_keys=40)
     (simulation, team), (other, twin) = (
         (run, run.build(attempts=NEVER, rejuvenate_every=20, smoothing=smoothing))
         for run in (SimulatedTeam(num_robots=2, seed=101) for _ in range(2))

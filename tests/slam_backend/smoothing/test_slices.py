@@ -17,7 +17,7 @@ from slam_backend.smoothing.options import SmoothingOptions
 from slam_backend.smoothing.slices import Draft, Smoother
 from slam_backend.smoothing.solving import find_mode
 
-IN_SLICES = SmoothingOptions(slice_keys=8, max_keys=20, fresh_keys=8)
+IN_SLICES = SmoothingOptions(slice_steps=8, max_keys=20, fresh_keys=8)
 
 
 def test_slices_end_where_all_at_once_does():
@@ -71,7 +71,7 @@ def test_no_step_does_more_than_its_slice(monkeypatch):
 def test_particles_drawn_in_slices_are_as_good():
     """In slices or at once, in the same step, the newest poses agree to a part of their doubt."""
     run = small_run(length=8.0)
-    sliced = run.build_filter(200, "fastslam2", 1, rejuvenate_every=26, smoothing=SmoothingOptions(slice_keys=8))
+    sliced = run.build_filter(200, "fastslam2", 1, rejuvenate_every=26, smoothing=SmoothingOptions(slice_steps=8))
     readings = iter(run.readings())
     steps = next(step for step, reading in enumerate(readings, 1) if sliced.step(**reading).rejuvenation is not None)
     whole = run.build_filter(200, "fastslam2", 1, rejuvenate_every=steps)
@@ -112,11 +112,11 @@ def test_snapshots_catch_a_descent_in_the_middle():
     assert any(draft is None for draft in drafts[10:])
 
 
-@pytest.mark.parametrize("slice_keys", [None, 8])
-def test_a_descent_that_keeps_failing_blocks_nothing(slice_keys):
+@pytest.mark.parametrize("slice_steps", [None, 8])
+def test_a_descent_that_keeps_failing_blocks_nothing(slice_steps):
     """What cannot be smoothed is left out, the report says so, and the smoother goes on with what comes next."""
     run = small_run(length=8.0)
-    smoothing = SmoothingOptions(max_iterations=1, tolerance=1e-3, slice_keys=slice_keys)
+    smoothing = SmoothingOptions(max_iterations=1, tolerance=1e-3, slice_steps=slice_steps)
     slam = run.build_filter(20, "fastslam2", 1, landmark_noise=0.0, rejuvenate_every=6, smoothing=smoothing)
     reasons = [slam.step(**reading).rejuvenation for reading in run.readings()]
     told = [report.reason for report in reasons if report is not None]
