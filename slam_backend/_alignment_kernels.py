@@ -70,9 +70,7 @@ def squared_distances(table: FloatArray, pose: FloatArray, floor: float) -> Floa
 
 
 @jit
-def _support(
-    table: FloatArray, pose: FloatArray, floor: float, gate: float, members: BoolArray
-) -> tuple[int, float]:
+def _support(table: FloatArray, pose: FloatArray, floor: float, gate: float, members: BoolArray) -> tuple[int, float]:
     """Mark the candidates within `gate`; return their number and the score, sum of 1 - D / gate over them."""
     cos, sin, tx, ty = math.cos(pose[2]), math.sin(pose[2]), pose[0], pose[1]
     count, score = 0, 0.0

@@ -12,9 +12,7 @@ from slam_backend.landmark_map import MapOutline
 
 
 @jit
-def _held(
-    ids: Any, row_of: Any, map_of: Any, maps: Any, counts: Any, m: int, min_count: int
-) -> tuple[IntArray, bool]:
+def _held(ids: Any, row_of: Any, map_of: Any, maps: Any, counts: Any, m: int, min_count: int) -> tuple[IntArray, bool]:
     """Return the slots that particle m holds with at least so many measurements, and whether their ids ascend."""
     slots = np.empty(len(ids), np.int64)
     n, last, ascending = 0, -1, True

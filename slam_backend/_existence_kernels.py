@@ -52,7 +52,7 @@ def landmarks_told_of(
     ids: IntArray, row_of: IntArray, map_of: IntArray, maps: Int32Array, values: FloatArray, counts: Int32Array,
     num_particles: int, best: int, poses: FloatArray, cosines: FloatArray, sines: FloatArray, mount: FloatArray,
     near: float, nearest: float, side: float, reach_squared: float, found: Int32Array, new_slots: IntArray,
-) -> IntArray:
+) -> IntArray:  # fmt: skip
     """Return the slots of the landmarks that a frame may tell something of, without those that it started.
 
     They are those that some particle has matched, and of those near the robot the ones that some particle expects in
@@ -98,7 +98,7 @@ def landmarks_told_of(
                 is_told = dx * dx + dy * dy <= near * near and _is_expected(
                     places[:num_particles], values[row], counts[row], poses, cosines, sines, mount, nearest, side,
                     reach_squared,
-                )
+                )  # fmt: skip
         if is_told:
             slots[num] = slot
             num += 1
@@ -109,7 +109,7 @@ def landmarks_told_of(
 def _is_expected(
     places: Int32Array, values: FloatArray, counts: Int32Array, poses: FloatArray, cosines: FloatArray,
     sines: FloatArray, mount: FloatArray, nearest: float, side: float, reach_squared: float,
-) -> bool:
+) -> bool:  # fmt: skip
     """Tell whether some particle may expect a landmark in view, heights apart.
 
     Args:
@@ -141,7 +141,7 @@ def _is_expected(
 def count_expected(
     slots: IntArray, row_of: IntArray, values: FloatArray, counts: Int32Array, m: int, pose: FloatArray,
     mount: FloatArray, nearest: float, side: float, rise: float, reach_squared: float,
-) -> int:
+) -> int:  # fmt: skip
     """Return how many of the landmarks particle m holds and expects in view.
 
     Args:
@@ -184,7 +184,7 @@ def weigh_existence(
     slots: IntArray, seen: Int32Array, odds: FloatArray, row_of: IntArray, values: FloatArray, counts: Int32Array,
     poses: FloatArray, cosines: FloatArray, sines: FloatArray, mount: FloatArray, nearest: float, side: float,
     rise: float, reach_squared: float, sighting: float, miss: float, floor: float, cap: float,
-) -> IntArray:
+) -> IntArray:  # fmt: skip
     """Update the log-odds of landmarks in all particles that hold them, and drop those that have become improbable.
 
     Args:
@@ -235,7 +235,7 @@ def weigh_existence(
 def release(
     slots: IntArray, ids: IntArray, row_of: IntArray, heads: Float32Array, free_rows: IntArray, free_slots: IntArray,
     tops: IntArray, far: np.float32,
-) -> None:
+) -> None:  # fmt: skip
     """Free slots, up to date, that no particle holds, and their rows; see `ParticleMaps`. Heads become `far`."""
     for k in range(len(slots)):
         ids[slots[k]] = -1

@@ -107,9 +107,7 @@ def _unlike(
 
 
 @jit
-def _alike(
-    a: Float32Array, b_columns: Float32Array, limit: float, most: int
-) -> tuple[IntArray, IntArray, IntArray]:
+def _alike(a: Float32Array, b_columns: Float32Array, limit: float, most: int) -> tuple[IntArray, IntArray, IntArray]:
     """Return the b within a squared distance `limit` of each a (n, most), and how many each a (n,) and b (m,) has."""
     n, m = len(a), b_columns.shape[1]
     found = np.zeros((n, most), np.int64)

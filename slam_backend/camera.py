@@ -95,8 +95,7 @@ class StereoCamera:
         pixel = np.diag([self.sigma_px**2, self.sigma_px**2, 0.0])
         depth = (self.sigma_disparity_px * scale / self.baseline) ** 2
         return np.asarray(
-            (scale**2)[..., None, None] * pixel
-            + depth[..., None, None] * points[..., :, None] * points[..., None, :]
+            (scale**2)[..., None, None] * pixel + depth[..., None, None] * points[..., :, None] * points[..., None, :]
         )
 
     def sees(self, points: FloatArray) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:

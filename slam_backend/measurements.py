@@ -35,9 +35,7 @@ class Measurements:
     def __post_init__(self) -> None:
         cure = "Give one row per measured point."
         points: Any = check_array("points", self.points, (None, 3), cure + " Drop points that are not finite.")
-        descriptors: Any = check_array(
-            "descriptors", self.descriptors, (len(points), None), cure, dtype=np.float32
-        )
+        descriptors: Any = check_array("descriptors", self.descriptors, (len(points), None), cure, dtype=np.float32)
         if descriptors.size and np.abs(descriptors).max() > LARGEST_DESCRIPTOR:
             largest = float(np.abs(descriptors).max())
             expected = f"numbers within +-{LARGEST_DESCRIPTOR:g}"

@@ -273,7 +273,7 @@ def stack_descriptors(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray
 def _unexplained(
     landmarks_a: FloatArray, present_a: BoolArray, landmarks_b: FloatArray, present_b: BoolArray,
     from_a: IntArray, from_b: IntArray, initial: FloatArray,
-) -> float:
+) -> float:  # fmt: skip
     """Return tau^2 [m^2], what the differences of shared landmarks need beyond both maps' covariances.
 
     For each pair of particles chi^2(tau^2) = degrees of freedom, by Newton's method on the latter over the former,
@@ -361,7 +361,7 @@ def _fuse_rows(
 def _fuse_odds(
     model: ExistenceModel, odds_a: FloatArray, counts_a: IntArray, rows_a: IntArray,
     odds_b: FloatArray, counts_b: IntArray, rows_b: IntArray,
-) -> None:
+) -> None:  # fmt: skip
     """Fuse the log-odds of existence (n, M) of b's rows into a's, in place, like `_fuse_rows`, and before it.
 
     What either filter saw is independent given whether the landmark exists: log-odds add up, and the prior that both
@@ -376,7 +376,7 @@ def _fuse_odds(
 def _align_pairs(
     landmarks_a: FloatArray, present_a: BoolArray, landmarks_b: FloatArray, present_b: BoolArray,
     from_a: IntArray, from_b: IntArray, initial: FloatArray, extra: float,
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, IntArray]:
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, IntArray]:  # fmt: skip
     """Estimate the motion between the maps of each pair of particles by Gauss-Newton on the shared landmarks.
 
     Args:
@@ -396,7 +396,7 @@ def _align_pairs(
 def _fit_pairs(
     landmarks_a: FloatArray, present_a: BoolArray, landmarks_b: FloatArray, present_b: BoolArray,
     from_a: IntArray, from_b: IntArray, starts: FloatArray, extra: FloatArray, iterations: int,
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, IntArray, FloatArray]:
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, IntArray, FloatArray]:  # fmt: skip
     """Fit motions (c, 3) from `starts`, with variances widened by `extra` (c,).
 
     Returns:

@@ -13,9 +13,7 @@ from vslam_env.navigation import FREE, GRID_SIZE, SeenGrid, cell_of
 
 
 @jit
-def _recount(
-    changes: Any, cells: Any, places: Any, floor: Any, seen: Any, seers: Any, ever: Any, fresh: Any
-) -> int:
+def _recount(changes: Any, cells: Any, places: Any, floor: Any, seen: Any, seers: Any, ever: Any, fresh: Any) -> int:
     """Bring up to date what one robot sees of the floor.
 
     Args:

@@ -215,9 +215,7 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         """
         episode = self._running_episode("state")
         true, believed = episode.true_path[-1], episode.believed_poses()
-        rows = [
-            np.column_stack([poses[:, :2], np.cos(poses[:, 2]), np.sin(poses[:, 2])]) for poses in (true, believed)
-        ]
+        rows = [np.column_stack([poses[:, :2], np.cos(poses[:, 2]), np.sin(poses[:, 2])]) for poses in (true, believed)]
         standing = self._standing
         frames = [episode.belief.group(robot)[0] for robot in range(len(true))]
         scored = np.column_stack([standing.map_errors, standing.map_recalls, self._pose_errors[:, 1], frames])

@@ -93,7 +93,7 @@ def _hits(partial: Float32Array, limit: float, hits: IntArray) -> int:
 def find_candidates(
     measured: Float32Array, stored: Float32Array, heads: Float32Array, ids: IntArray, names: IntArray,
     identities: IntArray, named: bool, gate: float,
-) -> tuple[IntArray, IntArray, FloatArray, IntArray, IntArray, IntArray]:
+) -> tuple[IntArray, IntArray, FloatArray, IntArray, IntArray, IntArray]:  # fmt: skip
     """List for each measurement the landmarks that may have caused it, nearest descriptor first.
 
     Some components alone rule most landmarks out, for all particles at once; the others are compared in full.
@@ -147,9 +147,7 @@ def find_candidates(
                 slots = np.append(slots, np.empty(size - total, dtype=np.int64))
                 squares = np.append(squares, np.empty(size - total))
             at = total
-            while at > starts[b] and (
-                squares[at - 1] > e or (squares[at - 1] == e and ids[slots[at - 1]] > ids[slot])
-            ):
+            while at > starts[b] and (squares[at - 1] > e or (squares[at - 1] == e and ids[slots[at - 1]] > ids[slot])):
                 squares[at] = squares[at - 1]
                 slots[at] = slots[at - 1]
                 at -= 1

@@ -32,7 +32,7 @@ from slam_backend.errors import FloatArray, Int32Array, IntArray
 def decide_alone(
     work: FloatArray, tile: FloatArray, seen: Int32Array, match: FloatArray, q: float,
     reach: float, dead_zone: float, dead_radius: float, log_clutter: float,
-) -> None:
+) -> None:  # fmt: skip
     """Pass B for a measurement with one candidate: match, reject or start, and sum.
 
     Row TAKEN says where an earlier measurement has taken the landmark; for `reach` see `_match_alone`.
@@ -77,7 +77,7 @@ def clear_taken(work: FloatArray) -> None:
 def consider_again(
     work: FloatArray, record: FloatArray, q: float, look: float, cap: float, gate: float, dead_zone: float,
     dead_radius: float,
-) -> None:
+) -> None:  # fmt: skip
     """Let candidate q compete for the measurement in pass B, unless row TAKEN says that its landmark is taken.
 
     D counts no more than `cap`: the gate where the caller names the landmarks.
@@ -147,7 +147,7 @@ def bar_taken(earlier: FloatArray, p: float, mask: FloatArray) -> None:
 def write_found(
     found: Int32Array, distances: FloatArray, chosen: FloatArray, low: int, high: int, slots: IntArray,
     records: FloatArray, first_pass: bool, new_slot: int,
-) -> None:
+) -> None:  # fmt: skip
     """Write the slot (or -1) and the squared distance (or NaN) of one measurement, that of pass A if `first_pass`."""
     if low == high:
         for i in range(len(found)):

@@ -27,7 +27,7 @@ def update_fastslam1(
     named: bool, descriptor_gate: float, position_gate: float, log_p0: float, walk: float, one_to_one: bool,
     work: FloatArray, records: FloatArray,
     found: Int32Array, distances: FloatArray, new_slots: IntArray, log_likelihood: FloatArray,
-) -> None:
+) -> None:  # fmt: skip
     """Sample one robot's motion and integrate its frame as in Algorithm 1 (corrected).
 
     Args:
@@ -99,13 +99,13 @@ def update_fastslam1(
                 new_landmark(
                     work, tile_of(values, padded, new_rows[b], block), points, noises, b, given, camera, mask,
                     counts[new_rows[b], first : first + LANES], walk,
-                )
+                )  # fmt: skip
                 for i in range(LANES):
                     work[CLUTTER + i] += log_clutter if mask[i] > 0.0 else 0.0
             write_found(
                 found[b, first : first + LANES], distances[b, first : first + LANES], chosen, starts[b], starts[b + 1],
                 slots, records, False, new_slots[b],
-            )
+            )  # fmt: skip
         for i in range(LANES):
             log_likelihood[first + i] += total_log_likelihood(work, i)
         for i in range(LANES):

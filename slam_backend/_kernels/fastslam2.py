@@ -51,7 +51,7 @@ def update_fastslam2(
     recovery: FloatArray, log_p0: float, walk: float, one_to_one: bool,
     work: FloatArray, records: FloatArray,
     found: Int32Array, distances: FloatArray, new_slots: IntArray, log_likelihood: FloatArray,
-) -> None:
+) -> None:  # fmt: skip
     """Integrate one robot's motion and frame, the measurements shaping the sampled pose (FastSLAM 2.0, Laplace form).
 
     Association takes two passes: unambiguous candidates first refine the pose robustly, then all decisions are taken at
@@ -105,7 +105,7 @@ def update_fastslam2(
         match_first(
             work, records, match, mask, values, counts, row_of, block, points, noises, given, camera,
             starts, slots, looks, owners, same, named, position_gate, ambiguity, one_to_one,
-        )
+        )  # fmt: skip
         if recovery[0] > 0.0 and any_suspect(work) > 0:
             widen_suspects(work, recovery)
             begin_judging(work)
@@ -125,7 +125,7 @@ def update_fastslam2(
             match_first(
                 work, records, match, mask, values, counts, row_of, block, points, noises, given, camera,
                 starts, slots, looks, owners, same, named, position_gate, ambiguity, one_to_one,
-            )
+            )  # fmt: skip
         step_pose(work, False)
         if any_wide(work) > 0:  # a wide prior is a long way for one iteration
             for _ in range(3):
@@ -158,7 +158,7 @@ def update_fastslam2(
                 decide_alone(
                     work, tile, counts[row, first : first + LANES], match[b], float(low), reach,
                     FARTHEST if named else dead_zone, dead_radius, log_clutter[b],
-                )
+                )  # fmt: skip
             else:
                 begin_choice(work)
                 for q in range(low, high):
@@ -170,9 +170,7 @@ def update_fastslam2(
                     tile = tile_of(values, padded, row_of[slots[q]], block)
                     innovate(work, tile, points, noises, b, given, camera)
                     evaluate(work, tile, records[q], True)
-                    consider_again(
-                        work, records[q], float(q), looks[q], cap, position_gate, dead_zone, dead_radius
-                    )
+                    consider_again(work, records[q], float(q), looks[q], cap, position_gate, dead_zone, dead_radius)
                 decide(work, match[b], ambiguity, log_clutter[b])
                 for q in range(low, high):
                     if mask_of(match[b], float(q), mask) > 0:
@@ -212,9 +210,9 @@ def update_fastslam2(
                 new_landmark(
                     work, tile_of(values, padded, new_rows[b], block), points, noises, b, given, camera, mask,
                     counts[new_rows[b], first : first + LANES], walk,
-                )
+                )  # fmt: skip
             write_found(
                 found[b, first : first + LANES], distances[b, first : first + LANES], match[b], starts[b],
                 starts[b + 1], slots, records, True, new_slots[b],
-            )
+            )  # fmt: skip
     name_new(new_slots, descriptors, names, named, ids, identities, stored, heads, tops)

@@ -32,7 +32,7 @@ def match_first(
     row_of: IntArray, block: int, points: FloatArray, noises: FloatArray, given: bool, camera: FloatArray,
     starts: IntArray, slots: IntArray, looks: FloatArray, owners: IntArray, same: IntArray, named: bool,
     position_gate: float, ambiguity: float, one_to_one: bool,
-) -> None:
+) -> None:  # fmt: skip
     """Pass A for one block: match at the predicted pose what is beyond doubt, sum it, and count what is unexplained."""
     padded, first = counts.shape[1], block * LANES
     reach = FARTHEST if named else position_gate
@@ -75,7 +75,7 @@ def match_first(
 def _match_alone(
     work: FloatArray, tile: FloatArray, record: FloatArray, seen: Int32Array, match: FloatArray, q: float,
     reach: float, gate: float,
-) -> None:
+) -> None:  # fmt: skip
     """Pass A for a measurement with one candidate: match, weigh by Cauchy's 1 / (1 + D / gate), sum, and judge.
 
     `reach` is the largest D that may match: the gate, or any where the caller names the landmarks.

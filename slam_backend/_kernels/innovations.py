@@ -149,7 +149,7 @@ def match_terms(
         e0, e1, e2, f0, f1, f2 = a0, a1, a2, b0, b1, b2
     d00, d01, d11 = (
         t00 + a0 * e0 + a1 * e1 + a2 * e2, t01 + a0 * f0 + a1 * f1 + a2 * f2, t11 + b0 * f0 + b1 * f1 + b2 * f2
-    )
+    )  # fmt: skip
     det_pose = d00 * d11 - d01 * d01
     distance = height + (d11 * px * px - 2.0 * d01 * px * py + d00 * py * py) / det_pose
     return (
@@ -157,7 +157,7 @@ def match_terms(
         a2 * u2 + b2 * w2, a0 * sx + b0 * sy, a1 * sx + b1 * sy, a2 * sx + b2 * sy,
         height + px * sx + py * sy, det * s22, det_pose * s22, depth, rx * rx + ry * ry + rz * rz,
         distance if depth >= MIN_DEPTH else np.inf,
-    )
+    )  # fmt: skip
 
 
 @lanes

@@ -35,7 +35,7 @@ YOUNG = 4  # a landmark seen up to so many times is updated by the iterated EKF:
 def _updated(
     work: FloatArray, tile: FloatArray, i: int, i00: float, i01: float, i02: float, i11: float, i12: float, i22: float,
     match: bool, walk: float,
-) -> None:
+) -> None:  # fmt: skip
     """Update a landmark where `match`, S^-1 given (Eqs. 8-10), and let it walk: Sigma + walk I."""
     p00, p01, p02 = tile[3 * LANES + i], tile[4 * LANES + i], tile[5 * LANES + i]
     p11, p12, p22 = tile[6 * LANES + i], tile[7 * LANES + i], tile[8 * LANES + i]
@@ -44,13 +44,13 @@ def _updated(
     rx, ry, rz = work[R0 + i], work[R1 + i], work[R2 + i]
     k00, k01, k02 = p00 * i00 + p01 * i01 + p02 * i02, p00 * i01 + p01 * i11 + p02 * i12, (
         p00 * i02 + p01 * i12 + p02 * i22
-    )  # Eq. 8
+    )  # Eq. 8  # fmt: skip
     k10, k11, k12 = p01 * i00 + p11 * i01 + p12 * i02, p01 * i01 + p11 * i11 + p12 * i12, (
         p01 * i02 + p11 * i12 + p12 * i22
-    )
+    )  # fmt: skip
     k20, k21, k22 = p02 * i00 + p12 * i01 + p22 * i02, p02 * i01 + p12 * i11 + p22 * i12, (
         p02 * i02 + p12 * i12 + p22 * i22
-    )
+    )  # fmt: skip
     tile[i] += k00 * rx + k01 * ry + k02 * rz if match else 0.0  # Eq. 9
     tile[LANES + i] += k10 * rx + k11 * ry + k12 * rz if match else 0.0
     tile[2 * LANES + i] += k20 * rx + k21 * ry + k22 * rz if match else 0.0
@@ -74,7 +74,7 @@ def _inverse_of_sum(
     return inverted(
         tile[3 * LANES + i] + work[N00 + i], tile[4 * LANES + i] + work[N01 + i], tile[5 * LANES + i] + work[N02 + i],
         tile[6 * LANES + i] + work[N11 + i], tile[7 * LANES + i] + work[N12 + i], tile[8 * LANES + i] + work[N22 + i],
-    )
+    )  # fmt: skip
 
 
 @lanes
@@ -94,7 +94,7 @@ def update(work: FloatArray, tile: FloatArray, mask: FloatArray, walk: float) ->
 def gate_and_update(
     work: FloatArray, tile: FloatArray, record: FloatArray, chosen: FloatArray, seen: Int32Array, q: float,
     admit: FloatArray, gate: float, walk: float,
-) -> None:
+) -> None:  # fmt: skip
     """At a known pose: where admitted and inside the gate, weigh and update the landmark (Eqs. 5-11).
 
     Args:
@@ -148,7 +148,7 @@ def count_matches(seen: Int32Array, mask: FloatArray) -> None:
 def new_landmark(
     work: FloatArray, tile: FloatArray, points: FloatArray, noises: FloatArray, n: int, given: bool, camera: FloatArray,
     mask: FloatArray, seen: Int32Array, walk: float,
-) -> None:
+) -> None:  # fmt: skip
     """Write mean and covariance of a landmark first seen from a known pose (Algorithm 1, l. 30-31 corrected).
 
     All lanes of the block are written; `seen` becomes 1 where `mask` is, and 0 elsewhere: those do not hold it.

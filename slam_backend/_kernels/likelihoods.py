@@ -37,9 +37,7 @@ def count_likelihood(work: FloatArray, i: int, on: bool, square: float, det: flo
 def add_likelihood(work: FloatArray, record: FloatArray, mask: FloatArray) -> None:
     """Add a match's part of the log-likelihood where `mask` is 1."""
     for i in range(LANES):
-        count_likelihood(
-            work, i, mask[i] > 0.0, record[Q_SQUARE + i], record[Q_DET + i], record[Q_DEPTH + i]
-        )
+        count_likelihood(work, i, mask[i] > 0.0, record[Q_SQUARE + i], record[Q_DET + i], record[Q_DEPTH + i])
 
 
 @lanes

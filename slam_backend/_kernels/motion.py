@@ -151,7 +151,7 @@ def sample_motion(
 def prior(
     poses: FloatArray, means: FloatArray, covariances: FloatArray, blind: bool, first: int, mean: FloatArray,
     covariance: FloatArray,
-) -> None:
+) -> None:  # fmt: skip
     """Fetch a block's poses before the motion: N(x^, P^) where the robot is blind, else the samples, exact."""
     for i in range(LANES):
         for c in range(3):
@@ -164,7 +164,7 @@ def prior(
 def move_blind(
     poses: FloatArray, means: FloatArray, covariances: FloatArray, blind: bool, odometry: FloatArray,
     sigmas: FloatArray, normals: FloatArray, work: FloatArray,
-) -> None:
+) -> None:  # fmt: skip
     """Move a robot that sees nothing: each particle's N(x^, P^) is propagated, and its sample moves by itself.
 
     Args:

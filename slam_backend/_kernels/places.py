@@ -41,7 +41,7 @@ def _copy_row(
 def refresh(
     slots: IntArray, values: FloatArray, counts: Int32Array, row_of: IntArray, map_of: IntArray, maps: Int32Array,
     users: IntArray, free_rows: IntArray, tops: IntArray,
-) -> None:
+) -> None:  # fmt: skip
     """Bring landmarks up to date: copy each particle's values from where its ancestor left them to its own place.
 
     One free row is needed: the row that a landmark leaves is taken by the next, while it is still in the cache.
@@ -89,7 +89,7 @@ def carry_odds(slots: IntArray, odds: FloatArray, map_of: IntArray, maps: Int32A
 def open_slot(
     b: int, new_slots: IntArray, new_rows: IntArray, row_of: IntArray, map_of: IntArray, values: FloatArray,
     counts: Int32Array, free_rows: IntArray, free_slots: IntArray, tops: IntArray,
-) -> None:
+) -> None:  # fmt: skip
     """Give measurement b a free slot and row for the landmark that it starts in some particles."""
     tops[0] -= 1
     tops[1] -= 1
@@ -106,7 +106,7 @@ def open_slot(
 def name_new(
     new_slots: IntArray, measured: Float32Array, names: IntArray, named: bool, ids: IntArray,
     identities: IntArray, stored: Float32Array, heads: Float32Array, tops: IntArray,
-) -> None:
+) -> None:  # fmt: skip
     """Give the landmarks that a frame has started their lasting names `tops[2]`, ..., in the order of measurements.
 
     Args:

@@ -101,7 +101,7 @@ def clear_sums(work: FloatArray) -> None:
 def add_terms(
     work: FloatArray, i: int, on: bool, w: float, j00: float, j01: float, j02: float, j11: float, j12: float,
     j22: float, g0: float, g1: float, g2: float,
-) -> None:
+) -> None:  # fmt: skip
     """Where `on`, add a match's share of the Gauss-Newton system, times w; elsewhere it may be NaN."""
     work[J00 + i] += w * j00 if on else 0.0
     work[J01 + i] += w * j01 if on else 0.0
@@ -122,13 +122,11 @@ def sum_matches(work: FloatArray, record: FloatArray, weights: FloatArray) -> No
             work, i, weights[i] > 0.0, weights[i],
             record[QJ00 + i], record[QJ01 + i], record[QJ02 + i], record[QJ11 + i], record[QJ12 + i], record[QJ22 + i],
             record[QG0 + i], record[QG1 + i], record[QG2 + i],
-        )
+        )  # fmt: skip
 
 
 @lanes
-def robust_weights(
-    record: FloatArray, chosen: FloatArray, q: float, gate: float, weights: FloatArray
-) -> int:
+def robust_weights(record: FloatArray, chosen: FloatArray, q: float, gate: float, weights: FloatArray) -> int:
     """Write Cauchy's weights 1 / (1 + D / gate) where the lane chose candidate q, else 0; return how many chose it."""
     count = 0
     for i in range(len(chosen)):
@@ -198,7 +196,7 @@ def posterior(work: FloatArray, normals: FloatArray, log_likelihood: FloatArray,
         h10, h11 = c10 * i00 + c11 * i01, c10 * i01 + c11 * i11
         h20, h21, h22 = (
             c20 * i00 + c21 * i01 + c22 * i02, c20 * i01 + c21 * i11 + c22 * i12, c20 * i02 + c21 * i12 + c22 * i22
-        )
+        )  # fmt: skip
         out[3 * LANES + i] = h00 * c00 + h01 * c01
         out[4 * LANES + i] = h10 * c00 + h11 * c01
         out[5 * LANES + i] = h20 * c00 + h21 * c01

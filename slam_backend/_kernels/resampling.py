@@ -43,7 +43,7 @@ def resample(
     path_log_weights: FloatArray, maps: Int32Array, users: IntArray, map_of: IntArray, ids: IntArray,
     row_of: IntArray, counts: Int32Array, heads: Float32Array, free_rows: IntArray, free_slots: IntArray,
     tops: IntArray,
-) -> int:
+) -> int:  # fmt: skip
     """Let particles become copies of their ancestors, their landmarks lazily, and free what no survivor holds.
 
     Landmarks that were up to date get one new ancestor map; the others' maps are composed with it.

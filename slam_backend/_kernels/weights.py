@@ -27,8 +27,8 @@ def weigh(
     m = len(log_weights)
     largest = -np.inf
     for i in range(m):
-        path_log_weights[i] += log_likelihood[i]
-        log_weights[i] += log_likelihood[i]
+        path_log_weights[i] += log_likelihood[i]  # Eq. 12
+        log_weights[i] += log_likelihood[i]  # Eqs. 3, 11
         largest = max(largest, log_weights[i])
     total = 0.0
     for i in range(m):
@@ -95,7 +95,7 @@ def mixture(
 def summarise(
     found: Int32Array, distances: FloatArray, new_slots: IntArray, keep: IntArray, best: int, ids: IntArray,
     associations: IntArray, created: IntArray,
-) -> tuple[int, int, float, int]:
+) -> tuple[int, int, float, int]:  # fmt: skip
     """Tell what became of one robot's measurements.
 
     Args:

@@ -171,10 +171,7 @@ def paint_scan(
         v = (row + 0.5) * CELL - HALF_WIDTH - y
         for col in range(first_col, last_col):
             u = (col + 0.5) * CELL - HALF_WIDTH - x
-            if (
-                direction[0, 0] * v < direction[0, 1] * u
-                or direction[count - 1, 0] * v >= direction[count - 1, 1] * u
-            ):
+            if direction[0, 0] * v < direction[0, 1] * u or direction[count - 1, 0] * v >= direction[count - 1, 1] * u:
                 continue
             while k > 0 and direction[k, 0] * v < direction[k, 1] * u:
                 k -= 1

@@ -108,9 +108,7 @@ def _draw_belief(
         _outline(plot, view, robot.estimated_pose, max(radius * view.scale, 5.0 * unit), colour, unit)
 
 
-def _outline(
-    plot: Image, view: Viewport, pose: FloatArray, radius: float, colour: palette.Colour, unit: float
-) -> None:
+def _outline(plot: Image, view: Viewport, pose: FloatArray, radius: float, colour: palette.Colour, unit: float) -> None:
     """Draw an estimated pose: an outlined disc whose heading sticks out."""
     centre, ahead = view.pixels(pose), np.array([np.cos(pose[2]), -np.sin(pose[2])])
     pen = max(1, round(2 * unit))

@@ -21,9 +21,7 @@ BYTES_MEAN, BYTES_SIGMA = 510.0, 147.8005  # of the sum of four uniform bytes
 
 
 @jit
-def _nearest(
-    slope: float, local: FloatArray, robots: FloatArray, radius: float
-) -> tuple[int, float, float]:
+def _nearest(slope: float, local: FloatArray, robots: FloatArray, radius: float) -> tuple[int, float, float]:
     """Follow the ray (1, slope) from the origin of the camera's frame.
 
     Args:

@@ -152,9 +152,7 @@ def _photographed(rows: int, columns: int, photographs: list[Image], rng: np.ran
     return np.ascontiguousarray(np.concatenate(strips, axis=1))
 
 
-def _draw_face(
-    rows: int, columns: int, config: TextureConfig, poster: Image, rng: np.random.Generator
-) -> Image:
+def _draw_face(rows: int, columns: int, config: TextureConfig, poster: Image, rng: np.random.Generator) -> Image:
     """Draw one face in the style of the configuration."""
     texel = config.texel
     plain = rng.uniform(95.0, 165.0) + _octaves(rows, columns, texel, rng)

@@ -157,9 +157,7 @@ class Blueprint:
 
     def _clear_of_doors(self, x0: float, y0: float, x1: float, y1: float) -> bool:
         """Tell whether no door's middle is close to a box."""
-        return all(
-            np.hypot(max(x0 - x, 0.0, x - x1), max(y0 - y, 0.0, y - y1)) > DOOR_CLEARANCE for x, y in self.doors
-        )
+        return all(np.hypot(max(x0 - x, 0.0, x - x1), max(y0 - y, 0.0, y - y1)) > DOOR_CLEARANCE for x, y in self.doors)
 
     def finished(self) -> FloatArray:
         """Return the walls (S, 4) [m], perhaps mirrored."""

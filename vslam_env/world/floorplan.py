@@ -69,9 +69,7 @@ def trace(free: Any, metres_per_pixel: float, tolerance_px: float, robot_radius:
         )
     corner = np.array([x - 1, y - 1])  # of the cropped part in the image
     to_metres = metres_per_pixel * np.array([1.0, -1.0])  # rows count downwards, y upwards
-    outlines = [
-        (line + corner - (0, len(free))) * to_metres for line in _outlines(cropped, tolerance_px)
-    ]
+    outlines = [(line + corner - (0, len(free))) * to_metres for line in _outlines(cropped, tolerance_px)]
     return np.vstack([np.hstack([line, np.roll(line, -1, axis=0)]) for line in outlines])
 
 

@@ -132,9 +132,7 @@ def cast_scans(
 
 
 @jit
-def _hidden(
-    x: float, y: float, dx: float, dy: float, own_wall: int, walls: FloatArray, indices: IntArray
-) -> bool:
+def _hidden(x: float, y: float, dx: float, dy: float, own_wall: int, walls: FloatArray, indices: IntArray) -> bool:
     """Tell whether a wall other than `own_wall` crosses the sight line from (x, y) to (x + dx, y + dy)."""
     length = np.sqrt(dx * dx + dy * dy)
     for i in range(len(walls)):
