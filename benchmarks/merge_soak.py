@@ -8,9 +8,10 @@
 Runs are stereo runs through offices of aisles, 100 m per robot, with look-alikes in classes of one to three, false
 points and wrong descriptors; or episodes of the environment in all its families of worlds, up to all landmarks with a
 twin. Numbers of robots and contacts change from run to run. A merge is false if it is more than 0.5 m or 5 degrees off;
-it counts if it is in force 200 steps later or at the end. With `--forced` robots do not merge by themselves: once two
-maps are large enough they are merged by that wrong motion which fits them best, and the question is how many of these
-the team undoes, and when; `--shift 0.6` takes the true motion shifted by so many metres instead.
+it counts if it is in force 200 steps later or at the end. How far off the team is by then, and whether what it joined
+are the same landmarks, is told beside it, see `merge_fates`. With `--forced` robots do not merge by themselves: once
+two maps are large enough they are merged by that wrong motion which fits them best, and the question is how many of
+these the team undoes, and when; `--shift 0.6` takes the true motion shifted by so many metres instead.
 """
 
 import os
@@ -19,7 +20,6 @@ os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
 
 import json
 import time
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import count
 from pathlib import Path
@@ -27,90 +27,30 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
+from merge_fates import Delay, Fates, Follower, MergeFate, fates, summarise
 from rich.console import Console
 
 from agents.registry import make_policy
 from slam_backend.alignment import Alignment
 from slam_backend.attempts import AttemptOptions
 from slam_backend.errors import FloatArray, IntArray, bad_argument, check_choice, check_int
-from slam_backend.geometry import between, inverse, rotation
+from slam_backend.geometry import between, rotation
 from slam_backend.landmark_map import LandmarkMap
 from slam_backend.merge_options import MergeOptions
-from slam_backend.reports import MergeEvent
 from slam_backend.team import TeamSlam
 from training.episode import is_false_merge
 from training.run_folder import check_writable, plain
 from training.stereo_runs import STEP, RunSpec, simulate_run
 from vslam_env import ExplorationEnv, preset_config
+from vslam_env.errors_of_maps import ClaimLedger
 
 KINDS = ("aisles", "environment", "both")
 WORLDS = ("office", "loops", "maze", "hall", "fig5")
 REPEATED = (0.0, 0.5, 1.0)  # shares of landmarks that look like another one
 RADIOS: tuple[dict[str, Any], ...] = ({}, {"comm_range": 8.0}, {"comm_line_of_sight": True}, {"comm_loss": 0.2})
-WINDOW = 200  # [steps] after which a false merge counts
 LOSES, FINDS = 0.02, 0.05  # probability per step that a link is lost, and found again
 ENOUGH = 20  # landmarks of either map before a merge is forced
 HYPOTHESES, COINCIDENCE = 2000, 0.25  # [-, m]: how a forced merge is found
-
-
-@dataclass(slots=True)
-class MergeFate:
-    """What became of a merge.
-
-    Attributes:
-        seed: Of its run.
-        world: Family of worlds.
-        alike: How much landmarks look alike.
-        step: When it was made.
-        robots_a, robots_b: Which groups.
-        error_m, error_deg: Of its motion.
-        bent_m, bent_deg: Of the motion by which the maps would have merged had they not been straightened; NaN if none.
-        undone_after: Steps until it was undone; None: it was not.
-        ended_after: Steps until the run ended.
-        end_m, end_deg: Of one group's frame in the other's as the team has it at the end; NaN if undone.
-    """
-
-    seed: int
-    world: str
-    alike: str
-    step: int
-    robots_a: tuple[int, ...]
-    robots_b: tuple[int, ...]
-    error_m: float
-    error_deg: float
-    bent_m: float
-    bent_deg: float
-    undone_after: int | None
-    ended_after: int
-    end_m: float
-    end_deg: float
-
-    @property
-    def is_false(self) -> bool:
-        """Whether its motion was plainly wrong."""
-        return is_false_merge(self.error_m, self.error_deg)
-
-    @property
-    def counts(self) -> bool:
-        """Whether it was in force after the window, or at the end."""
-        return self.undone_after is None or self.undone_after > WINDOW
-
-
-@dataclass(slots=True)
-class Delay:
-    """An attempt whose maps aligned as they were, but not once they were straight.
-
-    Attributes:
-        seed: Of its run.
-        step: When it was made.
-        reason: Why it was refused.
-        merged_after: Steps until the two groups' first robots shared a map; None: they never did.
-    """
-
-    seed: int
-    step: int
-    reason: str
-    merged_after: int | None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -122,20 +62,24 @@ class Setting:
         shift: How [m]; None: by the motion that fits best.
         rejuvenate_every: Of the filters; None: their default.
         straighten: Maps before a merge.
+        sure: Of the motion a merge has to be, see `MergeOptions`.
     """
 
     forced: bool = False
     shift: float | None = None
     rejuvenate_every: int | None = None
     straighten: bool = True
+    sure: float = MergeOptions().sure
+
+    @property
+    def merging(self) -> dict[str, Any]:
+        """Options of merges."""
+        return {"straighten": self.straighten, "sure": self.sure}
 
     @property
     def filter(self) -> dict[str, Any]:
         """Options of the filters that are not their defaults."""
         return {} if self.rejuvenate_every is None else {"rejuvenate_every": self.rejuvenate_every}
-
-
-Fates = tuple[list[MergeFate], list[Delay]]
 
 
 def make_env(seed: int, cycles: int, setting: Setting) -> ExplorationEnv:
@@ -148,7 +92,7 @@ def make_env(seed: int, cycles: int, setting: Setting) -> ExplorationEnv:
         landmarks={"repeated": float(rng.choice(REPEATED))},
         belief={
             "attempts": {"enabled": not setting.forced},
-            "merging": {"straighten": setting.straighten},
+            "merging": setting.merging,
             "filter": setting.filter,
         },
         **({} if setting.forced else RADIOS[int(rng.integers(len(RADIOS)))]),
@@ -162,6 +106,7 @@ def play_environment(seed: int, cycles: int, setting: Setting) -> Fates:
     rng = np.random.default_rng([seed, 18])
     policies = [make_policy("frontier", env.config.action_type) for _ in env.possible_agents]
     observations, _ = env.reset(seed=seed)
+    follower = Follower(env.episode.belief._team, env.episode.ledger, env.true_start_poses)
     while env.agents:
         if setting.forced and not env.events:
             force(env, rng, setting.shift)
@@ -170,9 +115,9 @@ def play_environment(seed: int, cycles: int, setting: Setting) -> Fates:
             for agent, policy in zip(env.agents, policies, strict=True)
         }
         observations = env.step(actions)[0]
+        follower.note(env.episode.tick - 1)
     alike = f"{env.config.landmarks.repeated:.0%} with a twin"
-    placed = [inverse(env.belief(agent).start_from_group) for agent in env.possible_agents]
-    return fates(env.events, env.true_start_poses, placed, seed, env.config.world, alike, env.episode.tick)
+    return fates(env.events, env.true_start_poses, seed, env.config.world, alike, env.episode.tick, follower)
 
 
 def play_aisles(seed: int, cycles: int, setting: Setting) -> Fates:
@@ -187,21 +132,23 @@ def play_aisles(seed: int, cycles: int, setting: Setting) -> Fates:
     camera = replace(noise.camera, sigma_px=2 * noise.sigma_px, sigma_disparity_px=2 * noise.sigma_disparity_px)
     team = TeamSlam(
         robots, seed=seed, attempts=AttemptOptions(enabled=not setting.forced),
-        merging=MergeOptions(straighten=setting.straighten), num_particles=50, camera=camera, motion=noise.motion,
+        merging=MergeOptions(**setting.merging), num_particles=50, camera=camera, motion=noise.motion,
         **setting.filter,
     )  # fmt: skip
     starts = run.true_paths[:, 0]
+    ledger = ClaimLedger(robots, run.landmarks, np.ones(len(run.landmarks), dtype=np.bool_), cutoff=1.0)
+    follower = Follower(team, ledger, starts)
     broken = not setting.forced and rng.random() < 0.5
     up = np.ones((robots, robots), dtype=np.bool_)
-    for reading in run.readings():
+    for step, (reading, names) in enumerate(zip(run.readings(), run.names, strict=True)):
         if broken:
             change = np.triu(np.where(up, rng.random(up.shape) < LOSES, rng.random(up.shape) < FINDS), 1)
             up = up ^ (change | change.T)
-        team.step(reading["odometry"], reading["measurements"], up)
+        ledger.record(team.step(reading["odometry"], reading["measurements"], up), names)
         if setting.forced and not team.events and min(len(team.map(robot)) for robot in range(2)) >= ENOUGH:
             team.merge(0, 1, forced_alignment(starts, team.map(0), team.map(1), rng, setting.shift))
-    placed = [inverse(team.start_from_group(robot)) for robot in range(robots)]
-    return fates(team.events, starts, placed, seed, "aisles", f"classes of {look_alikes}", run.num_steps)
+        follower.note(step)
+    return fates(team.events, starts, seed, "aisles", f"classes of {look_alikes}", run.num_steps, follower)
 
 
 def force(env: ExplorationEnv, rng: np.random.Generator, shift: float | None) -> None:
@@ -271,92 +218,6 @@ def coinciding(points_a: FloatArray, points_b: FloatArray, motion: FloatArray) -
     return np.column_stack([rows, nearest])[mutual]
 
 
-def off_by(starts: FloatArray, event: MergeEvent, motion: FloatArray) -> tuple[float, float]:
-    """Return by how much [m, degrees] a motion between two groups' frames is wrong."""
-    error = between(between(starts[event.robots_a[0]], starts[event.robots_b[0]]), motion)
-    return float(np.hypot(*error[:2])), float(abs(np.degrees(error[2])))
-
-
-def fates(
-    events: Sequence[MergeEvent], starts: FloatArray, placed: Sequence[FloatArray], seed: int, world: str, alike: str,
-    steps: int,
-) -> Fates:  # fmt: skip
-    """Return what became of the merges of a run that has ended after so many steps, and which came later.
-
-    Args:
-        events: Of the run.
-        starts: (K, 3) true start poses, world frame.
-        placed: (K, 3) start poses as believed at the end, each in its map frame.
-        seed, world, alike: Of the run.
-        steps: Of the run.
-    """
-    found = []
-    for i, event in enumerate(events):
-        if event.kind == "merge":
-            undone = next((e.step for e in events[i:] if e.kind == "undo" and e.alignment is event.alignment), None)
-            end = between(placed[event.robots_a[0]], placed[event.robots_b[0]])
-            found.append(
-                MergeFate(
-                    seed, world, alike, event.step, event.robots_a, event.robots_b,
-                    *off_by(starts, event, event.alignment.transform), *off_if_bent(starts, events[:i], event),
-                    None if undone is None else undone - event.step, steps - event.step,
-                    *(off_by(starts, event, end) if undone is None else (float("nan"), float("nan"))),
-                )
-            )  # fmt: skip
-    return found, delays(events, seed)
-
-
-def off_if_bent(starts: FloatArray, before: Sequence[MergeEvent], merge: MergeEvent) -> tuple[float, float]:
-    """Return by how much [m, degrees] the maps of a merge were off before they were straightened; NaN if they were not.
-
-    Args:
-        starts: As in `fates`.
-        before: The events before the merge, the attempt that led to it among them.
-        merge: The merge.
-    """
-    attempt = next((event for event in before if event.alignment is merge.alignment), None)
-    nothing = float("nan"), float("nan")
-    return nothing if attempt is None or attempt.bent is None else off_by(starts, attempt, attempt.bent.transform)
-
-
-def delays(events: Sequence[MergeEvent], seed: int) -> list[Delay]:
-    """Return the attempts of a run that were refused only because maps were straightened."""
-    found = []
-    for i, event in enumerate(events):
-        if event.bent is not None and not event.alignment.success:
-            pair = {event.robots_a[0], event.robots_b[0]}
-            merged = (e.step for e in events[i:] if e.kind == "merge" and len(pair & {*e.robots_a, *e.robots_b}) == 2)
-            later = next(merged, None)
-            found.append(Delay(seed, event.step, event.alignment.reason, later and later - event.step))
-    return found
-
-
-def summarise(merges: list[MergeFate], late: list[Delay], runs: int, steps: int) -> dict[str, Any]:
-    """Return the figures of all runs together."""
-    false = [merge for merge in merges if merge.is_false]
-    right = [merge for merge in merges if not merge.is_false]
-    after = [merge.undone_after for merge in false if merge.undone_after is not None]
-    bent = any(np.isfinite(merge.bent_m) for merge in merges)
-    return {
-        "runs": runs,
-        "steps": steps,
-        "merges": len(merges),
-        "right_merges": len(right),
-        "right_merges_undone": sum(merge.undone_after is not None for merge in right),
-        "false_merges": len(false),
-        "false_merges_undone": len(after),
-        "false_merges_in_force": sum(merge.counts for merge in false),
-        "false_at_the_end": sum(is_false_merge(merge.end_m, merge.end_deg) for merge in merges),
-        "steps_until_undone_median": float(np.median(after)) if after else float("nan"),
-        "rms_error_m": float(np.sqrt(np.mean([merge.error_m**2 for merge in merges]))) if merges else float("nan"),
-        "largest_error_m": max((merge.error_m for merge in merges), default=float("nan")),
-        "false_had_they_been_bent": sum(is_false_merge(merge.bent_m, merge.bent_deg) for merge in merges),
-        "rms_error_had_they_been_bent_m": float(np.sqrt(np.nanmean([m.bent_m**2 for m in merges]))) if bent else None,
-        "refused_once_straight": len(late),
-        "never_merged_after_that": sum(delay.merged_after is None for delay in late),
-    }
-
-
 def main(
     minutes: Annotated[float, typer.Option(help="How long; the last run is played to its end.")] = 10.0,
     first_seed: Annotated[int, typer.Option(help="Of the first run.")] = 100,
@@ -368,6 +229,7 @@ def main(
         int | None, typer.Option(help="Steps of a filter between its rejuvenations.", show_default="the default")
     ] = None,
     straighten: Annotated[bool, typer.Option(help="Straighten maps before they merge.")] = True,
+    sure: Annotated[float, typer.Option(help="Deviations a merge has to be sure by; 0: none.")] = MergeOptions().sure,
     json_file: Annotated[Path | None, typer.Option("--json", help="Write all figures to this file.")] = None,
 ) -> None:
     """Run the soak and print it."""
@@ -381,7 +243,7 @@ def main(
     check_int("first_seed", first_seed, 0, "Seeds are not negative.")
     if json_file is not None:
         check_writable(json_file, "json")
-    setting = Setting(forced=forced, shift=shift, rejuvenate_every=rejuvenate_every, straighten=straighten)
+    setting = Setting(forced=forced, shift=shift, rejuvenate_every=rejuvenate_every, straighten=straighten, sure=sure)
     console = Console(highlight=False, soft_wrap=True)
     merges: list[MergeFate] = []
     late: list[Delay] = []
@@ -395,7 +257,8 @@ def main(
         merges, late, played, steps = merges + found, late + delayed, played + 1, steps + length
         for merge in found:
             fate = (
-                f"in force, {merge.end_m:.2f} m {merge.end_deg:.1f} deg off at the end"
+                f"in force, {merge.later_m:.2f} m {merge.later_deg:.1f} deg off later, {merge.end_m:.2f} m "
+                f"{merge.end_deg:.1f} deg at the end"
                 if merge.undone_after is None
                 else f"undone after {merge.undone_after} steps"
             )
