@@ -76,7 +76,7 @@ def _outline(
 
 
 def best_outline(maps: ParticleMaps, m: int, min_count: int) -> MapOutline:
-    """Return the outline of `best_map`: the same landmarks in the same order. Fresh arrays."""
+    """Return the outline of `best_map`, which takes the same: the same landmarks in the same order. Fresh arrays."""
     room = len(maps.ids)
     means, variances = np.empty((room, 3)), np.empty(room)
     times, names = np.empty(room, np.int64), np.empty(room, np.int64)
@@ -91,10 +91,16 @@ def best_outline(maps: ParticleMaps, m: int, min_count: int) -> MapOutline:
 
 
 def best_map(maps: ParticleMaps, m: int, min_count: int) -> tuple[FloatArray, FloatArray, Any, IntArray, IntArray]:
-    """Return what particle m holds with at least so many measurements, by ascending id.
+    """Return what one particle holds, by ascending id.
+
+    Args:
+        maps: Of all particles.
+        m: Which of them.
+        min_count: What it measured fewer times, 1 at least, is left out.
 
     Returns:
-        Means (n, 3), covariances (n, 3, 3), descriptors (n, d) float32, counts (n,) and ids (n,): all fresh.
+        Means (n, 3) [m], covariances (n, 3, 3) [m^2], map frame, descriptors (n, d) float32, counts (n,) and ids (n,):
+        all fresh.
     """
     slots, ascending = _held(maps.ids, maps.row_of, maps.map_of, maps.maps, maps.counts, m, min_count)
     if not ascending:

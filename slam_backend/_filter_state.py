@@ -187,4 +187,5 @@ class FilterState:
 
 
 def _copies(estimates: Sequence[PoseEstimate]) -> tuple[PoseEstimate, ...]:
+    """Return the same estimates in arrays of their own."""
     return tuple(PoseEstimate(estimate.mean.copy(), estimate.covariance.copy()) for estimate in estimates)

@@ -72,7 +72,12 @@ class FrameBuffers:
             self._new_slots = np.zeros(2 * most, dtype=np.int64)
 
     def take(self, frame: Measurements | None, names: IntArray | None) -> Turn:
-        """Return a robot's readings as the kernels take them, with room for what becomes of them."""
+        """Return a robot's readings as the kernels take them, with room for what becomes of them.
+
+        Args:
+            frame: What it measured; None: nothing.
+            names: (n,) int64 the caller's names of that, -1 for what is to be rejected; None: unknown.
+        """
         if frame is None:
             frame = EMPTY
         points, covariances, descriptors = frame.points, frame.covariances, frame.descriptors

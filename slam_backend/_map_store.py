@@ -98,13 +98,19 @@ class MapStore:
     # ------------------------------------------------------------------ room
 
     def make_room(self, new: int, descriptor_size: int) -> None:
-        """See to it that `new` landmarks can start, and a row is left to bring landmarks up to date."""
+        """See to it that `new` landmarks can start, and a row is left to bring landmarks up to date.
+
+        Args:
+            new: How many at most.
+            descriptor_size: d of the landmarks; that of the map, if there are any.
+        """
         if self.tops[1] < new:
             self._grow_slots(max(64, len(self.ids), new - int(self.tops[1])), descriptor_size)
         if self.tops[0] < new + 1:
             self._grow_rows(max(64, len(self.counts) // 2, new + 1))
 
     def _grow_slots(self, extra: int, descriptor_size: int) -> None:
+        """Provide so many more slots, with room for descriptors of that size."""
         old = len(self.ids)
         for name, fill in (("row_of", 0), ("map_of", 0), ("ids", -1), ("identities", -1)):
             setattr(self, name, np.concatenate([getattr(self, name), np.full(extra, fill, dtype=np.int64)]))
@@ -129,6 +135,7 @@ class MapStore:
         self.tops[1] = extra + top
 
     def _grow_rows(self, extra: int) -> None:
+        """Provide so many more rows."""
         old, padded = len(self.counts), self.padded
         values = aligned(((old + extra) * 9 * padded,), np.float64)
         values[: len(self.values)] = self.values

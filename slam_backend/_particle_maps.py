@@ -82,18 +82,18 @@ class ParticleMaps(MapStore):
         self.odds[new_slots[new_slots >= 0]] = self.log_odds_prior
 
     def odds_of_particle(self, m: int, slots: IntArray) -> FloatArray:
-        """Return log-odds (n,) of one particle."""
+        """Return the log-odds (n,) of the slots (n,) of particle m. A copy."""
         return np.asarray(self.odds[slots, np.where(self.map_of[slots] > 0, self.maps[self.map_of[slots], m], m)])
 
     def dense_odds(self, slots: IntArray) -> FloatArray | None:
-        """Return log-odds (n, M) of all particles, None where existence is not kept. A copy."""
+        """Return the log-odds (n, M) of slots (n,) in all particles, None where existence is not kept. A copy."""
         if self.log_odds_prior is None:
             return None
         self.refresh(slots)
         return self.odds[slots][:, : self.num_particles]
 
     def release(self, slots: IntArray) -> None:
-        """Forget landmarks, up to date, that no particle holds."""
+        """Forget the landmarks of slots (n,), up to date, that no particle holds."""
         _existence_kernels.release(
             slots, self.ids, self.row_of, self.heads, self.free_rows, self.free_slots, self.tops, _kernels.FAR
         )
@@ -108,7 +108,7 @@ class ParticleMaps(MapStore):
         return blocks[rows, places // LANES, :, places % LANES], self.counts[rows, places]
 
     def dense(self, slots: IntArray) -> tuple[FloatArray, NDArray[np.int32]]:
-        """Return values (n, 9, M) and counts (n, M) of all particles. Copies."""
+        """Return values (n, 9, M) and counts (n, M) of slots (n,) in all particles. Copies."""
         self.refresh(slots)
         rows, m = self.row_of[slots], self.num_particles
         blocks = self.blocks[rows]
@@ -119,9 +119,15 @@ class ParticleMaps(MapStore):
         self, values: FloatArray, counts: NDArray[np.integer[Any]], descriptors: NDArray[np.float32], ids: IntArray,
         identities: IntArray, next_id: int, odds: FloatArray | None = None,
     ) -> None:  # fmt: skip
-        """Replace all landmarks by these: values (n, 9, M), counts and odds (n, M), one row each of the others.
+        """Replace all landmarks by these; those that no particle holds are left out.
 
-        Where existence is kept and `odds` are not given, landmarks get the prior.
+        Args:
+            values: (n, 9, M) float64 [m, m^2], map frame. Means and upper triangles of covariances.
+            counts: (n, M). 0 where the particle lacks it.
+            descriptors: (n, d) float32.
+            ids, identities: (n,) int64. Stable names, and the caller's own, -1 = none.
+            next_id: The name that the next landmark will get.
+            odds: (n, M) float64, log-odds of existence; None: where existence is kept, landmarks get the prior.
         """
         keep = (counts > 0).any(axis=1)
         padded = np.zeros((int(keep.sum()), 9, self.padded))
@@ -136,7 +142,10 @@ class ParticleMaps(MapStore):
     ) -> None:  # fmt: skip
         """Replace all landmarks by these, each held by a particle: `load` with values as `blocks` holds them.
 
-        Where rows of `tiles` are `chosen` (n,), all else is of these, in their order.
+        Args:
+            tiles: (n, P / lanes, 9, lanes) float64.
+            counts, descriptors, ids, identities, next_id, odds: As of `load`.
+            chosen: (n,) rows of `tiles`; all else is of these, in their order. None: all of them.
         """
         n, m = len(ids), self.num_particles
         self._clear(m)

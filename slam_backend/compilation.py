@@ -74,9 +74,11 @@ def log_compilation() -> None:
 
 
 def _name(event: Any) -> str:
+    """Return the dotted name of the function that an event of numba is about."""
     function = event.data["dispatcher"].py_func
     return f"{function.__module__}.{function.__qualname__}"
 
 
 def _is_ours(event: Any) -> bool:
+    """Tell whether it is one of this project."""
     return _name(event).split(".")[0] in PACKAGES

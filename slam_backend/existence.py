@@ -146,4 +146,5 @@ class View(NamedTuple):
 
 
 def _log_odds(probability: float) -> float:
+    """Return log p / (1 - p) of a probability in (0, 1)."""
     return log(probability / (1.0 - probability))

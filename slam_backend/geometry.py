@@ -53,7 +53,7 @@ def compose(a_from_b: ArrayLike, b_from_c: ArrayLike) -> FloatArray:
 
 
 def inverse(a_from_b: ArrayLike) -> FloatArray:
-    """Turn a motion around: the pose (..., 3) of a in b from the pose (..., 3) of b in a."""
+    """Turn a motion around: the pose (..., 3) [m, m, rad] of a in b from the pose (..., 3) of b in a."""
     a = np.asarray(a_from_b, dtype=np.float64)
     if a.shape == ONE:
         return _inverse_one(a.tolist())
@@ -70,12 +70,14 @@ def inverse(a_from_b: ArrayLike) -> FloatArray:
 
 
 def _compose_one(a: list[float], b: list[float]) -> FloatArray:
+    """Chain two motions (3,), as `compose` does, without the cost of arrays."""
     c, s = float(np.cos(a[2])), float(np.sin(a[2]))
     x, y = a[0] + c * b[0] - s * b[1], a[1] + s * b[0] + c * b[1]
     return np.array([x, y, (a[2] + b[2] + math.pi) % (2.0 * math.pi) - math.pi])
 
 
 def _inverse_one(a: list[float]) -> FloatArray:
+    """Turn one motion (3,) around, as `inverse` does, likewise."""
     c, s = float(np.cos(a[2])), float(np.sin(a[2]))
     return np.array([-c * a[0] - s * a[1], s * a[0] - c * a[1], (math.pi - a[2]) % (2.0 * math.pi) - math.pi])
 

@@ -130,6 +130,7 @@ class Group:
 
 
 def _oldest_unknown(branch: Branch, now: int) -> int:
+    """Return the first step that a filter may still have to take in; the next one if there is none."""
     if not branch.watches and len(branch.live) == len(branch.robots):
         return now + 1
     held = [1 + last for robot, last in branch.known.items() if robot not in branch.live]
@@ -143,5 +144,6 @@ def _oldest_of(watch: Watch) -> int:
 
 
 def _numbers(watch: Watch) -> set[int]:
+    """Return the numbers of the maps that an undo of a merge would take up again."""
     older = [_numbers(one) for side in watch.sides for one in side.watches]
     return {side.trunk["number"] for side in watch.sides}.union(*older)

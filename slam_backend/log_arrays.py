@@ -84,6 +84,7 @@ class LogArrays:
         return sum(array.nbytes for array in self._columns().values() if array is not None)
 
     def _columns(self) -> dict[str, Any]:
+        """Return all arrays by name."""
         return {column.name: getattr(self, column.name) for column in fields(self)}
 
     def row(self, t: int) -> LogStep:
@@ -132,6 +133,7 @@ class LogArrays:
 
 
 def _from_columns(columns: dict[str, Any]) -> LogArrays:
+    """Build a log from its arrays, as unpickling does."""
     return LogArrays(**columns)
 
 

@@ -129,6 +129,7 @@ def _fit_triples(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray, 
 
 
 def _checked(points_a: Any, points_b: Any, least: int = MINIMAL) -> tuple[FloatArray, FloatArray]:
+    """Return two arrays (n, 3) of partners, n >= `least`."""
     a = check_array("points_a", points_a, (None, 3), "Give one row x y z per point.")
     b = check_array("points_b", points_b, (len(a), 3), "Give the partner of each point of a.")
     if len(a) < least:

@@ -133,11 +133,13 @@ class RobotLog:
         return bad_argument(name, f"an array of shape {shape}", f"shape {value.shape}", cure)
 
     def _room_for_covariances(self) -> FloatArray:
+        """Return the open chunk's covariances, NaN where none were given."""
         if self._covariances is None:
             self._covariances = np.full((len(self._ids), 6), np.nan)
         return self._covariances
 
     def _room_for_descriptor_rows(self) -> IntArray:
+        """Return the open chunk's rows of descriptors, -1 where none were given."""
         if self._descriptor_rows is None:
             self._descriptor_rows = np.full(len(self._ids), -1, dtype=np.int64)
         return self._descriptor_rows
@@ -273,6 +275,7 @@ class RobotLog:
 
 
 def _restored(state: Mapping[str, Any]) -> RobotLog:
+    """Build a log from `get_state`, as copying does."""
     log = RobotLog()
     log.set_state(state)
     return log

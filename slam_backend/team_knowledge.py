@@ -182,9 +182,11 @@ class TeamKnowledge:
         return Standpoint(branch.robots, branch.live, branch.number, pose, own_pose, start_from_group)
 
     def _group_of(self, robot: int) -> Group:
+        """Return the robot's group."""
         return self._place(robot)[0]
 
     def _branch(self, robot: int) -> Branch:
+        """Return the branch that the robot goes by."""
         return self._place(robot)[1]
 
     def _find(self, robot: int) -> tuple[Branch, int]:

@@ -237,6 +237,7 @@ class StereoFrontEnd:
         )
 
     def _check(self, name: str, image: Any) -> Image:
+        """Return an image of the camera's size."""
         checked = check_image(name, image)
         expected = (self.camera.height, self.camera.width)
         if checked.shape != expected:

@@ -207,6 +207,7 @@ def load_euroc_eye(path: str | Path) -> Eye:
 
 
 def _text(file: Path) -> str:
+    """Return what a file says."""
     try:
         return file.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:

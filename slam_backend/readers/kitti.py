@@ -163,6 +163,7 @@ def read_truth(file: Path, times: FloatArray) -> Trajectory:
 
 
 def _check(file: Path, key: str, fine: bool, expected: str) -> None:
+    """Raise unless an entry of a file is fine."""
     if not fine:
         cure = f"Get {str(file)!r} again."
         raise bad_argument("path", f"{file.name} with {expected} in {key!r}", "a different one", cure)

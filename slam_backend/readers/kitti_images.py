@@ -106,6 +106,7 @@ def read_grey(file: Path) -> Image:
 
 
 def _eyes(folder: Path) -> tuple[Path, Path] | None:
+    """Return the folders of the left and the right images, None if there are none."""
     for left, right in EYES:
         if (folder / left).is_dir() and (folder / right).is_dir():
             return folder / left, folder / right
@@ -113,6 +114,7 @@ def _eyes(folder: Path) -> tuple[Path, Path] | None:
 
 
 def _times(file: Path, count: int) -> FloatArray:
+    """Return the times (count,) [s] of the images; without a file of them the usual ones."""
     if not file.is_file():
         return np.arange(count, dtype=np.float64) * PERIOD
     try:

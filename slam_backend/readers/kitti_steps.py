@@ -103,6 +103,7 @@ def track_descriptors(tracks: IntArray) -> FloatArray:
 
 
 def _frame(log: KittiLog, camera: StereoCamera, tracks: IntArray, pixels: FloatArray) -> Measurements | None:
+    """Return what is near enough to be known of tracks (n,) with pixels (n, 4), all at the height of the camera."""
     disparity = pixels[:, 0] - pixels[:, 2]
     near = disparity * camera.max_range >= camera.focal_px * camera.baseline
     if not near.any():

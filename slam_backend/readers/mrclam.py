@@ -116,6 +116,7 @@ def _check_robots(folder: Path, robots: Sequence[int] | None) -> tuple[int, ...]
 
 
 def _read_robot(folder: Path, robot: int, subject_of: dict[int, int], truth_file: Path | None) -> RobotLog:
+    """Read the files of one robot; what it saw of other robots is left out."""
     commands = _read_table(folder / f"Robot{robot}_Odometry.dat", ("time", "velocity", "angular_velocity"))
     rows = _read_table(folder / f"Robot{robot}_Measurement.dat", ("time", "barcode", "range", "bearing"), empty=True)
     seen = np.array([subject_of.get(int(barcode), 0) for barcode in rows[:, 1]], dtype=np.float64)
@@ -197,5 +198,6 @@ def _parse(body: str) -> list[float] | None:
 
 
 def _bad_line(file: Path, number: int, line: str, columns: tuple[str, ...], rule: str) -> ValueError:
+    """Say what is wrong with a line of a file."""
     expected = f"{len(columns)} numbers ({' '.join(columns)}){rule}"
     return bad_argument("path", expected, repr(line.strip()), f"Correct line {number} of {file}.")

@@ -133,6 +133,7 @@ def steps(
 def _robot_steps(
     log: RobotLog, times: FloatArray, subjects: IntArray, noise: SightingNoise, drive: Drive
 ) -> RobotSteps:
+    """Return the steps of one robot at these times (T,) [s]."""
     velocities = drive.driven(log.commands)
     path = integrate_commands(velocities, times)
     odometry = np.concatenate([np.zeros((1, 3)), between(path[:-1], path[1:])])

@@ -136,4 +136,5 @@ def _trees(file: Path, number: int, cell: Any) -> FloatArray:
 
 
 def _bad(file: Path, expected: str, got: str) -> ValueError:
+    """Say what is wrong with a file."""
     return bad_argument("path", f"{file.name} with {expected}", got, f"Get {str(file)!r} again.")

@@ -88,6 +88,7 @@ def axle_velocities(controls: FloatArray) -> FloatArray:
 
 
 def _frame(trees: FloatArray, noise: TreeNoise) -> Measurements | None:
+    """Return the trees (n, 3) of a scan as measurements, which all look alike; None if there are none."""
     if not len(trees):
         return None
     variances = np.tile([noise.range**2, noise.bearing**2, noise.height**2], (len(trees), 1))
