@@ -15,7 +15,7 @@ from slam_backend.log_arrays import LogArrays
 from slam_backend.reports import PoseEstimate
 from slam_backend.run_log import RobotLog
 from slam_backend.smoothing.coarsening import coarsened
-from slam_backend.smoothing.extending import first_rows
+from slam_backend.smoothing.extending import Places, first_rows
 from slam_backend.smoothing.graph import PathGraph, mean_pose
 from slam_backend.smoothing.joining import joined
 from slam_backend.smoothing.options import SmoothingOptions
@@ -99,7 +99,7 @@ class RejuvenationStep:
     # ------------------------------------------------------------------ where there is time for it
 
     def run(
-        self, logs: Sequence[RobotLog], starts: FloatArray, maps: ParticleMaps, camera: FloatArray,
+        self, logs: Sequence[RobotLog], starts: FloatArray, maps: ParticleMaps, best: int, camera: FloatArray,
         rng: np.random.Generator,
     ) -> Rejuvenation | None:  # fmt: skip
         """Do what is to be done now: all that is due, or a slice of it; None if there is nothing to tell of it.
@@ -108,6 +108,7 @@ class RejuvenationStep:
             logs: Per robot.
             starts: (K, 3, M) where the robots started, map frame.
             maps: Of the present particles; only looked at.
+            best: The most probable of them.
             camera: (7,) as kernels take it.
             rng: Source of the draws.
         """
@@ -121,7 +122,7 @@ class RejuvenationStep:
             return _told(graph, "poses that were given as exact")
         smoother = Smoother(options.motion, camera, options.smoothing, rng)
         if whole:
-            return self._whole(graph, _since(logs, graph), smoother, maps.num_particles, self._looks(maps))
+            return self._whole(graph, _since(logs, graph), smoother, maps, best)
         self._graph, self._held = graph, False
         if (draft := self._draft) is not None:
             return self._after(draft.graph, smoother.descend(draft), _since(logs, graph, draft.graph), smoother)
@@ -131,14 +132,16 @@ class RejuvenationStep:
             if waiting < share:
                 return None
             taken = [first_rows(log, share) for log in _since(logs, graph)]
-            return self._after(graph, smoother.take_in(graph, taken, self._guesses), taken, smoother)
+            outcome = smoother.take_in(graph, taken, self._guesses, _places(maps, best))
+            return self._after(graph, outcome, taken, smoother)
         last = _since(logs, graph)
-        outcome = smoother.draw(graph, last, self._guesses, maps.num_particles, self._looks(maps))
-        if isinstance(outcome, Rejuvenation):
+        places, looks = _places(maps, best), self._looks(maps)
+        drawn = smoother.draw(graph, last, self._guesses, places, maps.num_particles, looks)
+        if isinstance(drawn, Rejuvenation):
             self._rest()
-            self._keep(outcome.graph)
-            return outcome
-        return self._after(graph, outcome, last, smoother)
+            self._keep(drawn.graph)
+            return drawn
+        return self._after(graph, drawn, last, smoother)
 
     def _looks(self, maps: ParticleMaps) -> Looks:
         """Return the appearance of landmarks that no caller has named."""
@@ -179,12 +182,12 @@ class RejuvenationStep:
     # ------------------------------------------------------------------ what came of it
 
     def _whole(
-        self, graph: PathGraph, logs: Sequence[LogArrays], smoother: Smoother, num_particles: int, looks: Looks
+        self, graph: PathGraph, logs: Sequence[LogArrays], smoother: Smoother, maps: ParticleMaps, best: int
     ) -> Rejuvenation:
         """Do all at once."""
         result = rejuvenate(
-            graph, logs, smoother.motion, smoother.camera, num_particles, smoother.rng, smoother.options,
-            self._guesses, looks,
+            graph, logs, smoother.motion, smoother.camera, maps.num_particles, smoother.rng, smoother.options,
+            self._guesses, self._looks(maps), _places(maps, best),
         )  # fmt: skip
         self._rest()
         if np.isfinite(result.ess):
@@ -266,6 +269,15 @@ class RejuvenationStep:
             setattr(self, name, value)
         self._last_seen = dict(state["last_seen"])
         self._guesses = [dict(guesses) for guesses in state["guesses"]]
+
+
+def _places(maps: ParticleMaps, best: int) -> Places:
+    """Return where the most probable particle holds its landmarks to be."""
+    slots = maps.used_slots()
+    slots = slots[np.argsort(maps.ids[slots])]
+    values, counts = maps.of_particle(best, slots)
+    held = counts > 0
+    return Places(maps.ids[slots[held]], values[held, :3])
 
 
 def _since(logs: Sequence[RobotLog], graph: PathGraph, until: PathGraph | None = None) -> list[LogArrays]:

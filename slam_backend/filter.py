@@ -213,7 +213,9 @@ class FastSlam(FilterKnowledge):
     def _rejuvenate(self, smoother: RejuvenationStep) -> RejuvenationReport | None:
         """Draw the particles anew from the posterior of whole paths, if it is time and that can be found."""
         starts = self._starts[:, :, : self.num_particles]
-        result = smoother.run(self._logs, starts, self._maps, self._assumed.camera, self._rng)
+        result = smoother.run(
+            self._logs, starts, self._maps, self.best_particle, self._assumed.camera, self._rng
+        )  # fmt: skip
         if result is None:
             return None
         if result.particles is not None:

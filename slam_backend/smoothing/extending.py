@@ -14,6 +14,18 @@ from slam_backend.smoothing._walking import walk
 from slam_backend.smoothing.graph import LEVER, PathGraph
 
 
+class Places(NamedTuple):
+    """Where a filter holds landmarks to be.
+
+    Attributes:
+        ids: (n,) int64, ascending.
+        means: (n, 3) float64 [m], map frame.
+    """
+
+    ids: IntArray
+    means: FloatArray
+
+
 class _Part(NamedTuple):
     """One robot's new keys, frames and measurements; keys and frames are counted from 0, `NONE` is the old tip."""
 
@@ -34,6 +46,7 @@ def extended(
     mount: FloatArray,
     guesses: Sequence[Mapping[int, FloatArray]] | None = None,
     rigid_within: float = 0.0,
+    places: Places | None = None,
 ) -> PathGraph:
     """Return the graph with what the robots did since.
 
@@ -48,6 +61,9 @@ def extended(
         mount: (3,) [m] of the camera on the robot.
         guesses: Per robot where it may be after some of these steps (3,), map frame; else odometry says.
         rigid_within: [m]. See `SmoothingOptions`.
+        places: Where the filter holds landmarks to be: those start there of which most sightings are new, for their
+            first one may lie far off, and a robust kernel would then hold against the others that they contradict it.
+            None, or where poses start from odometry: where they were, or were first seen.
 
     Raises:
         ValueError: If a log holds a pose that was given as exact: there is nothing to smooth.
@@ -75,6 +91,8 @@ def extended(
     first_seen = np.column_stack([points[:, :2] + mount[:2], points[:, 2] + mount[2]])
     first_seen[:, :2] = at[:, :2] + np.einsum("nij,nj->ni", rotation(at[:, 2]), first_seen[:, :2])
     landmark_ids, landmarks, rows = _with_new(graph, ids, first_seen)
+    if places is not None and len(places.ids) and guesses is not None and all(map(_guided, logs, guesses)):
+        landmarks = _started(graph, landmark_ids, landmarks, rows, places)
     return replace(
         graph,
         robots=np.concatenate([graph.robots, *(np.full(len(part.poses), i) for i, part in enumerate(parts))]),
@@ -96,6 +114,29 @@ def extended(
         tips=tips,
         latest=np.array([log.steps[-1] if len(log) else graph.latest[i] for i, log in enumerate(logs)], dtype=np.int64),
     )  # fmt: skip
+
+
+def _guided(log: LogArrays, guesses: Mapping[int, FloatArray]) -> bool:
+    """Return whether there is a guess for the first step that measured something, and so for all."""
+    measured = np.flatnonzero(np.diff(log.starts))
+    return not len(measured) or int(log.steps[measured[0]]) in guesses
+
+
+def _started(graph: PathGraph, ids: IntArray, landmarks: FloatArray, rows: IntArray, places: Places) -> FloatArray:
+    """Return the landmarks (l, 3), of which those start where the filter has them that are mostly seen anew.
+
+    Args:
+        graph: As it stood.
+        ids: (l,) int64. Names of all landmarks, the graph's first.
+        landmarks: (l, 3) float64 [m], map frame.
+        rows: (n,) int64. Of the new measurements among `ids`.
+        places: Of the filter; at least one.
+    """
+    before = np.bincount(graph.frozen_landmarks, weights=graph.counts, minlength=len(ids))
+    before += np.bincount(graph.point_landmarks, minlength=len(ids))
+    at = np.minimum(np.searchsorted(places.ids, ids), len(places.ids) - 1)
+    anew = (np.bincount(rows, minlength=len(ids)) > before) & (places.ids[at] == ids)
+    return np.where(anew[:, None], places.means[at], landmarks)
 
 
 def scatter(noises: FloatArray) -> FloatArray:

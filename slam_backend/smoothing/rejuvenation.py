@@ -15,7 +15,7 @@ from slam_backend.motion import OdometryModel
 from slam_backend.resampling import effective_sample_size, systematic
 from slam_backend.smoothing.coarsening import at_mode, coarsened, compacted
 from slam_backend.smoothing.duplicates import find_duplicates, without_duplicates
-from slam_backend.smoothing.extending import extended, first_rows
+from slam_backend.smoothing.extending import Places, extended, first_rows
 from slam_backend.smoothing.graph import PathGraph
 from slam_backend.smoothing.options import SmoothingOptions
 from slam_backend.smoothing.sampling import Draws, draw_paths, scouted
@@ -96,6 +96,7 @@ def rejuvenate(
     options: SmoothingOptions,
     guesses: Sequence[Mapping[int, FloatArray]] | None = None,
     looks: Looks | None = None,
+    places: Places | None = None,
 ) -> Rejuvenation:
     """Take in what the robots did since, smooth, and draw particles.
 
@@ -112,6 +113,7 @@ def rejuvenate(
         options: What decides the rest.
         guesses: Per robot where it may be after some of the new steps (3,), map frame.
         looks: For landmarks that turn out to be one. None: all are what they are called.
+        places: Where the filter holds landmarks to be, see `extended`.
 
     Returns:
         The graph to go on with, and M particles, or why there are none.
@@ -124,7 +126,7 @@ def rejuvenate(
     while True:
         last = all(len(log) <= share for log in rest)
         first = [first_rows(log, share) for log in rest]
-        grown = extended(graph, first, motion, camera[4:], guesses, options.rigid_within)
+        grown = extended(graph, first, motion, camera[4:], guesses, options.rigid_within, places)
         mode = find_mode(grown, camera, options if last else near)
         if mode.reason:
             return Rejuvenation(graph, mode.reason, float("nan"), mode.iterations, None)

@@ -15,7 +15,7 @@ from slam_backend.errors import FloatArray
 from slam_backend.log_arrays import REJECTED, LogArrays
 from slam_backend.motion import OdometryModel
 from slam_backend.smoothing.coarsening import at_mode
-from slam_backend.smoothing.extending import extended
+from slam_backend.smoothing.extending import Places, extended
 from slam_backend.smoothing.graph import PathGraph
 from slam_backend.smoothing.options import SmoothingOptions
 from slam_backend.smoothing.rejuvenation import Looks, Rejuvenation, drawn, settled
@@ -58,7 +58,7 @@ class Smoother:
 
     @on_one_thread
     def take_in(
-        self, graph: PathGraph, logs: Sequence[LogArrays], guesses: Sequence[Mapping[int, FloatArray]]
+        self, graph: PathGraph, logs: Sequence[LogArrays], guesses: Sequence[Mapping[int, FloatArray]], places: Places
     ) -> PathGraph | Draft | str:
         """Take in all rows of the logs, which are few, and do one step.
 
@@ -66,11 +66,12 @@ class Smoother:
             graph: At its mode.
             logs: Per robot, of the steps after `graph.latest`.
             guesses: Per robot where it may be after some of these steps (3,), map frame.
+            places: Where the filter holds landmarks to be, see `extended`.
 
         Returns:
             As of `descend`.
         """
-        grown = extended(graph, logs, self.motion, self.camera[4:], guesses, self.options.rigid_within)
+        grown = extended(graph, logs, self.motion, self.camera[4:], guesses, self.options.rigid_within, places)
         return self.descend(Draft(graph=grown))
 
     @on_one_thread
@@ -93,20 +94,21 @@ class Smoother:
         graph: PathGraph,
         logs: Sequence[LogArrays],
         guesses: Sequence[Mapping[int, FloatArray]],
+        places: Places,
         num_particles: int,
         looks: Looks,
     ) -> Rejuvenation | PathGraph | Draft | str:
         """Take in the logs' last rows, and draw particles, if so few steps end the descent.
 
         Args:
-            graph, logs, guesses: As of `take_in`.
+            graph, logs, guesses, places: As of `take_in`.
             num_particles: M.
             looks: For landmarks that turn out to be one.
 
         Returns:
             What came of the draws, or else as of `descend`.
         """
-        grown = extended(graph, logs, self.motion, self.camera[4:], guesses, self.options.rigid_within)
+        grown = extended(graph, logs, self.motion, self.camera[4:], guesses, self.options.rigid_within, places)
         draft = Draft(graph=grown)
         mode = find_mode(grown, self.camera, self.options, LAST_STEPS)
         if not mode.reason:

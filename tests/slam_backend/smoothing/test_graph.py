@@ -3,10 +3,13 @@ import pytest
 from small_problems import camera_of, graph_of, logs_of, small_run
 
 from slam_backend.geometry import between, compose
-from slam_backend.smoothing.extending import chained, first_rows
+from slam_backend.run_log import RobotLog
+from slam_backend.smoothing.coarsening import at_mode
+from slam_backend.smoothing.extending import Places, chained, extended, first_rows
 from slam_backend.smoothing.graph import PathGraph
 from slam_backend.smoothing.options import SmoothingOptions
 from slam_backend.smoothing.rejuvenation import rejuvenate
+from slam_backend.smoothing.solving import find_mode
 
 
 def test_chained_odometry_has_the_spread_of_its_samples():
@@ -30,6 +33,52 @@ def test_a_log_can_be_taken_in_part_by_part():
     assert first.steps.tolist() == log.steps[:5].tolist()
     assert len(first.ids) == log.starts[5]
     assert len(first_rows(log, 1000)) == len(log)
+
+
+def misplaced(run, name, by):
+    """Return the log of a run's only robot whose first sighting of a landmark lies `by` [m] farther off."""
+    log, moved = RobotLog(), False
+    for row in logs_of(run)[0]:
+        points = row.points.copy()
+        if not moved and name in row.ids:
+            points[row.ids == name] *= 1.0 + by / np.linalg.norm(points[row.ids == name])
+            moved = True
+        log.append(row.step, row.motion if row.kind else None, points=points, ids=row.ids)
+    return log.arrays()
+
+
+def test_a_landmark_seen_mostly_anew_starts_where_the_filter_has_it():
+    """One false first sighting does not hold a landmark against many: the kernel gives up the one, not the many.
+
+    Without what the filter thinks it does. What is mostly old stays where it was, and so does all where poses start
+    from odometry.
+    """
+    run = small_run()
+    name, first = 6, 5  # seen in twelve steps, in this one first
+    assert [name in names for (names,) in run.names].index(True) == first
+    log = misplaced(run, name, by=3.0)
+    motion, camera, mount = run.spec.noise.motion, camera_of(run), np.array(run.spec.noise.camera.mount)
+    options = SmoothingOptions()
+    start = extended(PathGraph.at_starts(run.true_paths[:, 0]), [first_rows(log, first + 1)], motion, mount)
+    start = at_mode(start, find_mode(start, camera, options))
+    assert np.linalg.norm(start.landmarks[start.landmark_ids == name][0] - run.landmarks[name]) > 1.0
+    rest = [log.since(first + 1)]
+    guesses = [dict(enumerate(run.true_paths[0]))]
+    places = Places(np.arange(120), run.landmarks + 0.02)
+
+    def error(guesses, places):
+        graph = extended(start, rest, motion, mount, guesses, places=places)
+        mode = find_mode(graph, camera, options)
+        assert mode.reason == ""
+        return np.linalg.norm(mode.landmarks[graph.landmark_ids == name][0] - run.landmarks[name])
+
+    assert error(guesses, places) < 0.05
+    assert error(guesses, None) > 2.0
+    assert error([{}], places) == error([{}], None)
+    few = [first_rows(rest[0], 1)]
+    grown = extended(start, few, motion, mount, guesses, places=places)
+    old = np.flatnonzero(np.isin(grown.landmark_ids, start.landmark_ids))
+    np.testing.assert_array_equal(grown.landmarks[old], start.landmarks[old])
 
 
 def test_a_long_log_taken_in_at_once_ends_where_short_ones_do():

@@ -11,12 +11,13 @@ from slam_backend.filter import FastSlam
 from slam_backend.geometry import wrap_angle
 from slam_backend.motion import OdometryModel
 from slam_backend.smoothing import slices
-from slam_backend.smoothing.extending import first_rows
+from slam_backend.smoothing.extending import Places, first_rows
 from slam_backend.smoothing.graph import PathGraph
 from slam_backend.smoothing.options import SmoothingOptions
 from slam_backend.smoothing.slices import Draft, Smoother
 from slam_backend.smoothing.solving import find_mode
 
+NOWHERE = Places(np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
 IN_SLICES = SmoothingOptions(slice_steps=8, max_keys=20, fresh_keys=8)
 
 
@@ -28,7 +29,7 @@ def test_slices_end_where_all_at_once_does():
     logs = [log.arrays() for log in logs_of(run)]
     for upto in range(4, run.num_steps + 4, 4):
         part = [first_rows(log, upto).since(int(graph.latest[0]) + 1) for log in logs]
-        state = smoother.take_in(graph, part, [{}, {}])
+        state = smoother.take_in(graph, part, [{}, {}], NOWHERE)
         while isinstance(state, Draft):
             state = smoother.descend(state)
             steps += 1
