@@ -13,7 +13,7 @@ import numpy as np
 
 from slam_backend.branches import restored_filter
 from slam_backend.errors import FloatArray
-from slam_backend.geometry import between, inverse
+from slam_backend.geometry import between
 from slam_backend.reports import MergeEvent
 from slam_backend.team import TeamSlam
 from training.episode import is_false_merge
@@ -115,11 +115,14 @@ class Follower:
             if event.kind == "merge" and step - event.step <= WINDOW:
                 if i not in self.wrong_pairs:
                     self.wrong_pairs[i] = self._share_of_wrong_pairs(event)
-                self.later[i] = self.off_now(event)
+                if undone_in(self._team.events, event) is None:
+                    self.later[i] = self.off_now(event)
 
     def off_now(self, merge: MergeEvent) -> tuple[float, float]:
-        """Return by how much [m, degrees] one group's frame is off in the other's as the team has it now."""
-        starts = [inverse(self._team.start_from_group(group[0])) for group in (merge.robots_a, merge.robots_b)]
+        """Return by how much [m, degrees] one group's frame is off in the other's as their joint filter has it now."""
+        trunk = self._team._group_of(merge.robots_a[0]).trunk
+        robots = (group[0] for group in (merge.robots_a, merge.robots_b))
+        starts = [trunk.filter.start_pose(trunk.robots.index(robot)) for robot in robots]
         return off_by(self._starts, merge, between(*starts))
 
     def _share_of_wrong_pairs(self, merge: MergeEvent) -> float:

@@ -22,8 +22,10 @@ class AttemptOptions:
     Attributes:
         every: At most one pair tries in so many steps.
         new_candidates: A refused pair tries again only when so many of its candidate matches are new, or the last
-            attempt is more than `longest_wait` steps ago: by then the same landmarks are known better.
-        longest_wait: After each refusal a pair waits twice as long as before, at most so many steps.
+            attempt is more than `longest_wait` steps ago: by then the same landmarks are known better. If its maps did
+            align, and were refused only when they were straight, it needs no new ones.
+        longest_wait: After each refusal a pair waits twice as long as before, at most so many steps; or longer, after
+            one for which logs were smoothed (`AttemptSchedule.record`).
         enabled: Whether any pair tries at all.
     """
 

@@ -1,4 +1,4 @@
-"""`MergeOptions`: how two groups' filters become one, and how long the team doubts that it was right."""
+"""`MergeOptions`: how two groups' filters become one, how sure they must be, and how long the team doubts it."""
 
 from dataclasses import dataclass
 from typing import Literal
