@@ -1,12 +1,14 @@
-"""What all particles together say: mixtures of their Gaussians, of a pose and of landmarks."""
+"""What particles together say: mixtures of their Gaussians, of a pose and of landmarks."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from slam_backend.errors import FloatArray
 from slam_backend.geometry import wrap_angle
+from slam_backend.landmark_map import LandmarkMap
 from slam_backend.plain.frame import Landmark
+from slam_backend.plain.particles import Particle
 from slam_backend.plain.pose_belief import PoseBelief
 from slam_backend.reports import PoseEstimate
 
@@ -45,3 +47,26 @@ def landmark_mixture(landmarks: Sequence[Landmark], weights: FloatArray) -> tupl
     for share, one in zip(shares, landmarks, strict=True):
         covariance += share * (one.covariance + np.outer(one.mean - mean, one.mean - mean))
     return mean, covariance
+
+
+def landmark_map(best: Particle, holders: Sequence[Particle], descriptors: Mapping[int, FloatArray]) -> LandmarkMap:
+    """Return the landmarks of one particle, each as the mixture of what some particles hold of it.
+
+    Args:
+        best: Which says what landmarks there are, at least one, and how often they were measured.
+        holders: Whose estimates are mixed; `best` among them.
+        descriptors: (d,) by landmark.
+
+    Returns:
+        By ascending id, map frame.
+    """
+    names = sorted(best.landmarks)
+    found = []
+    for name in names:
+        sharers = [particle for particle in holders if name in particle.landmarks]
+        weights = np.exp([particle.log_weight for particle in sharers])
+        found.append(landmark_mixture([particle.landmarks[name] for particle in sharers], weights))
+    means, covariances = zip(*found, strict=True)
+    looks = np.array([descriptors[name] for name in names], np.float32)
+    counts = [best.landmarks[name].count for name in names]
+    return LandmarkMap(np.array(means), np.array(covariances), looks, np.array(counts), np.array(names))

@@ -16,16 +16,16 @@ from slam_backend.filter_options import FilterOptions
 from slam_backend.geometry import compose
 from slam_backend.landmark_map import LandmarkMap
 from slam_backend.measurements import Measurements
-from slam_backend.plain.estimates import landmark_mixture, pose_mixture
+from slam_backend.plain.estimates import landmark_map, pose_mixture
 from slam_backend.plain.existence import weigh_existence
 from slam_backend.plain.fastslam1 import fastslam1_turn
 from slam_backend.plain.fastslam2 import fastslam2_turn
 from slam_backend.plain.frame import Frame
 from slam_backend.plain.particles import Particle, descendants
 from slam_backend.plain.pose_belief import PoseBelief, wrapped
-from slam_backend.plain.turn import NEW, Candidates, RobotStep, Turn
+from slam_backend.plain.turn import NEW, Candidates, RobotStep, Turn, report_of
 from slam_backend.reports import PoseEstimate, StepReport
-from slam_backend.resampling import RESAMPLING, effective_sample_size
+from slam_backend.resampling import RESAMPLING
 
 
 class PlainFastSlam:
@@ -102,18 +102,9 @@ class PlainFastSlam:
 
     def _map_of(self, best: Particle, estimate: str) -> LandmarkMap:
         """Return the landmarks that one particle holds, as `map` says."""
-        names = sorted(best.landmarks)
-        if not names:
+        if not best.landmarks:
             return LandmarkMap.empty(self._descriptor_size)
-        found = []
-        for name in names:
-            holders = [p for p in self.particles if name in p.landmarks] if estimate == "mixture" else [best]
-            weights = np.exp([p.log_weight for p in holders])
-            found.append(landmark_mixture([p.landmarks[name] for p in holders], weights))
-        means, covariances = zip(*found, strict=True)
-        descriptors = np.array([self.descriptors[name] for name in names], np.float32)
-        counts = [best.landmarks[name].count for name in names]
-        return LandmarkMap(np.array(means), np.array(covariances), descriptors, np.array(counts), np.array(names))
+        return landmark_map(best, self.particles if estimate == "mixture" else [best], self.descriptors)
 
     # ------------------------------------------------------------------ one step
 
@@ -260,27 +251,8 @@ class PlainFastSlam:
         return pose_mixture([particle.posteriors[robot] for particle in self.particles], self.weights)
 
     def _report(self, records: list[RobotStep], best: int) -> StepReport:
-        """Tell what particle `best` did, and whether the particles are to be resampled (l. 10)."""
-        associations = tuple(record.associations[:, best] for record in records)
-        created = tuple(record.created for record in records)
-        given, started = np.concatenate(associations), np.concatenate(created)
-        num_new = int(np.sum((given >= 0) & (given == started)))
-        num_rejected = int(np.sum(given < 0))
-        distances = np.concatenate([record.distances[:, best] for record in records])
-        distances = distances[~np.isnan(distances)]
-        ess = effective_sample_size(self.weights)
-        threshold = self.options.resample_threshold * len(self.particles) * (1.0 + 1e-9)  # rounding must not decide
-        measured = any(record.measured for record in records)
-        return StepReport(
-            associations=associations,
-            created=created,
-            num_new=num_new,
-            num_matched=len(given) - num_new - num_rejected,
-            num_rejected=num_rejected,
-            ess=ess,
-            nis=float(distances[distances < np.inf].mean()) if (distances < np.inf).any() else float("nan"),
-            resampled=measured and ess <= threshold,
-        )
+        """Tell what particle `best` did in this step."""
+        return report_of(records, best, self.weights, self.options.resample_threshold)
 
     def _resample(self) -> None:
         """Draw the particles anew in proportion to their weights; all that a particle holds is copied with it."""

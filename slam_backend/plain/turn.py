@@ -1,5 +1,6 @@
-"""What goes into and comes out of one robot's turn, whatever the proposal: in one particle, and in all."""
+"""What goes into and comes out of one robot's turn, whatever the proposal: in one particle, in all, in the report."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -7,6 +8,8 @@ import numpy as np
 from slam_backend.errors import FloatArray
 from slam_backend.plain.frame import Landmark
 from slam_backend.plain.pose_belief import PoseBelief
+from slam_backend.reports import StepReport
+from slam_backend.resampling import effective_sample_size
 
 REJECTED = -1
 NEW = -2  # minus b: the landmark that measurement b starts, until all particles have decided and it gets its name
@@ -52,3 +55,34 @@ class RobotStep:
         self.created = np.full(size, -1, np.int64)
         self.log_likelihoods = np.zeros(num_particles)
         self.measured = False
+
+
+def report_of(records: Sequence[RobotStep], best: int, weights: FloatArray, resample_threshold: float) -> StepReport:
+    """Tell what one particle did in a step, and whether the particles are to be resampled (l. 10).
+
+    Args:
+        records: Of all robots.
+        best: The most probable particle.
+        weights: (M,) float64, summing to 1, after the step.
+        resample_threshold: Share of M below which the effective sample size asks for it.
+    """
+    associations = tuple(record.associations[:, best] for record in records)
+    created = tuple(record.created for record in records)
+    given, started = np.concatenate(associations), np.concatenate(created)
+    num_new = int(np.sum((given >= 0) & (given == started)))
+    num_rejected = int(np.sum(given < 0))
+    distances = np.concatenate([record.distances[:, best] for record in records])
+    judged = distances[distances < np.inf]  # neither NaN nor infinite
+    ess = effective_sample_size(weights)
+    threshold = resample_threshold * len(weights) * (1.0 + 1e-9)  # rounding must not decide
+    measured = any(record.measured for record in records)
+    return StepReport(
+        associations=associations,
+        created=created,
+        num_new=num_new,
+        num_matched=len(given) - num_new - num_rejected,
+        num_rejected=num_rejected,
+        ess=ess,
+        nis=float(judged.mean()) if len(judged) else float("nan"),
+        resampled=measured and ess <= threshold,
+    )
