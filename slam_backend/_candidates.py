@@ -4,6 +4,7 @@ import numpy as np
 
 from slam_backend import _alignment_kernels as kernels
 from slam_backend._matching import look_alikes, mutual_nearest, unlike_other_places
+from slam_backend._packed import UPPER
 from slam_backend.alignment_types import AlignmentOptions
 from slam_backend.errors import BoolArray, FloatArray, IntArray, bad_argument
 from slam_backend.landmark_map import LandmarkMap
@@ -48,10 +49,17 @@ def candidates(map_a: LandmarkMap, map_b: LandmarkMap, options: AlignmentOptions
 
 
 def match_table(map_a: LandmarkMap, map_b: LandmarkMap, matches: IntArray) -> FloatArray:
-    """Return the (k, 18) table of matched landmarks that the kernels read."""
-    upper = np.triu_indices(3)
+    """Return the table of matched landmarks that the kernels of alignment read.
+
+    Args:
+        map_a, map_b: Both maps.
+        matches: (k, 2) int64 rows (row in a, row in b).
+
+    Returns:
+        (k, 18) float64: means of a and b [m], upper triangles of their covariances [m^2], each in its map's frame.
+    """
     table = np.empty((len(matches), kernels.MATCH_COLUMNS))
     for offset, source, rows in ((0, map_a, matches[:, 0]), (1, map_b, matches[:, 1])):
         table[:, 3 * offset : 3 * offset + 3] = source.means[rows]
-        table[:, 6 + 6 * offset : 12 + 6 * offset] = source.covariances[rows][:, upper[0], upper[1]]
+        table[:, 6 + 6 * offset : 12 + 6 * offset] = source.covariances[rows][:, *UPPER]
     return table

@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from slam_backend._packed import UNPACK, UPPER
 from slam_backend.errors import BoolArray, FloatArray, IntArray
 from slam_backend.geometry import between, compose, rotation
 from slam_backend.smoothing.extending import chained
@@ -159,16 +160,6 @@ def _joined(graph: PathGraph, representative: IntArray) -> PathGraph:
     )
 
 
-def _full(upper: FloatArray) -> FloatArray:
-    """Return symmetric matrices (n, 3, 3) of upper triangles (n, 6)."""
-    return upper[:, [[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
-
-
-def _upper(full: FloatArray) -> FloatArray:
-    """Return the upper triangles (n, 6) of symmetric matrices (n, 3, 3)."""
-    return full[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
-
-
 def _moved(graph: PathGraph, rows: IntArray, offsets: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return centres, informations and slopes of the frozen sightings, `rows` of them moved by their keys' offsets."""
     centres, infos, slopes = graph.centres.copy(), graph.infos.copy(), graph.slopes.copy()
@@ -177,7 +168,7 @@ def _moved(graph: PathGraph, rows: IntArray, offsets: FloatArray) -> tuple[Float
     turn[:, :2, :2], turn[:, 2, 2] = rotation(by[:, 2]), 1.0
     centres[rows] = np.einsum("nij,nj->ni", turn, centres[rows])
     centres[rows, :2] += by[:, :2]
-    infos[rows] = _upper(turn @ _full(infos[rows]) @ turn.transpose(0, 2, 1))
+    infos[rows] = (turn @ infos[rows][:, UNPACK] @ turn.transpose(0, 2, 1))[:, *UPPER]
     slopes[rows] = np.einsum("nij,nj->ni", turn, slopes[rows])
     return centres, infos, slopes
 
@@ -195,7 +186,7 @@ def _combined(
     new[1:] = (keys[1:] != keys[:-1]) | (landmarks[1:] != landmarks[:-1])
     first, other = np.flatnonzero(new), np.flatnonzero(~new)
     shift = centres[first][np.cumsum(new)[other] - 1] - centres[other]
-    slopes[other] -= np.einsum("nij,nj->ni", _full(infos[other]), shift)
+    slopes[other] -= np.einsum("nij,nj->ni", infos[other][:, UNPACK], shift)
     return (
         keys[first], landmarks[first], centres[first], np.add.reduceat(infos, first), np.add.reduceat(slopes, first),
         np.add.reduceat(counts, first),

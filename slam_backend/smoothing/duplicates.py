@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from slam_backend._packed import UNPACK
 from slam_backend.errors import FloatArray, IntArray
 from slam_backend.smoothing.graph import PathGraph
 from slam_backend.smoothing.sampling import Draws
@@ -13,7 +14,6 @@ from slam_backend.smoothing.solving import Mode
 
 REACH = 0.5  # [m]; no duplicates are sought farther apart
 GATE = 7.81  # squared Mahalanobis distance, 95 % of 3 degrees of freedom
-UNPACK = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 
 
 def find_duplicates(
