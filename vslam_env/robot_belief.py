@@ -31,7 +31,7 @@ def cautious_filter() -> FilterOptions:
     return FilterOptions(
         camera=StereoCamera(sigma_px=2.0 * true.sigma_px, sigma_disparity_px=2.0 * true.sigma_disparity_px),
         rejuvenate_every=100,
-        smoothing=SmoothingOptions(max_keys=90, further_keys=0, slice_steps=90, rigid_within=0.01),
+        smoothing=SmoothingOptions(max_keys=90, further_keys=0, slice_steps=90, rigid_within=0.007),
     )
 
 
