@@ -25,7 +25,6 @@ class Mode:
         landmarks: (l, 3) float64 [m], map frame.
         columns: (k,) int64. First row of each key in `factor`, `FREE` where the pose is given.
         factor: (n, n) float64, upper triangle U with U^T U the information of the paths, landmarks integrated out.
-        slope: (n,) float64. Of half the cost there, landmarks at their best.
         sightings: As linearised there.
         odometry_infos: (k, 3, 3) float64. Information of the odometry from the key before; zeros where there is none.
         cost: Half the sum of squared distances (robust, and up to a constant of the frozen sightings).
@@ -38,7 +37,6 @@ class Mode:
     landmarks: FloatArray
     columns: IntArray
     factor: FloatArray
-    slope: FloatArray
     sightings: Sightings
     odometry_infos: FloatArray
     cost: float
@@ -76,9 +74,7 @@ def find_mode(
     most = options.max_iterations if most is None else most
 
     def given_up(reason: str, iterations: int = 0, cost: float = np.inf) -> Mode:
-        return Mode(
-            poses, landmarks, columns, empty, np.zeros(0), sightings, informations, cost, iterations, damping, reason
-        )
+        return Mode(poses, landmarks, columns, empty, sightings, informations, cost, iterations, damping, reason)
 
     if not size:
         return given_up("no pose to seek")
@@ -94,17 +90,16 @@ def find_mode(
         factor = system.factor(damping)
         if factor is None:
             return given_up("a singular system", iteration)
-        slope = system.vector.copy()
-        change = -lapack.dpotrs(factor, slope, lower=0)[0]
+        change = -lapack.dpotrs(factor, system.vector, lower=0)[0]
         if not np.abs(change).max() < LARGEST_STEP:
             return given_up("a descent that leaves the world", iteration)
-        expected = -0.5 * float(slope @ change)
+        expected = -0.5 * float(system.vector @ change)  # if the cost were a parabola
         trial_poses, trial_landmarks = poses.copy(), landmarks.copy()
         trial_poses[sought] += change.reshape(-1, 3)
         system.move(trial_landmarks, change)
         if expected <= options.tolerance and damping == 0.0:
             return Mode(
-                trial_poses, trial_landmarks, columns, factor, slope, sightings, informations, cost - expected,
+                trial_poses, trial_landmarks, columns, factor, sightings, informations, cost - expected,
                 iteration, damping, "",
             )  # fmt: skip
         trial_cost = system.form(trial_poses, trial_landmarks)

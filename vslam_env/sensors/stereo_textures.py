@@ -111,7 +111,7 @@ def draw_textures(walls: FloatArray, rng: np.random.Generator, config: TextureCo
         for face in (2 * wall, 2 * wall + 1):
             count = int(columns[face])
             if photographs is not None:
-                picture = _photographed(rows, count, photographs, stream)
+                picture = _photographed(count, photographs, stream)
             else:
                 picture = _draw_face(rows, count, config, poster, stream)
             sums[starts[face] : starts[face + 1]] = cv2.integral(picture, sdepth=cv2.CV_32S).T
@@ -139,7 +139,7 @@ def load_photographs(folder: str | Path, rows: int) -> list[Image]:
     return photographs
 
 
-def _photographed(rows: int, columns: int, photographs: list[Image], rng: np.random.Generator) -> Image:
+def _photographed(columns: int, photographs: list[Image], rng: np.random.Generator) -> Image:
     """Cover a face with photographs side by side, the first one begun anywhere."""
     strips: list[Image] = []
     missing = columns
