@@ -2,6 +2,7 @@
 
 import math
 from copy import deepcopy
+from functools import partial
 
 import numpy as np
 
@@ -69,6 +70,7 @@ def merge_groups(
     records: Records,
     rng: np.random.Generator,
     epoch: int,
+    known: bool = False,
 ) -> tuple[Group, Renaming]:
     """Merge the joint filters of two groups; robots out of contact keep their forks. The merge is then watched.
 
@@ -80,13 +82,14 @@ def merge_groups(
         records: Of the team.
         rng: For pairing and draws.
         epoch: Of the joint filter.
+        known: As of `merge_filters`; mixtures are always merged so.
 
     Raises:
         ValueError: If the inliers name rows that do not exist or the same one twice; nothing has changed then.
     """
     a, b = group_a.trunk, group_b.trunk
     pairs = _named(alignment, a.filter, b.filter)
-    combine = merge_filters if merging.method == "particles" else merge_mixtures
+    combine = partial(merge_filters, known=known) if merging.method == "particles" else merge_mixtures
     joint, renamed = combine(a.filter, b.filter, alignment, pairs, rng, merging.merged_particles)
     robots, live = a.robots + b.robots, a.live + b.live
     joint.reorder(np.argsort(robots))

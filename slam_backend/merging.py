@@ -61,6 +61,7 @@ def merge_filters(
     pairs: IntArray,
     rng: np.random.Generator,
     num_particles: int | None = None,
+    known: bool = False,
 ) -> tuple[FastSlam, IntArray]:
     """Merge two filters into a joint one in a's map frame (Secs. 3.2 and 4).
 
@@ -72,6 +73,7 @@ def merge_filters(
         pairs: (k, 2) int64 rows (landmark id in a, landmark id in b) in common, one-to-one.
         rng: For the pairing and the draws of T.
         num_particles: Of the joint filter; None: as many as the larger of the two.
+        known: The motion is drawn from the alignment, whatever the landmarks in common say of it.
 
     Returns:
         The joint filter, a's robots first; and (n, 2) int64 rows (id in b, id in the joint map) of all of b's
@@ -79,7 +81,7 @@ def merge_filters(
     """
     count = max(a.num_particles, b.num_particles) if num_particles is None else num_particles
     side_a, side_b = _side(a, pairs[:, 0]), _side(b, pairs[:, 1])
-    from_a, from_b, motion, evidence, extra, scale = _pair_up(side_a, side_b, alignment, count, rng)
+    from_a, from_b, motion, evidence, extra, scale = _pair_up(side_a, side_b, alignment, count, rng, known)
     (_, dense_a, shared_a), (_, dense_b, shared_b) = side_a, side_b
 
     joint = joined_robots(a, from_a, b, from_b, motion, rng)
@@ -143,7 +145,7 @@ def _side(slam: FastSlam, shared: IntArray) -> "tuple[FloatArray, _Dense, IntArr
 
 def _pair_up(
     side_a: "tuple[FloatArray, _Dense, IntArray]", side_b: "tuple[FloatArray, _Dense, IntArray]",
-    alignment: Alignment, count: int, rng: np.random.Generator,
+    alignment: Alignment, count: int, rng: np.random.Generator, known: bool = False,
 ) -> _Pairing:  # fmt: skip
     """Draw pairs of particles and their motions; a side is its weights, its landmarks, and the rows shared."""
     (weights_a, dense_a, shared_a), (weights_b, dense_b, shared_b) = side_a, side_b
@@ -156,7 +158,7 @@ def _pair_up(
     aligned = _align_pairs(*common, from_a, from_b, alignment.transform, extra)
     motions, informations, chi2, log_dets, shared = aligned
     scale = _contradiction(chi2, shared) if extra == MOST_EXTRA else 1.0
-    evidence, factors = _weigh(motions, informations, chi2, log_dets, shared, scale, alignment)
+    evidence, factors = _weigh(motions, informations, chi2, log_dets, shared, scale, alignment, known)
     weights = np.exp(evidence - evidence.max())
     chosen = systematic(weights / weights.sum(), rng, count)
     draws = rng.standard_normal((count, 3))
@@ -307,12 +309,14 @@ def _weigh(
     shared: IntArray,
     scale: float,
     alignment: Alignment,
+    known: bool,
 ) -> tuple[FloatArray, FloatArray]:
     """Return log-evidences (c,) and factors (c, 3, 3) with C C^T the covariance of each pair's motion.
 
-    Pairs of particles that share too little take the consensus motion, and the smallest evidence of the others.
+    Pairs of particles that share too little take the consensus motion, and the smallest evidence of the others. Where
+    the motion is `known`, all do.
     """
-    poor = shared < MIN_PAIRS
+    poor = (shared < MIN_PAIRS) | known
     informations = np.where(poor[:, None, None], np.eye(3), informations)
     covariances = scale * np.linalg.inv(informations)
     motions[poor] = alignment.transform

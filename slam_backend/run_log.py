@@ -186,6 +186,13 @@ class RobotLog:
             first -= 1
         return join([*self._chunks[first:], self._unfinished()]).since(since)
 
+    @property
+    def has_exact_poses(self) -> bool:
+        """Whether a pose was given as exact in any step."""
+        return any(
+            (kinds == EXACT).any() for kinds in (*(c.kinds for c in self._chunks), self._kinds[: self._num_rows])
+        )
+
     def num_since(self, since: int) -> int:
         """Return how many steps there are with an index of at least `since`; cost O(number of chunks with such)."""
         count = self._num_rows - int(np.searchsorted(self._steps[: self._num_rows], since))

@@ -172,7 +172,7 @@ class TeamSlam(TeamKnowledge):
         self._records.note_created(branch, branch.live, self._step, report)
         self._records.exchange.record_step(branch.robots, report, branch.filter.descriptor_size, branch.live)
 
-    def merge(self, robot_a: int, robot_b: int, alignment: Alignment) -> Renaming:
+    def merge(self, robot_a: int, robot_b: int, alignment: Alignment, known: bool = False) -> Renaming:
         """Merge the joint filters of two robots' groups with a given alignment, unasked whether it is right.
 
         The merge is then watched like any other; `MergeOptions(watch_steps=0)` makes it final.
@@ -182,6 +182,8 @@ class TeamSlam(TeamKnowledge):
             robot_b: Such a robot of the other.
             alignment: Motion from the map frame of b's group to that of a's; `inliers` are rows of `map(robot_a)` and
                 `map(robot_b)`, none if the landmarks in common are not known.
+            known: The motion is drawn from the alignment's covariance as it stands. Else the landmarks in common
+                correct it, for each pair of particles by itself, and the covariance counts where they are few.
 
         Returns:
             How landmark ids changed; `robots_a` is the group whose frame stays, the one with the lowest robot.
@@ -205,7 +207,7 @@ class TeamSlam(TeamKnowledge):
         if groups[1].robots < groups[0].robots:
             groups, alignment = groups[::-1], inverse_alignment(alignment)
         epoch = self._epoch + 1
-        joint, renaming = merge_groups(*groups, alignment, self._merging, self._records, self._rng, epoch)
+        joint, renaming = merge_groups(*groups, alignment, self._merging, self._records, self._rng, epoch, known)
         self._epoch = epoch
         self._events.append(MergeEvent(self._step, "merge", groups[0].robots, groups[1].robots, alignment))
         self._replace(groups, [joint])

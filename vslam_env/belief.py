@@ -126,9 +126,9 @@ class TeamBelief:
                 self._slots[robot].update(self._grids[robot].cells, self._poses[robot], positions)
         return report
 
-    def merge(self, robot_a: int, robot_b: int, alignment: Alignment) -> Renaming:
+    def merge(self, robot_a: int, robot_b: int, alignment: Alignment, known: bool = False) -> Renaming:
         """Merge the groups of two robots with a given alignment of their filter maps; see `TeamSlam.merge`."""
-        renaming = self._team.merge(robot_a, robot_b, alignment)
+        renaming = self._team.merge(robot_a, robot_b, alignment, known)
         self._look_up_poses()
         self._grids.keep(self._tick + 1, renaming)
         self._grids.meet(self._mates, self._starts)

@@ -237,7 +237,7 @@ class Episode:
                     self._claims(a), self._claims(b), self.true_starts[a[0]], self.true_starts[b[0]]
                 )
                 if alignment is not None:
-                    self.ledger.rename(self.belief.merge(*speakers, alignment))
+                    self.ledger.rename(self.belief.merge(*speakers, alignment, known=True))
                     self.merge_ticks.append((self.tick, a, b))
                     merged = True
                     break

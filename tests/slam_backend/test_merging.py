@@ -219,6 +219,16 @@ def test_without_enough_common_landmarks_the_alignment_s_own_covariance_is_used(
     assert len(renamed) == 7
 
 
+def test_a_known_motion_is_taken_whatever_the_landmarks_say() -> None:
+    """Landmarks in common correct an alignment that is off, however sure it claims to be, unless it is known."""
+    off = (0.3, -0.2, 0.1)
+    for known, moved in ((False, (0.0, 0.0, 0.0)), (True, off)):
+        a, b = both()
+        joint, _ = merge_filters(a, b, known_alignment(1e-6, off), PAIRS, np.random.default_rng(1), known=known)
+        np.testing.assert_allclose(joint.start_pose(1), A_FROM_B + moved, atol=1e-4 if known else 0.05)
+        assert len(joint.map()) == len(LANDMARKS)
+
+
 @pytest.mark.parametrize("empty_first", [True, False])
 def test_a_filter_without_landmarks_joins_by_the_alignment_alone(empty_first: bool) -> None:
     """A robot that has seen nothing yet brings its pose, and nothing is lost."""

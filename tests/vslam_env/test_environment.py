@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from small_env import MEETING, room, small_env, turning, wander
 
-from slam_backend.geometry import between, compose, wrap_angle
+from slam_backend.geometry import between, compose, inverse, wrap_angle
 from vslam_env import World
 from vslam_env.actions import DISCRETE_COMMANDS, command_of
 from vslam_env.pose_errors import pose_errors
@@ -198,6 +198,18 @@ def test_oracle_merge_is_exact_and_alone() -> None:
     infos = env.step(turning(env.possible_agents))[4] if env.agents else None
     assert infos is not None
     assert all(info["merges"] == 1 and info["group_size"] == 2 and info["group"] == 0 for info in infos.values())
+
+
+def test_an_oracle_merge_is_not_corrected_by_landmarks() -> None:
+    """Maps of robots that know their poses lie in each other's start frames as truly as in their own."""
+    env = small_env(oracle_merge=True, oracle_pose=True, oracle_association=True, max_cycles=200)
+    env.reset(seed=5, options={"start_poses": MEETING})
+    for _ in range(60):
+        env.step(turning(env.agents))
+    assert env.events
+    assert np.allclose(env.episode.belief.start_from_group(1), inverse(between(*MEETING)), atol=1e-3)
+    infos = env.step(turning(env.agents))[4]
+    assert np.allclose(infos["robot_0"]["map_rmse"], infos["robot_1"]["map_rmse"], atol=1e-3)
 
 
 def test_beliefs_are_in_the_own_start_frame() -> None:

@@ -136,6 +136,18 @@ def test_where_there_is_nothing_to_smooth_the_filter_goes_on():
         assert np.isfinite(slam.pose(0).mean).all()
 
 
+@pytest.mark.parametrize("slice_steps", [None, 4])
+def test_a_filter_that_is_asked_once_knows_that_its_poses_were_given(slice_steps):
+    """Asked for new particles, in slices or not, a filter that is never rejuvenated says why there can be none."""
+    run = small_run()
+    slam = rejuvenated(run, every=None, smoothing=SmoothingOptions(slice_steps=slice_steps))
+    for step, reading in enumerate(run.readings()):
+        slam.step(**reading, poses=[run.true_paths[0, step]])
+    before = slam.get_state()
+    assert slam.rejuvenate().reason == "poses that were given as exact"
+    assert_same(slam.get_state(), before)
+
+
 def test_too_small_a_sample_size_is_refused():
     """Below the share of M that is asked for, the old particles stay, and the reason says the size."""
     run = small_run()
