@@ -148,6 +148,8 @@ class FilterState:
                 )  # fmt: skip
                 if self._rejuvenation is not None:
                     self._rejuvenation.note(robot, self._steps - 1, self._estimates[robot], exact[robot] is not None)
+                    if turn.names is None:
+                        self._rejuvenation.note_refused(robot, self._steps - 1, ids, turn.descriptors)
 
     # ------------------------------------------------------------------ snapshots
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from slam_backend._blas import on_one_thread
 from slam_backend._particle_maps import ParticleMaps
@@ -19,6 +20,7 @@ from slam_backend.smoothing.extending import Places, first_rows
 from slam_backend.smoothing.graph import PathGraph, mean_pose
 from slam_backend.smoothing.joining import joined
 from slam_backend.smoothing.options import SmoothingOptions
+from slam_backend.smoothing.reassociation import Known, Refused, taken_up
 from slam_backend.smoothing.rejuvenation import Looks, Rejuvenation, rejuvenate
 from slam_backend.smoothing.slices import Draft, Smoother
 
@@ -55,6 +57,7 @@ class RejuvenationStep:
         self._last_seen: dict[int, int] = {}  # landmark -> step of the filter's own count
         self._count = 0
         self._guesses: list[dict[int, FloatArray]] = [{} for _ in range(num_robots)]
+        self._refused: list[dict[int, Refused]] = [{} for _ in range(num_robots)]
 
     # ------------------------------------------------------------------ in each step
 
@@ -62,10 +65,17 @@ class RejuvenationStep:
         """Remember where a robot that read something was thought to be, or that it was told so."""
         if exact:
             self._exact = True
-            for guesses in self._guesses:
+            for guesses, refused in zip(self._guesses, self._refused, strict=True):
                 guesses.clear()
+                refused.clear()
         if not self._exact:
             self._guesses[robot][step] = estimate.mean
+
+    def note_refused(self, robot: int, step: int, ids: IntArray, descriptors: NDArray[np.float32]) -> None:
+        """Remember what was neither matched nor new of all that a robot measured without names: ids (n,), looks."""
+        rows = np.flatnonzero(ids < 0)
+        if len(rows) and not self._exact:
+            self._refused[robot][step] = Refused(rows, descriptors[rows])
 
     def count(self, associations: Sequence[IntArray]) -> None:
         """Count a step, in which each robot saw these landmarks (n_i,)."""
@@ -123,7 +133,7 @@ class RejuvenationStep:
             return _told(graph, "poses that were given as exact")
         smoother = Smoother(options.motion, camera, options.smoothing, rng)
         if whole:
-            return self._whole(graph, _since(logs, graph), smoother, maps, best)
+            return self._whole(graph, self._new(logs, graph, maps, best), smoother, maps, best)
         self._graph, self._held = graph, False
         if (draft := self._draft) is not None:
             return self._after(draft.graph, smoother.descend(draft), _since(logs, graph, draft.graph), smoother)
@@ -132,10 +142,10 @@ class RejuvenationStep:
         if waiting > 2 * share or not due:
             if waiting < share:
                 return None
-            taken = [first_rows(log, share) for log in _since(logs, graph)]
+            taken = [first_rows(log, share) for log in self._new(logs, graph, maps, best)]
             outcome = smoother.take_in(graph, taken, self._guesses, _places(maps, best))
             return self._after(graph, outcome, taken, smoother)
-        last = _since(logs, graph)
+        last = self._new(logs, graph, maps, best)
         places, looks = _places(maps, best), self._looks(maps)
         drawn = smoother.draw(graph, last, self._guesses, places, maps.num_particles, looks)
         if isinstance(drawn, Rejuvenation):
@@ -143,6 +153,21 @@ class RejuvenationStep:
             self._keep(drawn.graph)
             return drawn
         return self._after(graph, drawn, last, smoother)
+
+    def _new(
+        self, logs: Sequence[RobotLog], graph: PathGraph, maps: ParticleMaps, best: int
+    ) -> list[LogArrays]:  # fmt: skip
+        """Return what the logs hold after a graph's last steps; what was refused has a name where it must be."""
+        new = _since(logs, graph)
+        if not any(self._refused):
+            return new
+        slots = maps.used_slots()
+        slots = slots[maps.identities[slots] < 0]
+        values, counts = maps.of_particle(best, slots)
+        held = counts > 0
+        slots, values = slots[held], values[held]
+        known = Known(maps.ids[slots], values[:, :3], values[:, 3:], counts[held], maps.descriptors[slots])
+        return taken_up(new, self._refused, self._guesses, known, self._options)
 
     def _looks(self, maps: ParticleMaps) -> Looks:
         """Return the appearance of landmarks that no caller has named."""
@@ -177,6 +202,7 @@ class RejuvenationStep:
         self._draft = None if options.slice_steps is None else Draft(graph=self._graph)
         moved = [{step: compose(motion, guess) for step, guess in guesses.items()} for guesses in b._guesses]
         self._guesses = [dict(guesses) for guesses in a._guesses] + moved
+        self._refused = [dict(refused) for refused in (*a._refused, *b._refused)]
         self._read, self._exact = a._read + b._read, a._exact or b._exact
         self._waited = self._every
 
@@ -231,9 +257,10 @@ class RejuvenationStep:
     def _keep(self, graph: PathGraph) -> None:
         """Go on from a graph at its mode."""
         self._graph, self._failures = graph, 0
-        for guesses, latest in zip(self._guesses, graph.latest, strict=True):
+        for guesses, refused, latest in zip(self._guesses, self._refused, graph.latest, strict=True):
             for step in [step for step in guesses if step <= latest]:
                 del guesses[step]
+                refused.pop(step, None)
 
     def _rest(self) -> None:
         """Wait anew."""
@@ -245,6 +272,7 @@ class RejuvenationStep:
         if self._draft is not None:
             self._draft = replace(self._draft, graph=self._draft.graph.reordered(order))
         self._guesses = [self._guesses[robot] for robot in order]
+        self._refused = [self._refused[robot] for robot in order]
 
     # ------------------------------------------------------------------ snapshots
 
@@ -257,6 +285,7 @@ class RejuvenationStep:
             "schedule": {name: getattr(self, name) for name in SCHEDULE},
             "last_seen": dict(self._last_seen),
             "guesses": tuple(dict(guesses) for guesses in self._guesses),
+            "refused": tuple(dict(refused) for refused in self._refused),
         }
 
     def set_state(self, state: Mapping[str, Any]) -> None:
@@ -270,6 +299,7 @@ class RejuvenationStep:
             setattr(self, name, value)
         self._last_seen = dict(state["last_seen"])
         self._guesses = [dict(guesses) for guesses in state["guesses"]]
+        self._refused = [dict(refused) for refused in state["refused"]]
 
 
 def _places(maps: ParticleMaps, best: int) -> Places:

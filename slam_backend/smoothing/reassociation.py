@@ -1,0 +1,166 @@
+"""Refused measurements are taken up where they agree that a landmark lies elsewhere than its few sightings say.
+
+A landmark whose first sighting lay far off blocks itself: what is seen of it later lies beyond the gate, but is too
+near to something that looks the same to be new, and would be refused for ever. One refused measurement says nothing, it
+may be false; several from different frames that agree with each other are no accident.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_backend.camera import ROBOT_FROM_CAMERA
+from slam_backend.errors import BoolArray, FloatArray, IntArray
+from slam_backend.filter_options import FilterOptions
+from slam_backend.geometry import rotation
+from slam_backend.log_arrays import LogArrays
+
+NO_ONE = -1
+ROUNDING = 1e-12  # [m^2]; keeps covariances of sensors without noise invertible
+UNPACK = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])  # of an upper triangle by rows
+
+
+class Refused(NamedTuple):
+    """What of one robot's step was neither matched nor new.
+
+    Attributes:
+        rows: (n,) int64. Among the step's logged measurements.
+        descriptors: (n, d) float32.
+    """
+
+    rows: IntArray
+    descriptors: NDArray[np.float32]
+
+
+class Known(NamedTuple):
+    """Landmarks of a map that no caller has named.
+
+    Attributes:
+        ids: (l,) int64.
+        means: (l, 3) float64 [m], map frame.
+        covariances: (l, 6) float64 [m^2], upper triangles by rows.
+        counts: (l,) int. Sightings of each.
+        descriptors: (l, d) float32.
+    """
+
+    ids: IntArray
+    means: FloatArray
+    covariances: FloatArray
+    counts: NDArray[np.int32]
+    descriptors: NDArray[np.float32]
+
+
+class _Points(NamedTuple):
+    """Refused measurements where they lie: robot (n,), step (n,), row in the robot's log (n,), map frame, look."""
+
+    robots: IntArray
+    steps: IntArray
+    places: IntArray
+    means: FloatArray
+    covariances: FloatArray
+    descriptors: NDArray[np.float32]
+
+
+def taken_up(
+    logs: Sequence[LogArrays],
+    refused: Sequence[Mapping[int, Refused]],
+    guesses: Sequence[Mapping[int, FloatArray]],
+    known: Known,
+    options: FilterOptions,
+) -> list[LogArrays]:
+    """Return the logs in which refused measurements bear the name of the landmark that they must be of.
+
+    A refused measurement can be of the only landmark within `dead_radius` that looks like it, if nothing else of its
+    frame is. Those of one landmark that agree on its place, within `position_gate` of one from another frame, are taken
+    up if they outnumber its own sightings, and their mean is within `dead_zone` of it: farther off it is another one.
+
+    Args:
+        logs: Per robot.
+        refused: Per robot by step; steps that its log does not hold are passed over.
+        guesses: Per robot by step where it was (3,) [m, m, rad], map frame.
+        known: The map.
+        options: Gates and camera of the filter.
+    """
+    points = _located(logs, refused, guesses, options)
+    if points is None or not len(known.ids):
+        return list(logs)
+    owners = _owners(points, logs, known, options)
+    ids = [log.ids for log in logs]
+    for owner in np.unique(owners[owners != NO_ONE]):
+        members = np.flatnonzero(owners == owner)
+        members = members[_agreeing(points, members, options.position_gate)]
+        if len(members) <= max(1, known.counts[owner]):
+            continue
+        mean, covariance = _mean(points, members)
+        off, joint = mean - known.means[owner], covariance + known.covariances[owner][UNPACK]
+        if off @ np.linalg.solve(joint, off) <= options.dead_zone:
+            for n in members:
+                robot = int(points.robots[n])
+                if ids[robot] is logs[robot].ids:
+                    ids[robot] = logs[robot].ids.copy()
+                ids[robot][points.places[n]] = known.ids[owner]
+    return [replace(log, ids=own) for log, own in zip(logs, ids, strict=True)]
+
+
+def _located(
+    logs: Sequence[LogArrays],
+    refused: Sequence[Mapping[int, Refused]],
+    guesses: Sequence[Mapping[int, FloatArray]],
+    options: FilterOptions,
+) -> _Points | None:
+    """Return where what was refused lies in the map, seen from the guessed poses; None if there is nothing."""
+    found = []
+    for robot, (log, of_steps, poses) in enumerate(zip(logs, refused, guesses, strict=True)):
+        for step, what in of_steps.items():
+            t = int(np.searchsorted(log.steps, step))
+            if t == len(log) or log.steps[t] != step or step not in poses:
+                continue
+            places, pose = log.starts[t] + what.rows, poses[step]
+            turn = np.eye(3)
+            turn[:2, :2] = rotation(pose[2])
+            own = log.points[places]
+            if log.given[t] and log.covariances is not None:
+                spread = log.covariances[places][:, UNPACK]
+            else:
+                seen = options.camera.covariance(own @ ROBOT_FROM_CAMERA)
+                spread = ROBOT_FROM_CAMERA @ seen @ ROBOT_FROM_CAMERA.T
+            means = (own + np.asarray(options.camera.mount)) @ turn.T
+            means[:, :2] += pose[:2]
+            covariances = turn @ spread @ turn.T + ROUNDING * np.eye(3)
+            n = len(places)
+            found.append((np.full(n, robot), np.full(n, step), places, means, covariances, what.descriptors))
+    return _Points(*(np.concatenate(column) for column in zip(*found, strict=True))) if found else None
+
+
+def _owners(points: _Points, logs: Sequence[LogArrays], known: Known, options: FilterOptions) -> IntArray:
+    """Return the row (n,) in `known` of the only landmark that each point can be of; `NO_ONE`: none, or several."""
+    near = np.linalg.norm(points.means[:, None] - known.means, axis=2) <= options.dead_radius
+    alike = np.linalg.norm(points.descriptors[:, None] - known.descriptors, axis=2) <= options.descriptor_gate
+    fits = near & alike
+    owners = np.where(fits.sum(axis=1) == 1, fits.argmax(axis=1), NO_ONE)
+    for n in np.flatnonzero(owners != NO_ONE):
+        log = logs[points.robots[n]]
+        t = int(np.searchsorted(log.steps, points.steps[n]))
+        if (log.ids[log.starts[t] : log.starts[t + 1]] == known.ids[owners[n]]).any():
+            owners[n] = NO_ONE
+    return owners
+
+
+def _agreeing(points: _Points, members: IntArray, gate: float) -> BoolArray:
+    """Return which members (n,) lie where another one does that is of another frame."""
+    off = points.means[members][:, None] - points.means[members]
+    joint = points.covariances[members][:, None] + points.covariances[members]
+    squares = np.einsum("ijk,ijk->ij", off, np.linalg.solve(joint, off[..., None])[..., 0])
+    robots, steps = points.robots[members], points.steps[members]
+    others = (robots[:, None] != robots) | (steps[:, None] != steps)
+    return np.asarray(((squares <= gate) & others).any(axis=1))
+
+
+def _mean(points: _Points, members: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Return the mean (3,) of the members, each by what it knows, and its covariance (3, 3)."""
+    infos = np.linalg.inv(points.covariances[members])
+    covariance = np.linalg.inv(infos.sum(axis=0))
+    return covariance @ np.einsum("nij,nj->i", infos, points.means[members]), covariance

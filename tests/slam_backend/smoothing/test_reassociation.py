@@ -1,0 +1,118 @@
+"""What was refused is taken up where several measurements agree on a landmark's place, and else is not."""
+
+import numpy as np
+import pytest
+
+from slam_backend.camera import StereoCamera
+from slam_backend.filter import FastSlam
+from slam_backend.filter_options import FilterOptions
+from slam_backend.geometry import inverse, transform_points
+from slam_backend.log_arrays import REJECTED
+from slam_backend.measurements import Measurements
+from slam_backend.run_log import RobotLog
+from slam_backend.smoothing.reassociation import Known, Refused, taken_up
+
+OPTIONS = FilterOptions(camera=StereoCamera(sigma_px=0.2, sigma_disparity_px=0.1, mount=(0.1, 0.0, 0.9)))
+POSES = {4: np.array([0.0, 0.0, 0.3]), 5: np.array([0.4, 0.1, 0.2]), 7: np.array([0.9, 0.1, -0.1])}
+PLACE = np.array([5.0, 0.6, 1.2])
+LOOK, OTHER_LOOK = np.eye(4, dtype=np.float32)[:2]
+
+
+def seen_from(pose, place):
+    """Return a point (3,) as logs hold it: robot axes, from the camera centre."""
+    return transform_points(inverse(pose), place[None])[0] - OPTIONS.camera.mount
+
+
+def logs_and_refused(places, looks=None, ids=()):
+    """Return a robot's log of one refused measurement in each step, beside one of landmark 3, and what was refused."""
+    log, refused = RobotLog(), {}
+    for i, (step, pose) in enumerate(POSES.items()):
+        points = np.array([seen_from(pose, np.array([6.0, -1.0, 0.5])), seen_from(pose, places[i])])
+        log.append(step, None if i == 0 else np.array([0.4, 0.0, 0.0]), points=points, ids=np.array([3, REJECTED]))
+        refused[step] = Refused(np.array([1]), (LOOK if looks is None else looks[i])[None])
+    return [log.arrays()], [refused]
+
+
+def known(off=(0.0, 0.5, 0.0), count=1, sigma=0.2, look=LOOK):
+    """Return a map of landmark 9, off by so much from where it is seen [m], and of landmark 3."""
+    variances = np.array([sigma**2, 0.0, 0.0, sigma**2, 0.0, sigma**2])
+    return Known(
+        np.array([3, 9]), np.array([[6.0, -1.0, 0.5], PLACE + off]), np.array([0.01 * variances, variances]),
+        np.array([9, count], dtype=np.int32), np.array([OTHER_LOOK, look]),
+    )  # fmt: skip
+
+
+def names(places, held, looks=None, poses=POSES):
+    """Return the names (3,) of what was refused, after all."""
+    logs, refused = logs_and_refused(places, looks)
+    found = taken_up(logs, refused, [poses], held, OPTIONS)[0]
+    assert found.ids[::2].tolist() == [3, 3, 3]
+    assert logs[0].ids[1::2].tolist() == [REJECTED] * 3
+    return found.ids[1::2].tolist()
+
+
+def test_what_agrees_is_taken_up():
+    """Three measurements of one place outnumber a landmark's only sighting 2.5 sigma off, and are its."""
+    assert names([PLACE] * 3, known()) == [9, 9, 9]
+
+
+@pytest.mark.parametrize(
+    ("held", "why"),
+    [
+        (known(count=3), "its own sightings are as many"),
+        (known(sigma=0.05), "it is another one, 10 sigma off"),
+        (known(off=(0.0, 1.2, 0.0), sigma=0.5), "it is farther than what lies too near to be new"),
+        (known(look=OTHER_LOOK), "it looks different"),
+        (known()._replace(ids=np.array([3, 3])), "its frames saw it elsewhere"),
+        (known()._replace(descriptors=np.array([LOOK, LOOK]), means=np.array([PLACE, PLACE])), "two may be it"),
+    ],
+)
+def test_what_need_not_be_its_is_left(held, why):
+    """Nothing has a name for it that could be another's."""
+    assert names([PLACE] * 3, held) == [REJECTED] * 3, why
+
+
+def test_one_that_nothing_agrees_with_is_left():
+    """Of two that agree and one elsewhere the two are taken up; of three that lie apart none is."""
+    apart = list(PLACE + np.array([[0.0, 0.0, 0.0], [0.0, 0.3, 0.0], [0.0, -0.3, 0.1]]))
+    assert names([PLACE, PLACE, apart[2]], known()) == [9, 9, REJECTED]
+    assert names(apart, known(sigma=0.5)) == [REJECTED] * 3
+    assert names([PLACE] * 3, known(), looks=[LOOK, OTHER_LOOK, OTHER_LOOK]) == [REJECTED] * 3
+    assert names([PLACE] * 3, known(), poses={4: POSES[4]}) == [REJECTED] * 3
+
+
+def test_nothing_refused_changes_no_log():
+    """Without anything refused, or without a map, the logs are the same arrays."""
+    logs, refused = logs_and_refused([PLACE] * 3)
+    nothing = Known(*(array[:0] for array in known()))
+    for found in (taken_up(logs, [{}], [POSES], known(), OPTIONS), taken_up(logs, refused, [POSES], nothing, OPTIONS)):
+        assert found[0].ids is logs[0].ids
+
+
+def error_of_one_first_seen_far_off(every):
+    """Return how far off [m] a landmark is after 14 steps without noise but in its first sighting, and its refusals."""
+    camera, rng, looks = OPTIONS.camera, np.random.default_rng(5), np.eye(12, dtype=np.float32)
+    marks = np.column_stack([rng.uniform(3.0, 7.0, 12), rng.uniform(-1.5, 1.5, 12), rng.uniform(0.3, 1.5, 12)])
+    marks[0] = [6.0, 0.0, 1.0]
+    slam = FastSlam(num_particles=30, camera=camera, rejuvenate_every=every, seed=1)
+    refused = 0
+    for step in range(14):
+        seen = camera.project(camera.camera_from_robot(marks - [0.1 * step, 0.0, 0.0]))
+        seen[0, 2] -= 0.55 * (step == 0)  # 5.5 sigma
+        odometry = None if step == 0 else np.array([0.1, 0.0, 0.0])
+        report = slam.step([odometry], [Measurements(camera.triangulate(seen), looks)])
+        refused += report.associations[0][0] < 0
+    held = slam.map()
+    own = held.means[held.descriptors[:, 0] > 0.9]
+    assert len(own) == 1
+    return np.linalg.norm(own[0] - marks[0]), refused
+
+
+def test_a_landmark_that_blocks_itself_is_put_right():
+    """All but its first sighting are refused and it stays off for ever; or until particles are drawn anew."""
+    off, refused = error_of_one_first_seen_far_off(None)
+    assert off > 0.5
+    assert refused == 13
+    off, refused = error_of_one_first_seen_far_off(5)
+    assert off < 0.05
+    assert refused <= 5
