@@ -10,7 +10,6 @@ from typing import Any
 from rich.console import Console
 
 from agents.own import is_own
-from training.accuracy_tables import goal_rows
 from training.bench_exploration import NO_ORACLE
 from training.exploration_summary import COMPARED, Rows
 from training.seed_means import shown
@@ -108,7 +107,7 @@ def print_tables(console: Console, lines: Rows, policies: Rows, oracles: Rows, g
             rows = [[who, *cells] for who, cells in _difference_rows(differences, True)]
             console.print(console_table(f"{title}: {heading}", _stacked(HEADINGS[name] for name in COMPARED), rows))
     if goals:
-        console.print(console_table("Goals", *goal_rows(goals)))
+        console.print(console_table("Goals", *_goal_rows(goals)))
 
 
 def markdown(lines: Rows, policies: Rows, oracles: Rows, goals: Rows) -> str:
@@ -123,7 +122,7 @@ def markdown(lines: Rows, policies: Rows, oracles: Rows, goals: Rows) -> str:
             rows = [[who, *cells] for who, cells in _difference_rows(differences, False)]
             parts.append(markdown_table([heading, *(HEADINGS[name] for name in COMPARED)], rows))
     if goals:
-        parts += ["### Goals\n", markdown_table(*goal_rows(goals))]
+        parts += ["### Goals\n", markdown_table(*_goal_rows(goals))]
     return "\n".join(parts)
 
 
@@ -142,6 +141,16 @@ def who_is(line: Mapping[str, Any], between: str = ", ") -> str:
     """Return the name of a policy, and what it is told."""
     told = "" if line["oracle"] == NO_ORACLE else f"{between}told {line['oracle']}"
     return f"{label(line['policy'])}{told}"
+
+
+def _goal_rows(goals: Rows) -> tuple[list[str], list[list[str]]]:
+    """Return headings and rows of text for the goals."""
+    rows = []
+    for goal in goals:
+        range_ = "" if goal["low"] is None else f"{goal['low']:z.3f} .. {goal['high']:z.3f}"
+        met = "yes" if goal["met"] else "no"
+        rows.append([goal["goal"], f"{goal['limit']:g}", f"{goal['reached']:z.3f}", range_, str(goal["seeds"]), met])
+    return ["goal", "at most", "reached", "95 %", "seeds", "met"], rows
 
 
 def _stacked(headings: Iterable[str]) -> list[str]:

@@ -52,8 +52,8 @@ def shown(line: Mapping[str, Any], name: str, digits: int = 3, factor: float = 1
     mean, low, high = (line[f"{name}{end}"] for end in ("", "_low", "_high"))
     if mean is None:
         return "-"
-    text = f"{factor * mean:.{digits}f}"
+    text = f"{factor * mean:z.{digits}f}"
     if low is None:
         return text
-    ends = [f"{factor * end:.{digits}f}" for end in (low, high)]
+    ends = [f"{factor * end:z.{digits}f}" for end in (low, high)]
     return f"{text}\n{'..'.join(ends)}" if stacked else f"{text} ({' .. '.join(ends)})"

@@ -31,3 +31,4 @@ def test_means_are_shown_as_far_as_they_are_known() -> None:
     assert shown(line, "a", 1, 100.0, stacked=True) == "50.0\n25.0..75.0"
     assert shown(line, "b", 1, stacked=True) == "2.0"
     assert shown(line, "c") == "-"
+    assert shown(mean_of("d", [-1e-9]), "d") == "0.000"  # no sign where nothing is left to sign
