@@ -106,26 +106,28 @@ def check_goals(rows: Rows) -> list[dict[str, Any]]:
                 values = ahead_by(*(_by_seed(by_policy[name,], "mean_coverage") for name in (less, more)))
                 found.append(_goal(f"{where}: floor over time, {less} - {more}", 0.0, values))
         if oracle == ALL_ORACLES:
-            worst = np.array([max(row["pose_error"] for row in own)])
-            found.append(
-                _goal(f"{where}, told all: worst pose error [m]", TOLD_M, worst, len(_by_seed(own, "coverage")))
-            )
-            untold = {
-                (row["seed"], row["policy"]): row["map_rmse_m"] for row in places.get((world, robots, NO_ORACLE), ())
-            }
-            by_seed: dict[int, list[float]] = {}
-            for row in own:
-                before, after = untold.get((row["seed"], row["policy"])), row["map_rmse_m"]
-                if before is not None and after is not None:
-                    by_seed.setdefault(row["seed"], []).append(after - before)
-            if by_seed:
-                values = np.array([np.mean(differences) for differences in by_seed.values()])
-                found.append(_goal(f"{where}: map RMSE, told - not told [m]", 0.0, values))
+            found += _goals_of_told(where, own, places.get((world, robots, NO_ORACLE), ()))
     made = sum(row["right_merges"] + row["false_merges"] for row in rows)
     if made:
         share = sum(row["false_merges"] for row in rows) / made
         seeds = len({row["seed"] for row in rows})
         found.append(_goal("false merges, of all that were not undone", MOST_FALSE, np.array([share]), seeds))
+    return found
+
+
+def _goals_of_told(where: str, told: Rows, untold: Rows) -> list[dict[str, Any]]:
+    """Ask what must hold of robots that are told all, beside the same policies and seeds untold."""
+    worst = np.array([max(row["pose_error"] for row in told)])
+    found = [_goal(f"{where}, told all: worst pose error [m]", TOLD_M, worst, len({row["seed"] for row in told}))]
+    before = {(row["seed"], row["policy"]): row["map_rmse_m"] for row in untold}
+    by_seed: dict[int, list[float]] = {}
+    for row in told:
+        pair = row["map_rmse_m"], before.get((row["seed"], row["policy"]))
+        if None not in pair:
+            by_seed.setdefault(row["seed"], []).append(pair[0] - pair[1])
+    if by_seed:
+        means = np.array([np.mean(differences) for differences in by_seed.values()])
+        found.append(_goal(f"{where}: map RMSE, told - not told [m]", 0.0, means))
     return found
 
 

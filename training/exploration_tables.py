@@ -69,7 +69,7 @@ PARTS: dict[str, tuple[Column, ...]] = {
         Column("decision [ms]", "decision_ms", 2),
     ),
 }
-UNITS = {name: column.factor for column in IN_SHORT for name in [column.figure]} | {"pose_error": 100.0}
+UNITS = {column.figure: column.factor for column in IN_SHORT} | {"pose_error": 100.0}
 BELOW = "\n  "  # what a policy is told, on a line of its own
 HEADINGS = {
     "mean_coverage": "over time [%]",
