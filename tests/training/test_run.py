@@ -240,6 +240,21 @@ def test_a_run_folder_repeats_itself(vslam: Any, tmp_path: Path) -> None:
         assert len(Trajectory.load_tum(one / name)) == 24
 
 
+@pytest.mark.parametrize(("policy", "action_type"), [("a_policy_of_mine:Still", "discrete"), ("random_goals", "goal")])
+def test_a_policy_brings_its_kind_of_action(
+    policy: str, action_type: str, vslam: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Who names a policy that knows no continuous actions, one of his own as well, need not say which it knows."""
+    lines = ("class Still:", "    action_type = 'discrete'", "    def reset(self): pass", "    def act(*_): return 0")
+    (tmp_path / "a_policy_of_mine.py").write_text("\n".join(lines))
+    monkeypatch.chdir(tmp_path)
+    few = ("--world", "fig5", "--robots", "1", "--max-cycles", "3", "--particles", "5", "--no-video", "--out", "run")
+    assert vslam("run", "--policy", policy, *few).status == 0
+    metrics = json.loads(Path("run/metrics.json").read_text())
+    assert (metrics["config"]["policy"], metrics["config"]["action_type"]) == (policy, action_type)
+    assert (metrics["robots"][0]["path_m"] == 0.0) is (action_type == "discrete")
+
+
 @pytest.mark.slow
 def test_an_interrupted_run_writes_what_it_has(monkeypatch: pytest.MonkeyPatch, vslam: Any, tmp_path: Path) -> None:
     """Ctrl-C after seven steps leaves a whole folder about these seven steps."""
