@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from slam_backend._packed import UNPACK
 from slam_backend.camera import ROBOT_FROM_CAMERA
 from slam_backend.errors import BoolArray, FloatArray, IntArray
 from slam_backend.filter_options import FilterOptions
@@ -20,7 +21,6 @@ from slam_backend.log_arrays import LogArrays
 
 NO_ONE = -1
 ROUNDING = 1e-12  # [m^2]; keeps covariances of sensors without noise invertible
-UNPACK = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])  # of an upper triangle by rows
 
 
 class Refused(NamedTuple):
