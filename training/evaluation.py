@@ -1,6 +1,5 @@
 """`EvaluateConfig`: a trained model beside scripted policies, each on the same worlds it has never seen; one trial."""
 
-import tomllib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import cache
@@ -79,7 +78,7 @@ class EvaluateConfig(PlainConfig):
             ValueError: If the model cannot be read, or knows another kind of environment.
         """
         _, about = load_model(self.model)
-        config = EnvConfig.from_dict(tomllib.loads(about["environment"]))
+        config = EnvConfig.from_toml_text(about["environment"])
         given = {"world": self.world, "num_robots": self.robots, "max_cycles": self.max_cycles}
         changes: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
         world = changes.get("world", config.world)

@@ -1,6 +1,5 @@
 """`RunConfig`: all that decides a run, and the environment and policies that it stands for."""
 
-import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -81,8 +80,8 @@ class RunConfig(PlainConfig):
         """Ticks between decisions: as many as a trained policy was trained with; None for others: the usual ones."""
         if not is_model(self.policy):
             return None
-        environment = tomllib.loads(load_model(self.policy)[1]["environment"])
-        return None if self.action_type != "goal" else environment.get("decision_ticks")
+        trained = EnvConfig.from_toml_text(load_model(self.policy)[1]["environment"])
+        return None if self.action_type != "goal" else trained.decision_ticks
 
     @property
     def num_steps(self) -> int:

@@ -29,6 +29,7 @@ PRESETS = ("easy", "standard", "hard")
 MAX_ROBOTS = 8
 TICK = 0.1  # [s]
 GOAL_DECISION_TICKS = 10
+NONE = "none"  # what TOML, which has no word for it, says for None
 PARTS = {
     "landmarks": LandmarkConfig,
     "odometry": OdometryNoise,
@@ -178,20 +179,27 @@ class EnvConfig:
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
         """Build a configuration from nested dicts; what is left out has the value of the `standard` preset."""
-        return _validated(cls, values)
+        return _validated(cls, _merged(_plain(cls()), values))
 
     @classmethod
     def from_toml(cls, path: str | Path) -> Self:
-        """Read a configuration from a TOML file, as `to_toml` writes it."""
+        """Read a configuration from a TOML file, as `to_toml` writes it.
+
+        What the file leaves out, in nested tables as well, has the value of the `standard` preset.
+        """
         try:
-            values = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+            return cls.from_toml_text(Path(path).read_text(encoding="utf-8"))
         except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
             raise bad_argument("config", "a readable TOML file", str(path), f"The reader says: {error}.") from error
-        return cls.from_dict(values)
+
+    @classmethod
+    def from_toml_text(cls, text: str) -> Self:
+        """Build a configuration from what `to_toml` returned."""
+        return cls.from_dict(_read(tomllib.loads(text)))
 
     def to_toml(self) -> str:
-        """Return the configuration as TOML. Fields that are None are left out, which means the same."""
-        return tomli_w.dumps(_without_none(_plain(self)))
+        """Return the configuration as TOML; None is left out where it is the standard, else it is the text "none"."""
+        return tomli_w.dumps(_written(_plain(self), _plain(type(self)())))
 
 
 def preset_config(name: str, sensor: str = "landmark") -> EnvConfig:
@@ -296,8 +304,22 @@ def _merged(values: dict[str, Any], changes: Mapping[str, Any]) -> dict[str, Any
     return merged
 
 
-def _without_none(values: Any) -> Any:
-    """Drop entries that are None, which TOML does not know."""
-    if isinstance(values, dict):
-        return {key: _without_none(value) for key, value in values.items() if value is not None}
-    return values
+def _written(values: Mapping[str, Any], standard: Any) -> dict[str, Any]:
+    """Return nested dicts without None: left out where the standard is None or knows no such entry, else `NONE`."""
+    usual = standard if isinstance(standard, Mapping) else {}
+    written: dict[str, Any] = {}
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            written[key] = _written(value, usual.get(key))
+        elif value is not None:
+            written[key] = value
+        elif usual.get(key) is not None:
+            written[key] = NONE
+    return written
+
+
+def _read(values: Any) -> Any:
+    """Turn the text `NONE` into None in nested dicts."""
+    if isinstance(values, Mapping):
+        return {key: _read(value) for key, value in values.items()}
+    return None if values == NONE else values

@@ -118,6 +118,23 @@ def test_default_decision_ticks(action_type: str, ticks: int) -> None:
     assert EnvConfig().replace(action_type=action_type, decision_ticks=4).ticks_per_step == 4
 
 
+def test_a_file_changes_what_it_names(tmp_path: Path) -> None:
+    """What a file leaves out of a nested table is that of the standard preset, as with `replace`."""
+    path = tmp_path / "config.toml"
+    path.write_text("num_robots = 2\n[belief.filter]\nnum_particles = 7\n", encoding="utf-8")
+    assert EnvConfig.from_toml(path) == EnvConfig(num_robots=2).replace(belief={"filter": {"num_particles": 7}})
+
+
+def test_none_against_a_standard_value_is_written(tmp_path: Path) -> None:
+    """TOML has no None: the text "none" stands for it where the standard is something else, and nothing elsewhere."""
+    config = EnvConfig().replace(belief={"filter": {"rejuvenate_every": None}})
+    text = config.to_toml()
+    assert text.count('"none"') == 1
+    assert 'rejuvenate_every = "none"' in text
+    assert EnvConfig.from_toml_text(text) == config
+    assert '"none"' not in EnvConfig().to_toml()
+
+
 def test_keywords_override_the_file(tmp_path: Path) -> None:
     """Arguments of `parallel_env` go before what a configuration file says; the environment tells the result."""
     path = tmp_path / "config.toml"
