@@ -99,10 +99,11 @@ def test_a_run_is_rejuvenated_and_repeats_itself(vslam: Any, tmp_path: Path) -> 
     assert estimates(one) != estimates(plain)
 
 
-@pytest.mark.parametrize("command", [("replay", "mrclam"), ("replay", "victoria"), ("replay", "kitti")])
-def test_no_steps_between_are_refused(command: tuple[str, ...], refusal: Any) -> None:
+@pytest.mark.parametrize("kind", WRITERS)
+def test_no_steps_between_are_refused(kind: str, refusal: Any, tmp_path: Path) -> None:
     """Every zero steps is no interval: one line, status 2."""
-    shown = refusal(*command, "--path", "none", "--rejuvenate-every", "0")
+    WRITERS[kind](tmp_path)
+    shown = refusal("replay", kind, "--path", str(tmp_path), "--rejuvenate-every", "0")
     assert shown.startswith("error rejuvenate_every: expected an int >= 1, got 0. Give a number,")
 
 
