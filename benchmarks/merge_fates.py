@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend.branches import restored_filter
 from slam_backend.errors import FloatArray
 from slam_backend.geometry import between
 from slam_backend.reports import MergeEvent
@@ -128,11 +127,10 @@ class Follower:
     def _share_of_wrong_pairs(self, merge: MergeEvent) -> float:
         """Return it for a merge just made; false points are no landmarks, and a pair with one is wrong."""
         watches = (watch for group in self._team._groups for watch in group.trunk.watches)
-        watch = next(watch for watch in watches if watch.alignment is merge.alignment)
+        sides = next(watch.sides for watch in watches if watch.alignment is merge.alignment)
         claims = []
-        for side, rows in zip(watch.sides, merge.alignment.inliers.T, strict=True):
-            ids = restored_filter(side.trunk["filter"]).map().ids
-            claims.append(self._ledger._claims[side.trunk["number"]][ids[rows]])
+        for side, joined, rows in zip(sides, self._team.merged_maps(merge), merge.alignment.inliers.T, strict=True):
+            claims.append(self._ledger._claims[side.trunk["number"]][joined.ids[rows]])
         return float(np.mean((claims[0] != claims[1]) | (claims[0] == FALSE))) if len(claims[0]) else float("nan")
 
 

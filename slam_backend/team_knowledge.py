@@ -4,7 +4,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from slam_backend.branches import Branch
+from slam_backend.branches import Branch, restored_filter
 from slam_backend.errors import FloatArray, IntArray, bad_argument
 from slam_backend.geometry import inverse
 from slam_backend.groups import Group
@@ -155,6 +155,22 @@ class TeamKnowledge:
     def map(self, robot: int, estimate: Literal["best", "mixture"] = "best", min_count: int = 1) -> LandmarkMap:
         """Return the map that the robot goes by in its map frame; see `FastSlam.map`."""
         return self._find(robot)[0].filter.map(estimate, min_count)
+
+    def merged_maps(self, merge: MergeEvent) -> tuple[LandmarkMap, LandmarkMap]:
+        """Return the two maps that a merge joined as they were just before it, straight if they had been straightened.
+
+        Each is in its own frame, under its own ids, and has the rows that the inliers of `merge.alignment` name.
+
+        Raises:
+            ValueError: If it is no merge that is still watched.
+        """
+        for group in self._groups:
+            for watch in group.trunk.watches:
+                if watch.alignment is merge.alignment:
+                    map_a, map_b = (restored_filter(side.trunk["filter"]).map() for side in watch.sides)
+                    return map_a, map_b
+        expected, got = "a merge still watched", f"the {merge.kind} of step {merge.step}"
+        raise bad_argument("merge", expected, got, "Ask in the step in which it is made.")
 
     def start_from_group(self, robot: int) -> FloatArray:
         """Return (3,) the motion from the map frame of the robot's filter to the robot's own start frame.

@@ -102,7 +102,7 @@ class ReplayConfig(PlainConfig):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Merge:
-    """One merge, with the maps as they were just before it.
+    """One merge, with the maps as they were just before it, straightened, without landmarks first seen in that step.
 
     Attributes:
         time: Seconds since the first step [s].
@@ -188,8 +188,9 @@ def replay(
             if event.kind == "merge":
                 since = float(readings.times[step] - readings.times[0])
                 sides = [groups[side[0]] for side in (event.robots_a, event.robots_b)]
-                claims = [ledger.claims(side[0], maps[side].ids) for side in sides]
-                merges.append(Merge(since, event, maps[sides[0]], maps[sides[1]], claims[0], claims[1]))
+                joined = [_those_of(new, maps[side]) for side, new in zip(sides, team.merged_maps(event), strict=True)]
+                claims = [ledger.claims(side[0], own.ids) for side, own in zip(sides, joined, strict=True)]
+                merges.append(Merge(since, event, joined[0], joined[1], claims[0], claims[1]))
             if event.kind == "undo":
                 when = float(readings.times[step] - readings.times[0])
                 merges = [replace(m, undone=when) if m.event.alignment is event.alignment else m for m in merges]
@@ -232,6 +233,11 @@ def _make_team(log: MrclamLog, config: ReplayConfig) -> TeamSlam:
         rejuvenate_every=config.rejuvenate_every,
         **GATES[config.identities],
     )
+
+
+def _those_of(landmarks: LandmarkMap, known: LandmarkMap) -> LandmarkMap:
+    """Return the landmarks that another map holds, too."""
+    return landmarks.subset(np.flatnonzero(np.isin(landmarks.ids, known.ids)))
 
 
 def _alike(frame: Measurements | None) -> Measurements | None:

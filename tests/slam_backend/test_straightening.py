@@ -72,6 +72,7 @@ def test_a_merge_is_that_of_straightened_maps() -> None:
     assert [event.kind for event in team.events] == ["attempt", "merge"]
     assert_same(team.events[0].bent, bent)
     assert_same(team.events[1].alignment, found)
+    assert_same(team.merged_maps(team.events[1]), tuple(side.map() for side in sides))
     watch = team._find(0)[0].watches[0]
     for side, of_side, before in zip(watch.sides, sides, watch.before, strict=True):
         assert_same(side.trunk["filter"]["_poses"], of_side.get_state()["_poses"])
@@ -202,3 +203,11 @@ def test_how_sure_a_merge_has_to_be_is_a_number_of_deviations() -> None:
     """Fewer than none are refused."""
     with pytest.raises(ValueError, match=r"merging\.sure: expected a finite number >= 0, got -1\.0\. Use 5, or 0"):
         MergeOptions(sure=-1.0)
+
+
+def test_maps_of_a_merge_that_is_not_watched_are_not_at_hand() -> None:
+    """Where merges are final, or nothing was merged, asking for the maps that were joined is refused."""
+    _, team = driven(112, AT_LAST, merging=MergeOptions(watch_steps=0))
+    for event in team.events:
+        with pytest.raises(ValueError, match=r"merge: expected a merge still watched, got 'the (attempt|merge) of"):
+            team.merged_maps(event)
