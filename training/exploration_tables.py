@@ -138,9 +138,10 @@ def to_csv(rows: Rows) -> str:
 
 
 def who_is(line: Mapping[str, Any], between: str = ", ") -> str:
-    """Return the name of a policy, and what it is told."""
+    """Return the name of a policy and what it is told; with `BELOW` between them, for narrow columns, line by line."""
     told = "" if line["oracle"] == NO_ORACLE else f"{between}told {line['oracle']}"
-    return f"{label(line['policy'])}{told}"
+    name = label(line["policy"])
+    return (name.replace("@", f"{BELOW}@") if between == BELOW else name) + told
 
 
 def _goal_rows(goals: Rows) -> tuple[list[str], list[list[str]]]:

@@ -30,6 +30,7 @@ def draw_exploration(file: Path, curves: Sequence[Mapping[str, Any]]) -> None:
     """
     places = list(dict.fromkeys((line["world"], line["robots"]) for line in curves))
     colours = _each(COLOURS, (line["policy"] for line in curves))
+    policy_of = {who_is(line): line["policy"] for line in curves}
     styles = _each(STYLES, (NO_ORACLE, *(line["oracle"] for line in curves)))
     figure = Figure(figsize=(12.0, 2.7 * len(places) + 0.5), layout="constrained")
     axes = figure.subplots(len(places), len(PANELS), squeeze=False, sharex=True)
@@ -47,7 +48,9 @@ def draw_exploration(file: Path, curves: Sequence[Mapping[str, Any]]) -> None:
     for panel in axes[-1]:
         panel.set_xlabel("time [s]")
     handles, names = axes[0][0].get_legend_handles_labels()
-    figure.legend(handles, names, loc="outside upper center", ncols=min(len(names), 6), frameon=False, fontsize=9)
+    entries = dict(sorted(zip(names, handles, strict=True), key=lambda e: list(colours).index(policy_of[e[0]])))
+    columns = min(len(colours), 6)  # a policy, and below it what it does when it is told more
+    figure.legend(entries.values(), entries, loc="outside upper center", ncols=columns, frameon=False, fontsize=9)
     save_png(figure, file, 100)
 
 

@@ -11,7 +11,7 @@ def console_table(title: str, headings: Sequence[str], rows: Sequence[Sequence[s
     """Return a table for the console; title, headings and rows are shown as they are, markup and all."""
     table = Table(title=escape(title), box=SIMPLE_HEAD, title_justify="left", padding=(0, 1), collapse_padding=True)
     for column, heading in enumerate(headings):
-        table.add_column(escape(heading), justify="left" if column == 0 else "right")
+        table.add_column(escape(heading), justify="left" if column == 0 else "right", overflow="fold")
     for row in rows:
         table.add_row(*map(escape, row))
     return table
