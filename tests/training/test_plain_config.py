@@ -8,6 +8,7 @@ import pytest
 from training.bench_accuracy import AccuracyConfig
 from training.bench_alignment import AlignmentBenchConfig
 from training.bench_env import EnvBenchConfig
+from training.bench_exploration import ExplorationBenchConfig
 from training.bench_filter import BenchConfig
 from training.bench_stereo import StereoBenchConfig
 from training.bench_train import TrainBenchConfig
@@ -33,6 +34,7 @@ CASES: dict[type[PlainConfig], dict[str, Any]] = {
     AccuracyConfig: {"lengths": (5.0, 7.5)},
     AlignmentBenchConfig: {"methods": ("icp", "svd")},
     EnvBenchConfig: {"worlds": ("fig5",)},
+    ExplorationBenchConfig: {"policies": ("frontier@discrete",), "worlds": ("maze",)},
     BenchConfig: {"proposals": ("fastslam1",), "large": True},
     StereoBenchConfig: {"descriptors": ("orb",)},
     TrainBenchConfig: {"workers": (0, 2)},

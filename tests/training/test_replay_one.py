@@ -158,14 +158,18 @@ def test_a_run_is_written_and_repeats_itself(
     assert np.array_equal(estimate.poses, Trajectory.load_tum(second / "estimate.tum").poses)
 
 
-@pytest.mark.parametrize(("command", "what"), [("victoria", "the Victoria Park log"), ("kitti", "KITTI features")])
+@pytest.mark.parametrize(
+    ("command", "what"),
+    [("victoria", "a folder of the Victoria Park log, with "), ("kitti", "an archive (.npz) of KITTI features, ")],
+)
 def test_a_log_that_is_not_named_is_asked_for(
     command: str, what: str, monkeypatch: pytest.MonkeyPatch, refusal: Any
 ) -> None:
     """Without --path and VSLAM_DATA the command ends with one line and status 2."""
     monkeypatch.delenv("VSLAM_DATA", raising=False)
-    expected = f"error path: expected a folder of {what}, got no --path. Name it, or set VSLAM_DATA.\n"
-    assert refusal("replay", command) == expected
+    said = refusal("replay", command)
+    assert said.startswith(f"error path: expected {what}")
+    assert said.endswith(", got no --path. Name it, or set VSLAM_DATA.\n")
 
 
 @pytest.mark.slow
