@@ -137,9 +137,10 @@ def _located(
 
 def _owners(points: _Points, logs: Sequence[LogArrays], known: Known, options: FilterOptions) -> IntArray:
     """Return the row (n,) in `known` of the only landmark that each point can be of; `NO_ONE`: none, or several."""
-    near = np.linalg.norm(points.means[:, None] - known.means, axis=2) <= options.dead_radius
-    alike = np.linalg.norm(points.descriptors[:, None] - known.descriptors, axis=2) <= options.descriptor_gate
-    fits = near & alike
+    fits = np.linalg.norm(points.means[:, None] - known.means, axis=2) <= options.dead_radius
+    near, place = np.nonzero(fits)
+    unlike = np.linalg.norm(points.descriptors[near] - known.descriptors[place], axis=1)
+    fits[near, place] = unlike <= options.descriptor_gate
     owners = np.where(fits.sum(axis=1) == 1, fits.argmax(axis=1), NO_ONE)
     for n in np.flatnonzero(owners != NO_ONE):
         log = logs[points.robots[n]]

@@ -23,12 +23,13 @@ def seen_from(pose, place):
     return transform_points(inverse(pose), place[None])[0] - OPTIONS.camera.mount
 
 
-def logs_and_refused(places, looks=None, ids=()):
+def logs_and_refused(places, looks=None, covariances=None):
     """Return a robot's log of one refused measurement in each step, beside one of landmark 3, and what was refused."""
     log, refused = RobotLog(), {}
     for i, (step, pose) in enumerate(POSES.items()):
         points = np.array([seen_from(pose, np.array([6.0, -1.0, 0.5])), seen_from(pose, places[i])])
-        log.append(step, None if i == 0 else np.array([0.4, 0.0, 0.0]), points=points, ids=np.array([3, REJECTED]))
+        log.append(step, None if i == 0 else np.array([0.4, 0.0, 0.0]), points=points, ids=np.array([3, REJECTED]),
+                   covariances=covariances)  # fmt: skip
         refused[step] = Refused(np.array([1]), (LOOK if looks is None else looks[i])[None])
     return [log.arrays()], [refused]
 
@@ -79,6 +80,15 @@ def test_one_that_nothing_agrees_with_is_left():
     assert names(apart, known(sigma=0.5)) == [REJECTED] * 3
     assert names([PLACE] * 3, known(), looks=[LOOK, OTHER_LOOK, OTHER_LOOK]) == [REJECTED] * 3
     assert names([PLACE] * 3, known(), poses={4: POSES[4]}) == [REJECTED] * 3
+
+
+def test_covariances_of_the_sensor_say_what_agrees():
+    """Places 0.3 m apart agree where the sensor says that it sees to 0.2 m, and do not where it says to 0.05 m."""
+    apart = list(PLACE + np.array([[0.0, 0.0, 0.0], [0.0, 0.3, 0.0], [0.0, -0.3, 0.1]]))
+    for sigma, found in ((0.2, [9, 9, 9]), (0.05, [REJECTED] * 3)):
+        noise = np.tile(np.array([1.0, 0.0, 0.0, 1.0, 0.0, 1.0]) * sigma**2, (2, 1))
+        logs, refused = logs_and_refused(apart, covariances=noise)
+        assert taken_up(logs, refused, [POSES], known(), OPTIONS)[0].ids[1::2].tolist() == found
 
 
 def test_nothing_refused_changes_no_log():
