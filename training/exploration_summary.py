@@ -132,10 +132,13 @@ def _goals_of_told(where: str, told: Rows, untold: Rows) -> list[dict[str, Any]]
 
 
 def _goal(name: str, limit: float, values: FloatArray, seeds: int | None = None) -> dict[str, Any]:
-    """Return a goal: the mean of values over seeds, with all of its interval where it has one, is at most `limit`."""
+    """Return a goal: the mean of values over seeds, with all of its interval, is at most `limit`.
+
+    With `seeds` given there is one value, of all these seeds together; otherwise one seed does not tell of the others.
+    """
     mean = mean_of("reached", values)
     reached, low, high = (mean[name] for name in ("reached", "reached_low", "reached_high"))
-    most = reached if high is None else high
+    most = high if seeds is None else reached
     return {
         "goal": name, "limit": limit, "reached": reached, "low": low, "high": high,
         "seeds": len(values) if seeds is None else seeds, "met": most is not None and most <= limit,

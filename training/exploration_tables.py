@@ -10,6 +10,7 @@ from typing import Any
 from rich.console import Console
 
 from agents.own import is_own
+from agents.trained import MODEL_FILE
 from training.bench_exploration import NO_ORACLE
 from training.exploration_summary import COMPARED, Rows
 from training.seed_means import shown
@@ -83,10 +84,13 @@ HEADINGS = {
 def label(name: str) -> str:
     """Return a policy or a world as tables and figures call it: without folders, if it is a path.
 
-    >>> label("runs/train-0-1"), label("random_goals")
-    ('train-0-1', 'random_goals')
+    >>> label("runs/train-0-1"), label("runs/train-0-1/model.npz"), label("random_goals")
+    ('train-0-1', 'train-0-1/model.npz', 'random_goals')
     """
-    return name if is_own(name) else Path(name).name
+    path = Path(name)
+    if is_own(name):
+        return name
+    return f"{path.parent.name}/{path.name}" if path.name == MODEL_FILE else path.name
 
 
 def print_tables(console: Console, lines: Rows, policies: Rows, oracles: Rows, goals: Rows) -> None:
@@ -100,7 +104,7 @@ def print_tables(console: Console, lines: Rows, policies: Rows, oracles: Rows, g
         goals: Of `check_goals`.
     """
     for (world, robots), own in _places(lines).items():
-        title = f"{label(world)}, K={robots}, {_seeds(own)} seeds"
+        title = f"{label(world)}, K={robots}, {_seeds(own)}"
         rows = [[who, *(column.cell(line, True) for column in IN_SHORT)] for who, line in _named(own, BELOW)]
         console.print(console_table(title, _stacked(column.heading for column in IN_SHORT), rows))
         for heading, differences in _comparisons(_at(policies, world, robots), _at(oracles, world, robots)):
@@ -114,7 +118,7 @@ def markdown(lines: Rows, policies: Rows, oracles: Rows, goals: Rows) -> str:
     """Return all figures, differences and goals as Markdown."""
     parts = []
     for (world, robots), own in _places(lines).items():
-        parts.append(f"### {label(world)}, K={robots}, {_seeds(own)} seeds\n")
+        parts.append(f"### {label(world)}, K={robots}, {_seeds(own)}\n")
         for title, columns in PARTS.items():
             rows = [[who, *(column.cell(line) for column in columns)] for who, line in _named(own)]
             parts.append(markdown_table([title, *(column.heading for column in columns)], rows))
@@ -201,4 +205,4 @@ def _at(lines: Rows, world: str, robots: int) -> Rows:
 def _seeds(lines: Sequence[Mapping[str, Any]]) -> str:
     """Return of how many seeds the lines are."""
     least, most = (pick(line["seeds"] for line in lines) for pick in (min, max))
-    return str(most) if least == most else f"{least}-{most}"
+    return f"{most} seed{'s' if most > 1 else ''}" if least == most else f"{least}-{most} seeds"

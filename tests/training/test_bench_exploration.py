@@ -184,6 +184,14 @@ def test_goals_hold_or_not(changes: dict[str, dict[str, Any]], name: str, met: b
     assert goal["met"] is met
 
 
+def test_one_seed_does_not_tell_of_the_others() -> None:
+    """A difference on a single seed meets no goal, however large it is."""
+    rows = [_row("random_goals", 1, mean_coverage=0.1), _row("frontier", 1, mean_coverage=0.9)]
+    found = {goal["goal"]: goal["met"] for goal in check_goals(rows)}
+    assert found["office, K=3: floor over time, random_goals - frontier"] is False
+    assert found["false merges, of all that were not undone"] is True
+
+
 def test_tables_fit_into_80_columns(rows: list[dict[str, Any]]) -> None:
     """Nothing is cut on a terminal of 80 columns; the Markdown has all policies, told and not."""
     lines, goals = summarise(rows), check_goals(rows)
