@@ -17,7 +17,7 @@ from slam_backend.reports import PoseEstimate
 from slam_backend.run_log import RobotLog
 from slam_backend.smoothing.coarsening import coarsened
 from slam_backend.smoothing.extending import Places, first_rows
-from slam_backend.smoothing.graph import PathGraph, mean_pose
+from slam_backend.smoothing.graph import PathGraph, mean_pose, scattered
 from slam_backend.smoothing.joining import joined
 from slam_backend.smoothing.options import SmoothingOptions
 from slam_backend.smoothing.reassociation import Known, Refused, taken_up
@@ -197,8 +197,9 @@ class RejuvenationStep:
         if options.slice_steps is not None and own.num_keys + other.num_keys > options.most_keys(robots):
             own, other = (_thinned(graph, robots, camera, options) for graph in (own, other))
         robot = int(np.flatnonzero(other.previous[other.heads] < 0)[0])  # one that defines b's frame
-        motion = compose(mean_pose(starts[2][len(starts[0]) + robot]), inverse(other.poses[other.heads[robot]]))
-        self._graph = joined(own, other, motion, renamed)
+        start = starts[2][len(starts[0]) + robot]
+        motion = compose(mean_pose(start), inverse(other.poses[other.heads[robot]]))
+        self._graph = joined(own, other, motion, renamed, scattered(start))
         self._draft = None if options.slice_steps is None else Draft(graph=self._graph)
         moved = [{step: compose(motion, guess) for step, guess in guesses.items()} for guesses in b._guesses]
         self._guesses = [dict(guesses) for guesses in a._guesses] + moved

@@ -16,6 +16,9 @@ from slam_backend.errors import BoolArray, FloatArray, IntArray
 MIN_DEPTH = 0.05  # [m]; a landmark predicted nearer than this to the camera plane is linearised where it was measured
 LANES = 64
 FREE = -1  # column of a pose that is given, not sought
+# Information [1/m^2] of a landmark about where it stands now, 1 km along each axis: where all its sightings have lost
+# their weight nothing else holds it. It takes part in every step, and moves nothing that has come to rest.
+WEAK = 1e-6
 
 # Rows of a block of poses and of the workspace of `replay`.
 PX, PY, COS, SIN, HEADING = (LANES * k for k in range(5))
@@ -205,8 +208,8 @@ def assemble(
         spreads, forces: (l, 6), (l, 3), results: inverse of the landmarks' own block, and their slopes.
 
     Returns:
-        Half the sum of squares of odometry, and of frozen sightings' forms up to a constant; infinite if a landmark has
-        no information.
+        Half the sum of squares of odometry, and of frozen sightings' forms up to a constant; infinite if a landmark is
+        at no finite place.
     """
     cost = 0.0
     cosines, sines = np.cos(poses[:, 2]), np.sin(poses[:, 2])
@@ -259,6 +262,7 @@ def assemble(
     for landmark in range(len(landmarks)):
         first, last = starts[landmark], starts[landmark + 1]
         block[:] = 0.0
+        block[0] = block[3] = block[5] = WEAK
         force = forces[landmark]
         force[:] = 0.0
         for q in range(first, last):
@@ -389,6 +393,8 @@ def replay(
         for block in range(num_blocks):
             for i in range(WORK_ROWS * LANES):
                 work[i] = 0.0
+            for i in range(LANES):
+                work[A00 + i] = work[A11 + i] = work[A22 + i] = WEAK
             for q in range(first, last):
                 base = (block * num_keys + keys[q]) * POSE_ROWS * LANES
                 pose = poses[base : base + POSE_ROWS * LANES]

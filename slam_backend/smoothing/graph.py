@@ -173,6 +173,13 @@ def mean_pose(poses: FloatArray) -> FloatArray:
     return np.array([x.mean(), y.mean(), np.arctan2(np.sin(headings).mean(), np.cos(headings).mean())])
 
 
+def scattered(poses: FloatArray) -> FloatArray:
+    """Return the covariance (3, 3) of poses (3, n) [m, m, rad] about their mean, at least that of `RIGID`."""
+    off = poses - mean_pose(poses)[:, None]
+    off[2] = wrap_angle(off[2])
+    return np.asarray(off @ off.T / off.shape[1] + RIGID**2 * np.eye(3))
+
+
 def _turned(poses: FloatArray) -> FloatArray:
     """Return differences of poses (n, 3) with headings in [-pi, pi)."""
     return np.column_stack([poses[:, :2], wrap_angle(poses[:, 2])])

@@ -14,22 +14,30 @@ OF_POINTS = ("points", "point_noises", "given", "point_frames", "point_landmarks
 OF_FROZEN = ("frozen_keys", "frozen_landmarks", "centres", "infos", "slopes", "counts")
 
 
-def joined(a: PathGraph, b: PathGraph, motion: FloatArray, renamed: IntArray) -> PathGraph:
+FIXES = 3  # landmarks in common from which measurements alone say how two groups lie
+
+
+def joined(
+    a: PathGraph, b: PathGraph, motion: FloatArray, renamed: IntArray, uncertainty: FloatArray | None = None
+) -> PathGraph:
     """Return the graph of both groups' robots, a's first, in a's frame.
 
     Measurements and odometry are seen from key poses, so that they stay as they are. All keys and landmarks of b are
     moved; what was given in b's frame is now sought, rigid among itself: its first start with a vague prior about where
-    the move puts it, the other starts by links to that one. So only landmarks in common say how the groups lie.
+    the move puts it, the other starts by links to that one. So only landmarks in common say how the groups lie. Where
+    there are fewer than `FIXES` of them the motion is all that does, and counts as certain as it is.
 
     Args:
         a: Whose frame, robots and landmark names stay.
         b: The other.
         motion: (3,) [m, m, rad] from b's frame to a's; a guess, from which the next descent starts.
         renamed: (n, 2) int64 rows (name in b, name in the joint map), each name in b once. What else b saw is left out.
+        uncertainty: (3, 3) covariance of where b's first robot started [m, m, rad], a's frame. None: nothing is known.
     """
     names = dict(zip(renamed[:, 0].tolist(), a.known_as(renamed[:, 1]).tolist(), strict=True))
     b = _named(_moved(b, motion), names)
-    loose, b = _unpinned(b)
+    fixed = uncertainty is None or len(np.intersect1d(a.landmark_ids, b.landmark_ids)) >= FIXES
+    loose, b = _unpinned(b, np.diag(VAGUE) if fixed else np.asarray(uncertainty))
     origin = np.flatnonzero(a.robots == NONE)
     if not len(origin):
         a, origin = _with_origin(a), np.array([a.num_keys])
@@ -91,8 +99,11 @@ def _rows(graph: PathGraph, names: tuple[str, ...], kept: BoolArray, row: IntArr
     return columns | {name: row[column] for name, column in columns.items() if name.endswith("_landmarks")}
 
 
-def _unpinned(graph: PathGraph) -> tuple[IntArray, PathGraph]:
-    """Return the starts that hang on nothing of the group (n,), and the group without an origin, none of it given."""
+def _unpinned(graph: PathGraph, prior: FloatArray) -> tuple[IntArray, PathGraph]:
+    """Return the starts that hang on nothing of the group (n,), and the group without an origin, none of it given.
+
+    These starts are where they are but for a prior covariance (3, 3).
+    """
     origin = np.flatnonzero(graph.robots == NONE)
     given = np.flatnonzero((graph.previous == NONE) & (graph.robots >= 0))
     loose = np.flatnonzero(np.isin(graph.previous, origin) & (graph.robots >= 0))
@@ -101,7 +112,7 @@ def _unpinned(graph: PathGraph) -> tuple[IntArray, PathGraph]:
     previous[given], motions[given], noises[given] = given[:1], 0.0, RIGID**2 * np.eye(3)
     if len(given):
         motions[given] = between(graph.poses[given[0]], graph.poses[given])
-    previous[free], motions[free], noises[free] = NONE, graph.poses[free], np.diag(VAGUE)
+    previous[free], motions[free], noises[free] = NONE, graph.poses[free], prior
     graph = replace(graph, previous=previous, motions=motions, noises=noises)
     if not len(origin):
         return free, graph

@@ -86,7 +86,7 @@ def find_mode(
     cost = system.form(poses, landmarks)
     for iteration in range(1, most + 1):
         if not np.isfinite(cost):
-            return given_up("a landmark without information", iteration)
+            return given_up("a landmark at no finite place", iteration)
         factor = system.factor(damping)
         if factor is None:
             return given_up("a singular system", iteration)

@@ -1,9 +1,10 @@
 import numpy as np
+import pytest
 from small_problems import TIGHT, camera_of, logs_of, small_run
 
 from slam_backend.geometry import between, compose
 from slam_backend.smoothing.extending import extended
-from slam_backend.smoothing.graph import NONE, PathGraph
+from slam_backend.smoothing.graph import NONE, PathGraph, scattered
 from slam_backend.smoothing.joining import joined
 from slam_backend.smoothing.solving import find_mode
 
@@ -108,3 +109,34 @@ def test_words_for_one_landmark_follow_it():
     b = PathGraph(**b.to_mapping() | {"aliases": np.array([[old[0], kept[0]]])})
     both = joined(a, b, np.zeros(3), renamed)
     assert both.known_as(np.array([old[1], kept[1]])).tolist() == [kept[1], kept[1]]
+
+
+@pytest.mark.parametrize("common", [0, 2])
+def test_groups_without_landmarks_that_fix_the_motion_lie_as_the_merge_said(common):
+    """Two groups that share too few landmarks are as uncertain against each other as the motion was, not lost."""
+    run = small_run(2)
+    (a, _), (b, renamed) = group_graph(run, [0]), group_graph(run, [1], OFFSET)
+    shared = renamed[np.isin(renamed[:, 1], a.landmark_ids)][:common]
+    own = renamed[~np.isin(renamed[:, 1], a.landmark_ids)]
+    uncertainty = np.diag([0.03, 0.04, 0.01]) ** 2
+    motion = between(run.true_paths[0, 0], run.true_paths[1, 0])
+    both = joined(a, b, motion, np.concatenate([shared, own]), uncertainty)
+    mode = find_mode(both, camera_of(run), TIGHT)
+    assert mode.reason == ""
+    half = np.linalg.inv(np.triu(mode.factor))
+    first = mode.columns[both.heads[1]] + np.arange(3)
+    claimed = (half @ half.T)[np.ix_(first, first)]
+    if common:
+        assert np.linalg.eigvalsh(uncertainty - claimed).min() > -1e-9
+        return
+    np.testing.assert_allclose(mode.poses[both.heads[1]], motion, atol=1e-6)
+    np.testing.assert_allclose(claimed, uncertainty, rtol=1e-3, atol=1e-9)
+
+
+def test_scatter_is_the_covariance_about_the_mean_direction():
+    """Poses on both sides of a half turn scatter as they would about zero."""
+    rng = np.random.default_rng(3)
+    poses = rng.normal(size=(3, 400)) * np.array([[0.3], [0.2], [0.1]])
+    there = poses + np.array([[1.0], [2.0], [np.pi]])
+    np.testing.assert_allclose(scattered(there), scattered(poses), rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(scattered(poses), np.cov(poses, bias=True), atol=1e-3)

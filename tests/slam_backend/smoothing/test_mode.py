@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from small_problems import (
@@ -184,3 +186,25 @@ def test_exact_poses_are_refused():
     log.append(0, pose=np.zeros(3))
     with pytest.raises(ValueError, match="logs: expected odometry"):
         extended(PathGraph.at_starts(np.zeros((1, 3))), [log.arrays()], OdometryModel(), np.zeros(3))
+
+
+def test_a_landmark_whose_sightings_say_nothing_stays_and_keeps_nobody():
+    """Frozen sightings that have lost their weight hold no landmark: it stays where it is, and poses are as without."""
+    run = small_run()
+    graph = graph_of(run)
+    best = find_mode(graph, camera_of(run), TIGHT)
+    lost = np.array([3.0, -2.0, 0.5])
+    ghost = {
+        "frozen_keys": np.array([2, 4]),
+        "frozen_landmarks": np.full(2, len(graph.landmarks)),
+        "centres": np.array([[1.0, 0.0, 0.0], [40.0, 0.0, 0.0]]),
+        "infos": 1e-200 * np.array([[1.0, 0.0, 0.0, 1.0, 0.0, 1.0]] * 2),
+        "slopes": np.zeros((2, 3)),
+        "counts": np.ones(2, dtype=np.int64),
+        "landmark_ids": np.append(graph.landmark_ids, 10_000),
+        "landmarks": np.concatenate([graph.landmarks, lost[None]]),
+    }
+    mode = find_mode(replace(graph, **ghost), camera_of(run), TIGHT)
+    assert mode.reason == ""
+    np.testing.assert_allclose(mode.landmarks[-1], lost, atol=1e-9)
+    np.testing.assert_allclose(mode.poses, best.poses, atol=1e-9)
