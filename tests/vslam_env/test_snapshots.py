@@ -14,7 +14,7 @@ from digests import digest
 from small_env import MEETING, small_env, wander
 
 from vslam_env import ExplorationEnv, load_state, save_state, vslam_v0
-from vslam_env.snapshots import state_version
+from vslam_env.snapshots import STATE_FORMAT, state_version
 
 FURTHER = 300
 
@@ -228,7 +228,10 @@ def test_a_refused_state_leaves_the_environment_alone() -> None:
     [
         (lambda content: content[: len(content) // 2], "path: expected a whole file of a state, got a damaged file"),
         (lambda content: b"hello" + content, "path: expected the file of a state"),
-        (lambda content: content.replace(b"state 2/", b"state 9/", 1), r"expected a state of version .*got '9/"),
+        (
+            lambda content: content.replace(f"state {STATE_FORMAT}/".encode(), b"state 9/", 1),
+            r"expected a state of version .*got '9/",
+        ),
         (None, "path: expected the file of a state, .*no such file|No such file"),
     ],
 )
