@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from training import compile_timing
+from training import compile_timing, filter_bounds
 from training.bench_filter import BenchConfig, BenchResult, count_trials, run_bench
 from training.filter_bounds import arithmetic_bound_ms, bytes_moved, copy_bound_ms, map_bytes
 from training.filter_goals import goals_of
@@ -174,8 +174,10 @@ def test_calls_are_timed_without_the_garbage_collector() -> None:
     assert gc.isenabled()
 
 
-def test_bounds_follow_from_counts_and_rates() -> None:
+def test_bounds_follow_from_counts_and_rates(monkeypatch: pytest.MonkeyPatch) -> None:
     """Bytes grow with B M alone, whatever N; times are counts over the rates measured in this process."""
+    assert multiply_add_rate("float32") > 0.0
+    monkeypatch.setattr(filter_bounds, "multiply_add_rate", {"float64": 10e9, "float32": 20e9}.__getitem__)
     load = FilterLoad(particles=1000)
     assert bytes_moved(load) == 2 * 15 * 1000 * 76
     assert bytes_moved(replace(load, landmarks=1000)) == bytes_moved(replace(load, robots=3)) == bytes_moved(load)
@@ -183,7 +185,8 @@ def test_bounds_follow_from_counts_and_rates() -> None:
     assert copy_bound_ms(load) * copy_rate(map_bytes(load)) == pytest.approx(1e3 * bytes_moved(load))
     small, large = (arithmetic_bound_ms(replace(load, proposal=p)) for p in ("fastslam1", "fastslam2"))
     assert 2.0 < large / small < 4.0
-    assert multiply_add_rate("float32") > 0.0
+    monkeypatch.setattr(filter_bounds, "multiply_add_rate", {"float64": 20e9, "float32": 40e9}.__getitem__)
+    assert arithmetic_bound_ms(replace(load, proposal="fastslam1")) == pytest.approx(small / 2)
     assert processor()
 
 
