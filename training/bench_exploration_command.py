@@ -5,7 +5,20 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from training.command_folder import begin, choose, finish
-from training.command_options import Check, Config, FirstSeed, Json, OutToGoOn, Particles, Processes, numbers, words
+from training.command_options import (
+    Check,
+    Config,
+    EnvRejuvenateEvery,
+    FirstSeed,
+    Json,
+    Noise,
+    OutToGoOn,
+    Particles,
+    Processes,
+    Sensor,
+    numbers,
+    words,
+)
 from training.command_progress import KeptPart, play_kept
 
 if TYPE_CHECKING:  # what computes is imported when the command runs, so that --help answers at once
@@ -36,14 +49,9 @@ def bench_exploration(
     ] = None,
     duration: Annotated[float | None, typer.Option(help="Seconds of an episode.", show_default="120")] = None,
     particles: Particles = None,
-    rejuvenate_every: Annotated[
-        int | None,
-        typer.Option(help="Ticks after which particles are drawn anew; 0: never.", show_default="100"),
-    ] = None,
-    preset: Annotated[str | None, typer.Option(help="easy, standard or hard noise.", show_default="standard")] = None,
-    sensor: Annotated[
-        str | None, typer.Option(help="landmark, or stereo: rendered eyes.", show_default="landmark")
-    ] = None,
+    rejuvenate_every: EnvRejuvenateEvery = None,
+    preset: Noise = None,
+    sensor: Sensor = None,
     seeds: Annotated[int | None, typer.Option(help="Episodes of each policy.", show_default="10")] = None,
     first_seed: FirstSeed = None,
     quick: Annotated[bool, typer.Option("--quick", help="Offices alone, 60 s, 3 seeds.")] = False,

@@ -12,6 +12,11 @@ RejuvenateEvery = Annotated[
     int | None,
     typer.Option(help="Steps after which particles are drawn anew from smoothed paths.", show_default="never"),
 ]
+EnvRejuvenateEvery = Annotated[
+    int | None, typer.Option(help="Ticks after which particles are drawn anew; 0: never.", show_default="100")
+]
+Noise = Annotated[str | None, typer.Option(help="easy, standard or hard noise.", show_default="standard")]
+Sensor = Annotated[str | None, typer.Option(help="landmark, or stereo: rendered eyes.", show_default="landmark")]
 Seed = Annotated[int | None, typer.Option(help="Of all random draws.", show_default="0")]
 FirstSeed = Annotated[int | None, typer.Option(help="The first of them.", show_default="0")]
 Processes = Annotated[int, typer.Option(help="Trials at a time.")]

@@ -7,7 +7,7 @@ import typer
 from rich.console import Console
 
 from training.command_folder import begin, choose, finish
-from training.command_options import Config, Json, Out, Particles, Seed
+from training.command_options import Config, EnvRejuvenateEvery, Json, Noise, Out, Particles, Seed, Sensor
 
 if TYPE_CHECKING:  # what computes is imported when the command runs, so that --help answers at once
     from training.episode import EpisodeRecord
@@ -38,14 +38,9 @@ def run(
     ] = None,
     max_cycles: Annotated[int | None, typer.Option(help="Steps of the episode.", show_default="180 s worth")] = None,
     particles: Particles = None,
-    rejuvenate_every: Annotated[
-        int | None,
-        typer.Option(help="Ticks after which particles are drawn anew; 0: never.", show_default="100"),
-    ] = None,
-    preset: Annotated[str | None, typer.Option(help="easy, standard or hard noise.", show_default="standard")] = None,
-    sensor: Annotated[
-        str | None, typer.Option(help="landmark, or stereo: rendered eyes.", show_default="landmark")
-    ] = None,
+    rejuvenate_every: EnvRejuvenateEvery = None,
+    preset: Noise = None,
+    sensor: Sensor = None,
     out: Out = None,
     json: Json = None,
     video: Annotated[bool, typer.Option(help="Whether to film the run.")] = True,
