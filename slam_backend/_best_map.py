@@ -90,6 +90,12 @@ def best_outline(maps: ParticleMaps, m: int, min_count: int) -> MapOutline:
     return MapOutline(means[order], variances[order], times[order], names[order])
 
 
+def slots_held(maps: ParticleMaps, m: int, min_count: int) -> IntArray:
+    """Return the slots (n,) of `best_map`, which takes the same, by ascending id."""
+    slots, ascending = _held(maps.ids, maps.row_of, maps.map_of, maps.maps, maps.counts, m, min_count)
+    return slots if ascending else slots[np.argsort(maps.ids[slots])]
+
+
 def best_map(maps: ParticleMaps, m: int, min_count: int) -> tuple[FloatArray, FloatArray, Any, IntArray, IntArray]:
     """Return what one particle holds, by ascending id.
 
@@ -102,9 +108,7 @@ def best_map(maps: ParticleMaps, m: int, min_count: int) -> tuple[FloatArray, Fl
         Means (n, 3) [m], covariances (n, 3, 3) [m^2], map frame, descriptors (n, d) float32, counts (n,) and ids (n,):
         all fresh.
     """
-    slots, ascending = _held(maps.ids, maps.row_of, maps.map_of, maps.maps, maps.counts, m, min_count)
-    if not ascending:
-        slots = slots[np.argsort(maps.ids[slots])]
+    slots = slots_held(maps, m, min_count)
     means, covariances, times, names = _gather(
         slots, maps.ids, maps.row_of, maps.map_of, maps.maps, maps.values, maps.counts, m, LANES
     )

@@ -14,15 +14,15 @@ from numba.extending import intrinsic
 P = ParamSpec("P")
 T = TypeVar("T")
 
-KERNELS = "_kernels"  # a folder whose modules hold kernels that call each other
+KERNELS = "_kernels"  # ends the name of a folder whose modules hold kernels that call each other
 
 
 def jit(function: Callable[P, T]) -> Callable[P, T]:
     """Compile `function` with numba and keep its signature for the type checker.
 
     numba's disk cache notices edits of the file that holds `function`, not of other files whose kernels it calls:
-    kernels that call each other therefore live in one module, or in one folder named `_kernels`, of which an edit of
-    any file is noticed. `parallel=True` is left out on purpose, because it breaks forked workers.
+    kernels that call each other therefore live in one module, or in one folder whose name ends in `_kernels`, of which
+    an edit of any file is noticed. `parallel=True` is left out on purpose, because it breaks forked workers.
     """
     return _compiled(function)
 
@@ -60,7 +60,7 @@ def _compiled(function: Callable[P, T], **options: Any) -> Callable[P, T]:
     except RuntimeError:  # neither the package's folder nor the user's can be written: each process compiles anew
         return cast(Callable[P, T], numba.njit(nogil=True, **options)(function))
     folder = Path(function.__code__.co_filename).parent
-    if folder.name == KERNELS and hasattr(kernel, "_cache"):  # it has none where NUMBA_DISABLE_JIT is set
+    if folder.name.endswith(KERNELS) and hasattr(kernel, "_cache"):  # it has none where NUMBA_DISABLE_JIT is set
         file = kernel._cache._cache_file
         file._source_stamp = (file._source_stamp, _contents(folder))
     return cast(Callable[P, T], kernel)

@@ -18,14 +18,14 @@ from typing import Any
 
 import numpy as np
 
+from slam_backend._alignment_kernels import moved_away
+from slam_backend._candidates import match_table
 from slam_backend.alignment import RIVAL_ANGLE, RIVAL_DISTANCE, Alignment, AlignmentOptions, align_maps
 from slam_backend.errors import FloatArray, IntArray
-from slam_backend.geometry import rotate_covariances, rotation, transform_points
+from slam_backend.geometry import transform_points
 from slam_backend.landmark_map import LandmarkMap
 from slam_backend.merge_options import MergeOptions
 from slam_backend.reports import StepReport
-
-FITS = 10  # rounds of fitting a rigid motion to the landmarks within the gate
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,29 +114,11 @@ def moved_share(old: LandmarkMap, joint: LandmarkMap, options: AlignmentOptions)
     Returns:
         In [0, 1]: of the landmarks that both maps hold, those beyond the gate at the rigid motion on which most agree.
     """
-    _, rows, places = np.intersect1d(old.ids, joint.ids, return_indices=True)
+    _, rows, places = np.intersect1d(old.ids, joint.ids, assume_unique=True, return_indices=True)
     if len(rows) < options.min_inliers:
         return 0.0
-    points, targets = old.means[rows], joint.means[places]
-    floor = options.position_floor**2 * np.eye(3)
-    inside = np.ones(len(rows))
-    for _ in range(FITS):
-        motion = _rigid_motion(points, targets, inside)
-        covariances = rotate_covariances(motion[2], old.covariances[rows]) + joint.covariances[places] + floor
-        residuals = targets - transform_points(motion, points)
-        squares = np.einsum("ni,ni->n", residuals, np.linalg.solve(covariances, residuals[..., None])[..., 0])
-        outside = squares > options.position_gate
-        inside = np.where(outside, 1e-3, 1.0)  # never nothing: the fit stays defined
-    return float(np.mean(outside))
-
-
-def _rigid_motion(points: FloatArray, targets: FloatArray, weights: FloatArray) -> FloatArray:
-    """Return the planar motion (3,) that takes points (n, 3) to targets (n, 3) by weighted least squares."""
-    shares = weights / weights.sum()
-    here, there = shares @ points[:, :2], shares @ targets[:, :2]
-    spread = ((points[:, :2] - here) * shares[:, None]).T @ (targets[:, :2] - there)
-    angle = np.arctan2(spread[0, 1] - spread[1, 0], spread[0, 0] + spread[1, 1])
-    return np.array([*(there - rotation(angle) @ here), angle])
+    table = match_table(joint, old, np.column_stack([places, rows]))
+    return moved_away(table, options.position_floor**2, options.position_gate) / len(table)
 
 
 def differs(motion: FloatArray, points: FloatArray) -> bool:

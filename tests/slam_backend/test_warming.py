@@ -118,12 +118,13 @@ def test_kernels_work_where_no_cache_can_be_written(monkeypatch: pytest.MonkeyPa
         assert compiled(4.0) == 8.0
 
 
-def test_an_edit_of_a_kernel_is_noticed_by_kernels_of_its_folder_that_call_it(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["_kernels", "_other_kernels"])
+def test_an_edit_of_a_kernel_is_noticed_by_kernels_of_its_folder_that_call_it(name: str, tmp_path: Path) -> None:
     """What is compiled into another module's kernel does not linger in the cache."""
-    folder = tmp_path / "_kernels"
+    folder = tmp_path / name
     folder.mkdir()
     (folder / "caller.py").write_text(
-        "from slam_backend._jit import jit\n\nfrom _kernels.callee import answer\n\n\n"
+        f"from slam_backend._jit import jit\n\nfrom {name}.callee import answer\n\n\n"
         "@jit\ndef ask(x):\n    return answer(x)\n"
     )
     answers = []
@@ -131,7 +132,7 @@ def test_an_edit_of_a_kernel_is_noticed_by_kernels_of_its_folder_that_call_it(tm
         (folder / "callee.py").write_text(
             f"from slam_backend._jit import inlined\n\n\n@inlined\ndef answer(x):\n    return x + {number}\n"
         )
-        code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); from _kernels.caller import ask; print(ask(0.0))"
+        code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); from {name}.caller import ask; print(ask(0.0))"
         answers.append(float(subprocess.run([sys.executable, "-c", code], capture_output=True, check=True).stdout))
     assert answers == [1.0, 2.0]
 

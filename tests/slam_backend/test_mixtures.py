@@ -1,0 +1,66 @@
+"""The compiled mixture over all particles agrees with the plain sums, and reads maps without touching them."""
+
+import numpy as np
+
+from slam_backend import FastSlam, Measurements
+from slam_backend._mixtures import map_mixture
+from slam_backend.landmark_map import LandmarkMap
+
+UNPACK = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
+
+
+def filter_with_gaps(num_particles: int, seed: int) -> FastSlam:
+    """Return a filter whose particles have resampled at different times, and do not all hold the same landmarks."""
+    rng = np.random.default_rng(seed)
+    slam = FastSlam(num_particles=num_particles, seed=seed, resample_threshold=1.0)
+    points = np.column_stack([rng.uniform(-2.0, 2.0, 14), rng.uniform(-1.0, 1.0, 14), rng.uniform(2.0, 6.0, 14)])
+    looks = np.linalg.qr(rng.standard_normal((14, 14)))[0].astype(np.float32)
+    for step in range(12):
+        seen = rng.choice(14 if step > 4 else 8, 5, replace=False)
+        noisy = points[seen] + rng.normal(0.0, 0.02, (5, 3))
+        slam.step([np.array([0.0, 0.0, 0.001])], [Measurements(noisy, looks[seen])])
+    slots = slam._maps.used_slots()
+    slam._maps.refresh(slots[::2])
+    slam._maps.counts[slam._maps.row_of[slots[::2]], 1::3] = 0
+    return slam
+
+
+def plain_mixture(slam: FastSlam, min_count: int) -> LandmarkMap:
+    """Return the same map by sums over all that `dense` copies."""
+    maps, best = slam._maps, slam.best_particle
+    slots = maps.used_slots()
+    counts = maps.of_particle(best, slots)[1]
+    slots, counts = slots[counts >= min_count], counts[counts >= min_count]
+    dense, times = maps.dense(slots)
+    weights = np.exp(slam._log_weights) * (times > 0)
+    weights /= weights.sum(axis=1, keepdims=True)
+    mixed = np.einsum("ncm,nm->nc", dense, weights)
+    offsets = dense[:, :3] - mixed[:, :3, None]
+    covariances = mixed[:, 3:][:, UNPACK] + np.einsum("nim,njm,nm->nij", offsets, offsets, weights)
+    return LandmarkMap(mixed[:, :3], covariances, maps.descriptors[slots], counts, maps.ids[slots])
+
+
+def test_the_kernel_agrees_with_plain_sums() -> None:
+    """Whatever the number of particles, and however often a landmark has to be seen: the same map, to rounding."""
+    for num_particles, seed in ((1, 5), (8, 6), (70, 7)):
+        slam = filter_with_gaps(num_particles, seed)
+        for least in (1, 2):
+            found = LandmarkMap(*map_mixture(slam._maps, slam.best_particle, slam._log_weights, least))
+            plain = plain_mixture(slam, least)
+            np.testing.assert_array_equal(found.ids, plain.ids)
+            np.testing.assert_array_equal(found.counts, plain.counts)
+            np.testing.assert_array_equal(found.descriptors, plain.descriptors)
+            np.testing.assert_allclose(found.means, plain.means, rtol=1e-12, atol=1e-12)
+            np.testing.assert_allclose(found.covariances, plain.covariances, rtol=1e-9, atol=1e-15)
+            assert len(plain) > (7 if least == 1 else 0)
+
+
+def test_to_ask_for_a_mixture_changes_nothing() -> None:
+    """Maps that wait to be brought up to date still wait afterwards."""
+    slam = filter_with_gaps(33, 8)
+    before = slam._maps.get_state()
+    assert before["map_of"].any()
+    slam.map("mixture")
+    after = slam._maps.get_state()
+    for name in ("map_of", "maps", "values", "counts"):
+        np.testing.assert_array_equal(after[name], before[name])
