@@ -8,12 +8,12 @@ and is the default.
 
 import numpy as np
 
+from slam_backend._joint_robots import finish, joined_robots
 from slam_backend._packed import UPPER
 from slam_backend.alignment import Alignment
 from slam_backend.errors import IntArray
 from slam_backend.filter import FastSlam
 from slam_backend.fusion import fuse_maps
-from slam_backend.merging import finish, joined_robots
 from slam_backend.resampling import systematic
 
 
