@@ -97,6 +97,11 @@ class RejuvenationStep:
         self._asked = True
 
     @property
+    def asked(self) -> bool:
+        """Whether it was told to `hasten`, and nothing has come of it yet."""
+        return self._asked
+
+    @property
     def due(self) -> bool:
         """Whether it is time for new particles."""
         if self._asked:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from slam_backend.alignment import AlignmentOptions, candidate_matches
+from slam_backend.alignment import Alignment, AlignmentOptions, candidate_matches
 from slam_backend.errors import bad_argument, check_int
 from slam_backend.landmark_map import LandmarkMap
 
@@ -51,12 +51,34 @@ class _Record:
     tried: set[tuple[int, int]] = field(default_factory=set)  # candidate matches of the last attempt, by landmark ids
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Straightening:
+    """An attempt whose maps fit as the filters bent them, and which goes on when these have straightened them.
+
+    Attributes:
+        pair: That tries.
+        numbers: Of both joint filters' maps: with others it does not go on.
+        bent: How the maps fit.
+        since: Step in which it began.
+        ready: Whether both maps are straight; it goes on one step later.
+    """
+
+    pair: PairKey
+    numbers: tuple[int, int]
+    bent: Alignment
+    since: int
+    ready: bool = False
+
+
 class AttemptSchedule:
     """The memory of past attempts.
 
     Args:
         options: The rhythm.
         alignment: What makes a candidate match, and how many an alignment needs.
+
+    Attributes:
+        straightening: The attempt that goes on; None: none does.
     """
 
     def __init__(self, options: AttemptOptions, alignment: AlignmentOptions) -> None:
@@ -66,6 +88,7 @@ class AttemptSchedule:
         self._proposed: dict[PairKey, set[tuple[int, int]]] = {}
         self._bars: list[tuple[PairKey, int]] = []
         self._doubts: dict[tuple[int, int], float] = {}  # robot of either side -> the least that there has been
+        self.straightening: Straightening | None = None
 
     def is_due(self, step: int) -> bool:
         """Tell whether a pair may try at this step."""
@@ -141,11 +164,13 @@ class AttemptSchedule:
     def get_state(self) -> dict[str, Any]:
         """Return the options and a copy of the memory."""
         memory = {"records": copy.deepcopy(self._records), "bars": tuple(self._bars), "doubts": dict(self._doubts)}
-        return {"options": self._options, "alignment": self._alignment} | memory
+        fixed = {"options": self._options, "alignment": self._alignment, "straightening": self.straightening}
+        return fixed | memory
 
     def set_state(self, state: Mapping[str, Any]) -> None:
         """Take over options and a memory that `get_state` returned."""
         self._options, self._alignment = state["options"], state["alignment"]
+        self.straightening = state["straightening"]
         self._records = copy.deepcopy(state["records"])
         self._bars = list(state["bars"])
         self._doubts = dict(state["doubts"])

@@ -210,6 +210,21 @@ class FastSlam(FilterKnowledge):
             pass
         return report
 
+    @property
+    def smooths_in_slices(self) -> bool:
+        """Whether the filter keeps a smoother that works in slices, one at a time."""
+        return self._rejuvenation is not None and self.options.smoothing.slice_steps is not None
+
+    def hasten(self) -> None:
+        """Let the particles be drawn anew as soon as may be, in slices if the smoother works so; see `is_hastened`."""
+        if self._rejuvenation is not None:
+            self._rejuvenation.hasten()
+
+    @property
+    def is_hastened(self) -> bool:
+        """Whether `hasten` was called and nothing has come of it yet."""
+        return self._rejuvenation is not None and self._rejuvenation.asked
+
     def _rejuvenate(self, smoother: RejuvenationStep) -> RejuvenationReport | None:
         """Draw the particles anew from the posterior of whole paths, if it is time and that can be found."""
         starts = self._starts[:, :, : self.num_particles]

@@ -17,26 +17,24 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from slam_backend._step_input import check_step
-from slam_backend.alignment import Alignment, AlignmentOptions, align_maps
-from slam_backend.attempts import AttemptOptions, AttemptSchedule, PairKey
+from slam_backend.alignment import Alignment, AlignmentOptions
+from slam_backend.attempts import AttemptOptions, AttemptSchedule
 from slam_backend.branches import Branch, take_in
 from slam_backend.contacts import check_contacts, reach
 from slam_backend.errors import IntArray, bad_argument, check_int, check_seed
 from slam_backend.filter import FastSlam
 from slam_backend.filter_options import FilterOptions
-from slam_backend.group_changes import contradicted, doubt_about, merge_groups, straightened, undone
+from slam_backend.group_changes import contradicted, merge_groups, undone
 from slam_backend.groups import Group
 from slam_backend.input_log import RobotInput
-from slam_backend.landmark_map import LandmarkMap
 from slam_backend.measurements import Measurements
 from slam_backend.merge_options import MergeOptions
 from slam_backend.merging import inverse_alignment
 from slam_backend.records import Records
 from slam_backend.reports import MapDropped, MergeEvent, RejuvenationReport, Renaming, TeamReport
 from slam_backend.team_knowledge import TeamKnowledge
+from slam_backend.trying import attempt, speakers
 from slam_backend.undoing import Undoing
-
-LEAST_KEPT = 0.8  # of the landmarks on which two bent maps agree, the straight ones have to agree on so many
 
 
 class TeamSlam(TeamKnowledge):
@@ -250,45 +248,16 @@ class TeamSlam(TeamKnowledge):
         self._schedule.bar(pair, self._step + self._merging.barred_steps)
 
     def _attempt(self, networks: IntArray) -> tuple[Renaming, ...]:
-        """Let the most promising pair of groups try, if it is time."""
-        if not self._schedule.is_due(self._step) or len(self._groups) < 2:
+        """Let a pair of groups try, if it is time, and merge those whose attempt is a success."""
+        options = self._schedule, self._alignment, self._merging
+        event = attempt(self._groups, networks, self._step, *options, self._records, self._rng)
+        if event is None:
             return ()
-        maps: dict[tuple[int, ...], LandmarkMap] = {}
-        pairs: dict[PairKey, tuple[Group, Group]] = {}
-        for i, a in enumerate(self._groups):
-            for b in self._groups[i + 1 :]:
-                touch = networks[a.trunk.live[0]] == networks[b.trunk.live[0]]
-                touch &= a.undoing is None and b.undoing is None
-                if touch and self._schedule.may_try((a.robots, b.robots), self._step):
-                    pairs[a.robots, b.robots] = (a, b)
-                    for group in (a, b):
-                        if group.robots not in maps:
-                            maps[group.robots] = group.trunk.filter.map("mixture")
-        chosen = self._schedule.choose({key: (maps[key[0]], maps[key[1]]) for key in pairs}, self._step)
-        if chosen is None:
+        self._events.append(event)
+        if not event.alignment.success:
             return ()
-        a, b = pairs[chosen]
-        alignment = align_maps(maps[a.robots], maps[b.robots], rng=self._rng, options=self._alignment)
-        bent: Alignment | None = None
-        speakers = a.trunk.live[0], b.trunk.live[0]
-        self._records.exchange.record_maps(*speakers, maps[a.robots], maps[b.robots])
-        before = [group.trunk.filter.get_state() for group in (a, b)] if alignment.success else []
-        straight = straightened(a, b) if alignment.success and self._merging.straighten else None
-        if straight is not None:
-            bent, alignment = alignment, align_maps(*straight, rng=self._rng, options=self._alignment)
-            self._records.exchange.record_straightened(*speakers, *straight)
-            fewer = alignment.success and len(alignment.inliers) < LEAST_KEPT * len(bent.inliers)
-            if fewer or alignment.reason == "too few inliers":
-                alignment = Alignment.refused("too few inliers", alignment.ratio)
-                for group, state in zip((a, b), before, strict=True):  # the smoother has lost its way
-                    group.trunk.filter.set_state(state)
-        if alignment.success and self._merging.sure:
-            doubt = self._merging.sure * doubt_about(a, b, alignment, self._rng)
-            if self._schedule.should_wait(chosen, doubt):
-                alignment = Alignment.refused("too uncertain", alignment.ratio)
-        self._events.append(MergeEvent(self._step, "attempt", a.robots, b.robots, alignment, bent))
-        self._schedule.record(chosen, self._step, alignment.success, straightened=straight is not None)
-        return (self.merge(*speakers, alignment),) if alignment.success else ()
+        groups = self._group_of(event.robots_a[0]), self._group_of(event.robots_b[0])
+        return (self.merge(*speakers(groups), event.alignment),)
 
     def _dropped(self) -> list[MapDropped]:
         """Return the maps that are gone since this was asked last."""

@@ -7,7 +7,7 @@ from merged_pair import NEVER
 from same_bits import assert_same
 from simulated_team import SimulatedTeam
 
-from slam_backend import team as team_module
+from slam_backend import trying
 from slam_backend.alignment import AlignmentOptions, align_maps
 from slam_backend.attempts import AttemptOptions
 from slam_backend.branches import restored_filter
@@ -117,14 +117,14 @@ def test_maps_that_no_longer_fit_are_not_merged() -> None:
 def test_maps_that_agree_on_less_once_straight_are_not_merged(every: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """A smoother that has lost its way is not believed: the attempt is refused, and the filters are as they were."""
     _, alone = driven(112, NEVER)
-    original = team_module.straightened
+    original = trying.straightened
 
     def lost(a: Group, b: Group) -> tuple[LandmarkMap, LandmarkMap]:
         maps = original(a, b)
         assert maps is not None
         return maps[0].subset(np.flatnonzero(np.arange(len(maps[0])) % every)), maps[1]
 
-    monkeypatch.setattr(team_module, "straightened", lost)
+    monkeypatch.setattr(trying, "straightened", lost)
     _, team = driven(112, AT_LAST)
     event = team.events[0]
     assert (len(team.events), event.alignment.reason) == (1, "too few inliers")

@@ -1,0 +1,165 @@
+"""An attempt of two groups to align their maps: the pair is chosen, both maps are straightened, and align once more.
+
+Filters that keep a smoother which works in slices straighten theirs over some steps, a slice in each, as they would for
+a rejuvenation that is due; the attempt goes on when both have, and hear each other. Others smooth all they have read
+in one step.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from slam_backend.alignment import Alignment, AlignmentOptions, align_maps
+from slam_backend.attempts import AttemptSchedule, PairKey, Straightening
+from slam_backend.errors import IntArray
+from slam_backend.group_changes import doubt_about, straightened
+from slam_backend.groups import Group
+from slam_backend.landmark_map import LandmarkMap
+from slam_backend.merge_options import MergeOptions
+from slam_backend.records import Records
+from slam_backend.reports import MergeEvent
+
+LEAST_KEPT = 0.8  # of the landmarks on which two bent maps agree, the straight ones have to agree on so many
+MOST_STEPS = 40  # for which an attempt waits for straight maps and for contact; then it takes maps as they are
+
+Pair = tuple[Group, Group]
+Maps = tuple[LandmarkMap, LandmarkMap]
+
+
+def attempt(
+    groups: Sequence[Group], networks: IntArray, step: int, schedule: AttemptSchedule, alignment: AlignmentOptions,
+    merging: MergeOptions, records: Records, rng: np.random.Generator,
+) -> MergeEvent | None:  # fmt: skip
+    """Let the most promising pair of groups try, if it is time, or go on with an attempt whose maps are straightened.
+
+    Args:
+        groups: Of the team, by their robots. Filters of a pair that tries are straightened.
+        networks: (K,) robots with the same number are in contact.
+        step: Of the team.
+        schedule: Who tries when; it remembers an attempt that goes on.
+        alignment: When two maps are believed to fit together.
+        merging: Whether maps are straightened, and how sure a merge has to be.
+        records: In which what is sent is written down.
+        rng: For the search.
+
+    Returns:
+        The attempt that came to its end in this step; its two groups are to be merged if its alignment is a success.
+    """
+    pending = schedule.straightening
+    if pending is None:
+        return _begun(groups, networks, step, schedule, alignment, merging, records, rng)
+    pair = next((pair for pair in _pairs(groups) if _is_meant(pending, pair)), None)
+    late = step - pending.since >= MOST_STEPS
+    if pair is None or (late and not _in_touch(pair, networks)):
+        schedule.straightening = None
+        return None
+    if not pending.ready or not _in_touch(pair, networks):
+        ready = pending.ready or late or not any(group.trunk.filter.is_hastened for group in pair)
+        schedule.straightening = replace(pending, ready=ready)  # to go on would be too much for one step
+        return None
+    schedule.straightening = None
+    outcome = _straight(pair, pending.bent, _mixtures(pair), alignment, records, rng)
+    return _concluded(pair, step, outcome, pending.bent, schedule, merging, rng)
+
+
+def _begun(
+    groups: Sequence[Group], networks: IntArray, step: int, schedule: AttemptSchedule, options: AlignmentOptions,
+    merging: MergeOptions, records: Records, rng: np.random.Generator,
+) -> MergeEvent | None:  # fmt: skip
+    """Choose a pair, if it is time, and align its maps as the filters have bent them."""
+    if not schedule.is_due(step) or len(groups) < 2:
+        return None
+    able = (pair for pair in _pairs(groups) if _in_touch(pair, networks))
+    pairs = {_key(pair): pair for pair in able if schedule.may_try(_key(pair), step)}
+    maps = {group.robots: group.trunk.filter.map("mixture") for group in _unique(pairs)}
+    chosen = schedule.choose({key: (maps[key[0]], maps[key[1]]) for key in pairs}, step)
+    if chosen is None:
+        return None
+    pair, (map_a, map_b) = pairs[chosen], (maps[chosen[0]], maps[chosen[1]])
+    bent = align_maps(map_a, map_b, rng=rng, options=options)
+    records.exchange.record_maps(*speakers(pair), map_a, map_b)
+    if not bent.success or not merging.straighten:
+        return _concluded(pair, step, bent, None, schedule, merging, rng)
+    if all(group.trunk.filter.smooths_in_slices for group in pair):
+        for group in pair:
+            group.trunk.filter.hasten()
+        schedule.straightening = Straightening(chosen, _numbers(pair), bent, step)
+        return None
+    before = [group.trunk.filter.get_state() for group in pair]
+    straight = straightened(*pair)
+    if straight is None:
+        return _concluded(pair, step, bent, None, schedule, merging, rng)
+    outcome = _straight(pair, bent, straight, options, records, rng, before)
+    return _concluded(pair, step, outcome, bent, schedule, merging, rng)
+
+
+def _straight(
+    pair: Pair, bent: Alignment, maps: Maps, options: AlignmentOptions, records: Records, rng: np.random.Generator,
+    before: Sequence[Mapping[str, Any]] = (),
+) -> Alignment:  # fmt: skip
+    """Align straight maps, which must agree on most of what the bent ones did.
+
+    Where they do not, filters that were straightened on purpose go on from their states `before` that.
+    """
+    alignment = align_maps(*maps, rng=rng, options=options)
+    records.exchange.record_straightened(*speakers(pair), *maps)
+    fewer = alignment.success and len(alignment.inliers) < LEAST_KEPT * len(bent.inliers)
+    if fewer or alignment.reason == "too few inliers":
+        alignment = Alignment.refused("too few inliers", alignment.ratio)
+        for group, state in zip(pair, before, strict=bool(before)):  # the smoother has lost its way
+            group.trunk.filter.set_state(state)
+    return alignment
+
+
+def _concluded(
+    pair: Pair, step: int, alignment: Alignment, bent: Alignment | None, schedule: AttemptSchedule,
+    merging: MergeOptions, rng: np.random.Generator,
+) -> MergeEvent:  # fmt: skip
+    """Ask whether a merge would be sure enough, and remember what came of the attempt."""
+    if alignment.success and merging.sure:
+        doubt = merging.sure * doubt_about(*pair, alignment, rng)
+        if schedule.should_wait(_key(pair), doubt):
+            alignment = Alignment.refused("too uncertain", alignment.ratio)
+    schedule.record(_key(pair), step, alignment.success, straightened=bent is not None)
+    return MergeEvent(step, "attempt", pair[0].robots, pair[1].robots, alignment, bent)
+
+
+def speakers(pair: Pair) -> tuple[int, int]:
+    """Return the robots by whom two groups exchange their maps."""
+    return pair[0].trunk.live[0], pair[1].trunk.live[0]
+
+
+def _pairs(groups: Sequence[Group]) -> list[Pair]:
+    """Return the pairs of groups none of which takes back a merge."""
+    able = [group for group in groups if group.undoing is None]
+    return [(a, b) for i, a in enumerate(able) for b in able[i + 1 :]]
+
+
+def _in_touch(pair: Pair, networks: IntArray) -> bool:
+    """Tell whether two groups hear each other."""
+    one, other = speakers(pair)
+    return bool(networks[one] == networks[other])
+
+
+def _unique(pairs: Mapping[PairKey, Pair]) -> list[Group]:
+    """Return the groups of some pairs, each once."""
+    return list({group.robots: group for pair in pairs.values() for group in pair}.values())
+
+
+def _key(pair: Pair) -> PairKey:
+    return pair[0].robots, pair[1].robots
+
+
+def _numbers(pair: Pair) -> tuple[int, int]:
+    return pair[0].trunk.number, pair[1].trunk.number
+
+
+def _is_meant(pending: Straightening, pair: Pair) -> bool:
+    """Tell whether a pair is the one whose maps are straightened, with the filters that it had."""
+    return (pending.pair, pending.numbers) == (_key(pair), _numbers(pair))
+
+
+def _mixtures(pair: Pair) -> Maps:
+    return pair[0].trunk.filter.map("mixture"), pair[1].trunk.filter.map("mixture")
