@@ -144,7 +144,7 @@ class FilterState:
                 ids = report.associations[robot]
                 self._logs[robot].append(
                     self._steps - 1, moves[robot], exact[robot], turn.points,
-                    ids if len(turn.keep) == turn.size else ids[turn.keep], turn.noises if turn.given else None,
+                    ids if turn.keep is None else ids[turn.keep], turn.noises if turn.given else None,
                 )  # fmt: skip
                 if self._rejuvenation is not None:
                     self._rejuvenation.note(robot, self._steps - 1, self._estimates[robot], exact[robot] is not None)

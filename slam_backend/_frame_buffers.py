@@ -1,5 +1,6 @@
 """Working space of a filter's step: the robots' readings in the form that the kernels take, and room for results."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -22,7 +23,7 @@ class Turn(NamedTuple):
 
     Attributes:
         size: Number of measurements that the caller gave.
-        keep: (n,) which of them are used: those that the caller did not name -1.
+        keep: (n,) which of them are used: those that the caller did not name -1. None: all.
         points: (n, 3) used measurements relative to the camera centre, robot axes.
         noises: (n, 6) their covariances, robot axes; zeros unless `given`.
         given: Whether the caller gave covariances.
@@ -34,7 +35,7 @@ class Turn(NamedTuple):
     """
 
     size: int
-    keep: IntArray
+    keep: IntArray | None
     points: FloatArray
     noises: FloatArray
     given: bool
@@ -61,6 +62,7 @@ class FrameBuffers:
         self._found: NDArray[np.int32] = np.zeros((0, padded), dtype=np.int32)
         self._distances: FloatArray = np.zeros((0, padded))
         self._new_slots: IntArray = np.zeros(0, dtype=np.int64)
+        self._rows: IntArray = np.zeros(0, dtype=np.int64)
 
     def start(self, most: int) -> None:
         """Begin a step with at most `most` measurements."""
@@ -70,6 +72,21 @@ class FrameBuffers:
             self._found = np.zeros((2 * most, self.padded), dtype=np.int32)
             self._distances = np.zeros((2 * most, self.padded))
             self._new_slots = np.zeros(2 * most, dtype=np.int64)
+            self._rows = np.arange(2 * most)
+
+    def outcome(self, turns: Sequence[Turn]) -> tuple[NDArray[np.int32], FloatArray, IntArray, IntArray]:
+        """Return what became of the measurements of all turns of a step, one after the other.
+
+        Returns:
+            `found`, `distances` and `new_slots` of the turns, and which of all measurements that the caller gave these
+            are (n,).
+        """
+        used, rows = self.used, self._rows[: self.used]
+        if any(turn.keep is not None for turn in turns):
+            firsts = np.cumsum([0] + [turn.size for turn in turns])
+            kept = (np.arange(turn.size) if turn.keep is None else turn.keep for turn in turns)
+            rows = np.concatenate([first + own for first, own in zip(firsts[:-1], kept, strict=True)])
+        return self._found[:used], self._distances[:used], self._new_slots[:used], rows
 
     def take(self, frame: Measurements | None, names: IntArray | None) -> Turn:
         """Return a robot's readings as the kernels take them, with room for what becomes of them.
@@ -82,6 +99,7 @@ class FrameBuffers:
             frame = EMPTY
         points, covariances, descriptors = frame.points, frame.covariances, frame.descriptors
         size = len(points)
+        keep: IntArray | None = None
         if names is not None and size and names.min() < 0:
             keep = np.flatnonzero(names >= 0)
             points, descriptors, names = points[keep], descriptors[keep], names[keep]
@@ -89,8 +107,6 @@ class FrameBuffers:
             for array in (points, descriptors, covariances):
                 if array is not None:
                     array.setflags(write=False)  # as those of a frame: kernels are compiled once
-        else:
-            keep = np.arange(size)
         first, num = self.used, len(points)
         turned, noises = np.empty((num, 3)), np.empty((num, 6))
         _kernels.to_robot_axes(points, NO_COVARIANCES if covariances is None else covariances, turned, noises)

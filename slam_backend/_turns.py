@@ -11,7 +11,7 @@ from slam_backend._particle_maps import ParticleMaps
 from slam_backend.errors import FloatArray, IntArray
 from slam_backend.filter_options import FilterOptions
 from slam_backend.geometry import compose
-from slam_backend.reports import StepReport
+from slam_backend.reports import PoseEstimate, StepReport
 
 NOTHING = np.zeros(3)
 NO_NAMES = np.zeros(0, dtype=np.int64)
@@ -22,15 +22,21 @@ class Assumed(NamedTuple):
 
     Attributes:
         options: Of the filter.
+        sighting: Whether measurements shape the sampled pose (FastSLAM 2.0).
         camera: (7,) focal length [px], baseline [m], sigmas of image coordinates and of the disparity [px], mount [m].
+        gates: What that kernel takes between its readings and `recovery`.
         recovery: (3,) [m, m, rad]. Sigmas of the prior of a lost pose.
         log_p0: Logarithm of the density of new landmarks [1/m^3] (Algorithm 1, l. 32).
+        walk: Variance [m^2] by which a landmark may move between two sightings.
     """
 
     options: FilterOptions
+    sighting: bool
     camera: FloatArray
+    gates: tuple[float, float, float, float, float, float]
     recovery: FloatArray
     log_p0: float
+    walk: float
 
     @classmethod
     def by(cls, options: FilterOptions) -> "Assumed":
@@ -38,10 +44,16 @@ class Assumed(NamedTuple):
         camera = options.camera
         return cls(
             options,
+            options.proposal == "fastslam2",
             np.array([camera.focal_px, camera.baseline, camera.sigma_px, camera.sigma_disparity_px, *camera.mount]),
+            (
+                options.descriptor_gate**2, options.descriptor_sigma**2, options.position_gate, options.dead_zone,
+                options.dead_radius, options.ambiguity,
+            ),
             np.array([options.recovery_position, options.recovery_position, options.recovery_heading]),
             float(np.log(options.new_landmark_density)),
-        )
+            options.landmark_walk,
+        )  # fmt: skip
 
 
 class RobotParticles(NamedTuple):
@@ -94,7 +106,7 @@ def take_turn(
         count = maps.num_particles
         poses[:, :count] = compose(starts[:, :count].T.copy(), exact).T
         move, sigmas, blind = NOTHING, NOTHING, False
-    if num == 0 and options.proposal == "fastslam2":
+    if num == 0 and assumed.sighting:
         if exact is None:
             _kernels.move_blind(poses, means, covariances, blind, move, sigmas, normals, buffers.work)
             return True
@@ -110,52 +122,67 @@ def take_turn(
     names = NO_NAMES if turn.names is None else turn.names
     readings = (turn.points, turn.noises, turn.given, assumed.camera, turn.descriptors, names, named)
     results = (buffers.work, buffers.records, turn.found, turn.distances, turn.new_slots, buffers.log_likelihood)
-    if options.proposal == "fastslam1":
+    if not assumed.sighting:
         _kernels.update_fastslam1(
             poses, means, covariances, exact is None, move, sigmas, normals, *store, *readings,
-            options.descriptor_gate**2, options.position_gate, assumed.log_p0, options.landmark_walk,
+            options.descriptor_gate**2, options.position_gate, assumed.log_p0, assumed.walk,
             options.one_to_one, *results,
         )  # fmt: skip
         return blind
     _kernels.update_fastslam2(
         poses, means, covariances, blind, move, sigmas, normals, *store, *readings,
-        options.descriptor_gate**2, options.descriptor_sigma**2, options.position_gate, options.dead_zone,
-        options.dead_radius, options.ambiguity, NOTHING if exact is not None else assumed.recovery,
-        assumed.log_p0, options.landmark_walk, options.one_to_one, *results,
+        *assumed.gates, NOTHING if exact is not None else assumed.recovery,
+        assumed.log_p0, assumed.walk, options.one_to_one, *results,
     )  # fmt: skip
     return False
 
 
-def report_of(turns: Sequence[Turn], best: int, ids: IntArray, ess: float, resampled: bool) -> StepReport:
-    """Return the report of a step.
+def conclude(
+    turns: Sequence[Turn],
+    buffers: FrameBuffers,
+    ids: IntArray,
+    weights: tuple[FloatArray, FloatArray, FloatArray],
+    believed: tuple[FloatArray, FloatArray],
+    threshold: float,
+) -> tuple[StepReport, list[PoseEstimate]]:
+    """Weigh the particles after all turns, and return the report of the step and each robot's pose.
 
     Args:
         turns: Of all robots.
-        best: The most probable particle, whose associations are told.
+        buffers: In which they were taken.
         ids: (slots,) int64. Names of the landmarks.
-        ess: Effective sample size, in [1, M].
-        resampled: Whether the particles are to be resampled.
+        weights: Log-weights, log-weights along the path, and weights (M,), changed.
+        believed: (K, 3, P), (K, 6, P). N(x^, P^) of each robot and particle.
+        threshold: Particles are to be resampled where the effective sample size is not above it.
     """
-    associations, created = [], []
-    num_new, num_matched, num_rejected, total, num_judged = 0, 0, 0, 0.0, 0
-    for turn in turns:
-        associations.append(np.empty(turn.size, dtype=np.int64))
-        created.append(np.empty(turn.size, dtype=np.int64))
-        new, matched, squares, judged = _kernels.summarise(
-            turn.found, turn.distances, turn.new_slots, turn.keep, best, ids, associations[-1], created[-1]
-        )
-        num_new += new
-        num_matched += matched
-        num_rejected += turn.size - new - matched
-        total += squares
-        num_judged += judged
-    return StepReport(
-        associations=tuple(associations),
-        created=tuple(created),
+    sizes = [turn.size for turn in turns]
+    given, robots = sum(sizes), len(turns)
+    associations, created = np.empty(given, np.int64), np.empty(given, np.int64)
+    means, covariances = np.empty((robots, 3)), np.empty((robots, 3, 3))
+    found, distances, new_slots, rows = buffers.outcome(turns)
+    ess, num_new, num_matched, squares, judged = _kernels.conclude(
+        buffers.log_likelihood, *weights, *believed, means, covariances, found, distances, new_slots, rows, ids,
+        associations, created,
+    )  # fmt: skip
+    report = StepReport(
+        associations=_split(associations, sizes),
+        created=_split(created, sizes),
         num_new=num_new,
         num_matched=num_matched,
-        num_rejected=num_rejected,
+        num_rejected=given - num_new - num_matched,
         ess=ess,
-        nis=total / num_judged if num_judged else float("nan"),
-        resampled=resampled,
+        nis=squares / judged if judged else float("nan"),
+        resampled=buffers.used > 0 and ess <= threshold,
     )
+    return report, [PoseEstimate(means[robot], covariances[robot]) for robot in range(robots)]
+
+
+def _split(values: IntArray, sizes: Sequence[int]) -> tuple[IntArray, ...]:
+    """Return each robot's part of what stands one after the other."""
+    if len(sizes) == 1:
+        return (values,)
+    parts, first = [], 0
+    for size in sizes:
+        parts.append(values[first : first + size])
+        first += size
+    return tuple(parts)

@@ -12,11 +12,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from slam_backend import _kernels
 from slam_backend._frame_buffers import Turn
 from slam_backend._rejuvenation_step import RejuvenationStep
 from slam_backend._step_input import check_step
-from slam_backend._turns import RobotParticles, report_of, take_turn
+from slam_backend._turns import RobotParticles, conclude, take_turn
 from slam_backend.adaptation import AdaptiveParticles, next_num_particles
 from slam_backend.camera import StereoCamera
 from slam_backend.errors import FloatArray, IntArray, check_array
@@ -178,11 +177,11 @@ class FastSlam(FilterKnowledge):
                 where, best = self._poses[robot], self.best_particle
                 deserted.append(self._existence.weigh(self._maps, where, best, turns[robot]))
         self._steps += 1
-        ess = _kernels.weigh(buffers.log_likelihood, self._log_weights, self._path_log_weights, self._weights)
-        self._estimates = [self._mixture(robot) for robot in range(len(frames))]
+        weights = self._log_weights, self._path_log_weights, self._weights
         threshold = self.options.resample_threshold * self.num_particles * (1.0 + 1e-9)
-        resampled = buffers.used > 0 and ess <= threshold
-        report = report_of(turns, self.best_particle, self._maps.ids, ess, resampled)
+        report, self._estimates = conclude(
+            turns, buffers, self._maps.ids, weights, (self._means, self._covariances), threshold
+        )  # fmt: skip
         self._write_down(turns, moves, exact, report)
         for slots in deserted:
             self._maps.release(slots)
@@ -190,8 +189,8 @@ class FastSlam(FilterKnowledge):
             self._resample()
         if self._rejuvenation is not None:
             self._rejuvenation.count(report.associations)
-            if self.may_smooth:
-                return replace(report, rejuvenation=self._rejuvenate(self._rejuvenation))
+            if self.may_smooth and (told := self._rejuvenate(self._rejuvenation)) is not None:
+                return replace(report, rejuvenation=told)
         return report
 
     def rejuvenate(self) -> RejuvenationReport:

@@ -44,8 +44,8 @@ class InputLog:
 
     def forget_before(self, step: int) -> None:
         """Forget the steps before this one."""
-        for old in [kept for kept in self._steps if kept < step]:
-            del self._steps[old]
+        while self._steps and (oldest := next(iter(self._steps))) < step:  # they stand in order of time
+            del self._steps[oldest]
 
     def get_state(self) -> dict[str, Any]:
         """Return what is kept; inputs are never written to, and are shared."""

@@ -1,5 +1,6 @@
 """What a team of filters knows: groups, poses, maps, diagnostics. `TeamSlam` adds what changes them."""
 
+from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -22,17 +23,19 @@ class Standpoint(NamedTuple):
         members: See `members`.
         mates: See `mates`.
         number: Of its map, see `maps`.
-        pose: In the map frame.
+        poses: Of all members in the map frame, as its filter knows them.
         own_pose: In its own start frame.
         start_from_group: (3,) [m, m, rad]. See `start_from_group`.
+        ess: Effective sample size of its filter, as a share of M.
     """
 
     members: tuple[int, ...]
     mates: tuple[int, ...]
     number: int
-    pose: PoseEstimate
+    poses: Sequence[PoseEstimate]
     own_pose: PoseEstimate
     start_from_group: FloatArray
+    ess: float
 
 
 class TeamKnowledge:
@@ -192,10 +195,12 @@ class TeamKnowledge:
         """Return where a robot stands, all at once."""
         branch, index = self._find(robot)
         own_pose, start = branch.filter._seen_from_start(index)
-        pose = branch.filter.pose(index)
         # Most often the robot's start frame is the map frame.
         start_from_group = inverse(start) if any(start.tolist()) else FROM_ORIGIN.copy()
-        return Standpoint(branch.robots, branch.live, branch.number, pose, own_pose, start_from_group)
+        report, particles = branch.report, branch.filter.num_particles
+        ess = 1.0 if report is None else report.ess / particles
+        poses = branch.filter._estimates
+        return Standpoint(branch.robots, branch.live, branch.number, poses, own_pose, start_from_group, ess)
 
     def _group_of(self, robot: int) -> Group:
         """Return the robot's group."""

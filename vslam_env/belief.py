@@ -1,5 +1,6 @@
 """`TeamBelief` owns the team's filters and the seen grids, and hands out what each robot believes."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from typing import Any
@@ -12,7 +13,7 @@ from slam_backend.errors import FloatArray, IntArray, bad_argument
 from slam_backend.filter_options import FilterOptions
 from slam_backend.geometry import compose, rotate_covariances
 from slam_backend.landmark_map import LandmarkMap, MapOutline
-from slam_backend.reports import MergeEvent, Renaming, TeamReport
+from slam_backend.reports import MergeEvent, PoseEstimate, Renaming, TeamReport
 from slam_backend.team import TeamSlam
 from vslam_env.navigation import CandidateSlots, SeenGrid
 from vslam_env.readings import Readings
@@ -92,8 +93,7 @@ class TeamBelief:
     @property
     def position_sigmas(self) -> FloatArray:
         """(K,) float64 [m]. One sigma of each robot's position in its own start frame, averaged over directions."""
-        traces = [estimate.covariance[0, 0] + estimate.covariance[1, 1] for estimate in self._estimates]
-        return np.sqrt(0.5 * np.array(traces))
+        return np.array([_position_sigma(point.own_pose) for point in self._points])
 
     def step(self, readings: Sequence[Readings]) -> TeamReport:
         """Take in one tick's readings of all K robots; the first ones are those of the reset.
@@ -117,7 +117,8 @@ class TeamBelief:
         for robot, mates in enumerate(self._mates):
             poses = self._poses[robot : robot + 1]
             if len(mates) > 1:
-                poses = compose(self._starts[robot], self._means[list(mates)])
+                means = self._means if len(mates) == len(self._means) else self._means[list(mates)]
+                poses = compose(self._starts[robot], means)
                 poses[mates.index(robot)] = self._poses[robot]
             self._grids.paint(self._tick, robot, mates, poses, readings)
         for robot in range(self.num_robots):
@@ -136,7 +137,7 @@ class TeamBelief:
 
     def group(self, robot: int) -> tuple[int, ...]:
         """Return the robots that share a map with this one, as far as it knows, itself included."""
-        return self._members[robot]
+        return self._points[robot].members
 
     def speaker(self, group: tuple[int, ...]) -> int:
         """Return the first robot of a group that goes by its joint filter, and so can merge it with another."""
@@ -148,14 +149,14 @@ class TeamBelief:
 
     def group_map(self, robot: int) -> LandmarkMap:
         """Return the confirmed landmarks of a robot's group, in the group's map frame."""
-        number = self._numbers[robot]
+        number = self._points[robot].number
         if number not in self._maps:
             self._maps[number] = self._team.map(robot, min_count=self._confirm_after)
         return self._maps[number]
 
     def outline(self, robot: int) -> MapOutline:
         """Return the outline of `group_map`, much faster."""
-        number = self._numbers[robot]
+        number = self._points[robot].number
         if number not in self._outlines:
             self._outlines[number] = self._team.outline(robot, self._confirm_after)
         return self._outlines[number]
@@ -181,19 +182,20 @@ class TeamBelief:
 
     def glimpse(self, robot: int) -> Glimpse:
         """Return the part of a robot's belief that its observation shows; it shares memory with the filters."""
-        own, start, mates, poses, sigmas = self._estimates[robot], self._starts[robot], NOBODY, NO_POSES, NO_SIGMAS
-        if len(self._members[robot]) > 1:
-            mates = np.array([mate for mate in self._members[robot] if mate != robot])
-            seen = [self._team.pose(mate, seen_by=robot) for mate in mates.tolist()]
+        point, start, mates, poses, sigmas = self._points[robot], self._starts[robot], NOBODY, NO_POSES, NO_SIGMAS
+        own, members = point.own_pose, point.members
+        if len(members) > 1:
+            mates = np.array([mate for mate in members if mate != robot])
+            seen = [estimate for mate, estimate in zip(members, point.poses, strict=True) if mate != robot]
             poses = compose(start, np.array([estimate.mean for estimate in seen]))
-            sigmas = np.sqrt([0.5 * (estimate.covariance[0, 0] + estimate.covariance[1, 1]) for estimate in seen])
+            sigmas = np.array([_position_sigma(estimate) for estimate in seen])
         features, valid = self._slots[robot].described(own.mean, poses)
         return Glimpse(
             robot=robot,
-            group_size=len(self._members[robot]),
+            group_size=len(members),
             pose=own.mean,
             covariance=own.covariance,
-            ess=self._team.ess(robot) / self._team.num_particles(robot),
+            ess=point.ess,
             start_from_group=start,
             outline=self.outline(robot),
             cells=self._grids[robot].cells,
@@ -229,13 +231,10 @@ class TeamBelief:
     def _look_up_poses(self) -> None:
         """Take note of the groups and poses after a step or a merge, and forget what was derived from those before."""
         self._groups = self._team.groups
-        points = [self._team.standpoint(robot) for robot in range(self.num_robots)]
-        self._members = [point.members for point in points]
+        self._points = points = [self._team.standpoint(robot) for robot in range(self.num_robots)]
         self._mates = [point.mates for point in points]
-        self._numbers = [point.number for point in points]
         self._starts = np.array([point.start_from_group for point in points])
-        self._means = np.array([point.pose.mean for point in points])
-        self._estimates = [point.own_pose for point in points]
+        self._means = np.array([point.poses[point.members.index(robot)].mean for robot, point in enumerate(points)])
         self._poses = np.array([point.own_pose.mean for point in points])
         self._beliefs.clear()
         self._maps.clear()
@@ -243,17 +242,16 @@ class TeamBelief:
 
     def _teammates(self, robot: int) -> list[Teammate]:
         """Return the other robots that a robot knows of; one out of contact is where it was when contact was lost."""
-        start, mates = self._starts[robot], []
-        for mate in self._members[robot]:
+        start, point, mates = self._starts[robot], self._points[robot], []
+        for mate, estimate in zip(point.members, point.poses, strict=True):
             if mate != robot:
-                estimate = self._team.pose(mate, seen_by=robot)
                 covariance = rotate_covariances(start[2], estimate.covariance)
                 mates.append(Teammate(mate, compose(start, estimate.mean), covariance))
         return mates
 
     def _make_belief(self, robot: int) -> Belief:
         group, start, mates = self.group(robot), self._starts[robot], self._teammates(robot)
-        own = self._estimates[robot]
+        own = self._points[robot].own_pose
         log_weights = self._team.particles(robot)[1]
         slots = self._slots[robot]
         return Belief(
@@ -265,7 +263,7 @@ class TeamBelief:
             covariance=own.covariance,
             particles=self._team.particles_from_start(robot),
             log_weights=log_weights,
-            ess=self._team.ess(robot) / len(log_weights),
+            ess=self._points[robot].ess,
             grid=self._grids[robot].frozen(),
             candidates=Candidates(
                 goals=slots.goals,
@@ -285,3 +283,9 @@ class TeamBelief:
         if self._decision_ticks is not None:
             return self._tick % self._decision_ticks == 0
         return (self._tick - robot * CANDIDATE_TICKS // self.num_robots) % CANDIDATE_TICKS == 0
+
+
+def _position_sigma(estimate: PoseEstimate) -> float:
+    """Return one sigma of a robot's position [m], averaged over directions."""
+    covariance = estimate.covariance
+    return math.sqrt(0.5 * (covariance[0, 0] + covariance[1, 1]))

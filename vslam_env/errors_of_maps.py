@@ -110,10 +110,8 @@ class ClaimLedger:
             elif isinstance(entry, Renaming):
                 self.rename(entry)
         self._map_of = list(report.maps)
-        if report.oldest_step > report.step:
-            self._seen.clear()
-        else:
-            self._seen = {key: ids for key, ids in self._seen.items() if key[0] >= report.oldest_step}
+        while self._seen and (oldest := next(iter(self._seen)))[0] < report.oldest_step:  # they stand in order of time
+            del self._seen[oldest]
 
     def rename(self, renaming: Renaming) -> None:
         """Join the books of two groups: landmarks of a keep their claims, those of b bring theirs.

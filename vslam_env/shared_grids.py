@@ -1,5 +1,6 @@
 """`SharedGrids`: the robots' seen grids, what they tell each other of the floor, and how a wrong merge is wiped out."""
 
+from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -64,7 +65,7 @@ class SharedGrids:
         self._body = body
         self._mates: list[tuple[int, ...]] = [(robot,) for robot in range(num_robots)]
         self._kept: list[Kept] = []
-        self._strokes: list[Stroke] = []
+        self._strokes: deque[Stroke] = deque()
 
     @property
     def all(self) -> list[SeenGrid]:
@@ -101,8 +102,9 @@ class SharedGrids:
             elif isinstance(entry, MapDropped):
                 self._kept = [kept for kept in self._kept if entry.number not in kept.maps[:2]]
         if self._strokes:
-            oldest = min((kept.tick for kept in self._kept), default=None)
-            self._strokes = [stroke for stroke in self._strokes if oldest is not None and stroke.tick >= oldest]
+            oldest = min((kept.tick for kept in self._kept), default=tick)
+            while self._strokes and self._strokes[0].tick < oldest:  # they stand in order of time
+                self._strokes.popleft()
 
     def _undo(self, undone: MergeUndone) -> None:
         """Restore the grids from before a merge and paint again what the robots of each side have scanned since."""
@@ -115,8 +117,11 @@ class SharedGrids:
                 self._grids[robot].set_state(kept.grids[robot])
                 self._mates[robot] = tuple(mate for mate in self._mates[robot] if mate in side)
             own = [s for s in self._strokes if s.tick >= kept.tick and s.owner in side and s.robot in side]
+            body = self._body
             for stroke in own:
-                self._apply(stroke)
+                self._grids[stroke.owner].paint_reading(
+                    stroke.pose, stroke.scan, body.ray_angles, body.scan_range, body.radius, stroke.bump
+                )
 
     def meet(self, mates: Sequence[tuple[int, ...]], starts: FloatArray) -> None:
         """Let robots that have come together absorb what the others have seen.
@@ -150,17 +155,12 @@ class SharedGrids:
             poses: (n, 3) [m, m, rad], start frame of the owner. Where they are believed to be.
             readings: (K,) `Readings` of this tick.
         """
+        grid, body = self._grids[owner], self._body
         for robot, pose in zip(robots, poses, strict=True):
-            stroke = Stroke(tick, owner, robot, pose, readings[robot].scan, readings[robot].bump)
-            self._apply(stroke)
+            scan, bump = readings[robot].scan, readings[robot].bump
+            grid.paint_reading(pose, scan, body.ray_angles, body.scan_range, body.radius, bump)
             if self._kept:
-                self._strokes.append(stroke)
-
-    def _apply(self, stroke: Stroke) -> None:
-        body = self._body
-        self._grids[stroke.owner].paint_reading(
-            stroke.pose, stroke.scan, body.ray_angles, body.scan_range, body.radius, stroke.bump
-        )
+                self._strokes.append(Stroke(tick, owner, robot, pose, scan, bump))
 
     def get_state(self) -> dict[str, Any]:
         """Return all that decides how the grids go on; what is never written to is shared."""
@@ -175,4 +175,4 @@ class SharedGrids:
         """Go on as the grids that gave `state`, in place: views of them follow."""
         for grid, seen in zip(self._grids, state["grids"], strict=True):
             grid.set_state(seen)
-        self._mates, self._kept, self._strokes = (list(state[name]) for name in ("mates", "kept", "strokes"))
+        self._mates, self._kept, self._strokes = list(state["mates"]), list(state["kept"]), deque(state["strokes"])

@@ -28,9 +28,9 @@ from slam_backend._kernels.layout import CANDIDATE_ROWS, FAR, LANES, MIN_DEPTH, 
 from slam_backend._kernels.motion import move_blind
 from slam_backend._kernels.places import carry_odds, refresh
 from slam_backend._kernels.resampling import resample
-from slam_backend._kernels.weights import mixture, summarise, weigh
+from slam_backend._kernels.weights import conclude, mixture
 
 __all__ = [
-    "CANDIDATE_ROWS", "FAR", "LANES", "MIN_DEPTH", "WORK_ROWS", "YOUNG", "carry_odds", "extent", "mixture",
-    "move_blind", "refresh", "resample", "summarise", "to_robot_axes", "update_fastslam1", "update_fastslam2", "weigh",
+    "CANDIDATE_ROWS", "FAR", "LANES", "MIN_DEPTH", "WORK_ROWS", "YOUNG", "carry_odds", "conclude", "extent",
+    "mixture", "move_blind", "refresh", "resample", "to_robot_axes", "update_fastslam1", "update_fastslam2",
 ]  # fmt: skip

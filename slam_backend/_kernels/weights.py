@@ -96,7 +96,7 @@ def summarise(
     found: Int32Array, distances: FloatArray, new_slots: IntArray, keep: IntArray, best: int, ids: IntArray,
     associations: IntArray, created: IntArray,
 ) -> tuple[int, int, float, int]:  # fmt: skip
-    """Tell what became of one robot's measurements.
+    """Tell what became of measurements.
 
     Args:
         found: (n, P) slots to which the particles gave the used measurements, -1 = rejected.
@@ -130,3 +130,30 @@ def summarise(
                 squares += distances[b, best]
                 judged += 1
     return num_new, num_matched, squares, judged
+
+
+@jit
+def conclude(
+    log_likelihood: FloatArray, log_weights: FloatArray, path_log_weights: FloatArray, weights: FloatArray,
+    means: FloatArray, covariances: FloatArray, mean: FloatArray, covariance: FloatArray,
+    found: Int32Array, distances: FloatArray, new_slots: IntArray, keep: IntArray, ids: IntArray,
+    associations: IntArray, created: IntArray,
+) -> tuple[float, int, int, float, int]:  # fmt: skip
+    """Do what `weigh`, `mixture` for each of K robots and, for the measurements of all, `summarise` do.
+
+    Args:
+        means, covariances: (K, 3, P), (K, 6, P).
+        mean, covariance: (K, 3), (K, 3, 3), written.
+        The others are as in those.
+
+    Returns:
+        The effective sample size, and what `summarise` returns by the most probable particle.
+    """
+    ess = weigh(log_likelihood, log_weights, path_log_weights, weights)
+    for robot in range(len(means)):
+        mixture(means[robot], covariances[robot], weights, mean[robot], covariance[robot])
+    best = int(path_log_weights.argmax())
+    new, matched, squares, judged = summarise(
+        found, distances, new_slots, keep, best, ids, associations, created
+    )  # fmt: skip
+    return ess, new, matched, squares, judged

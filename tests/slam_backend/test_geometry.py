@@ -65,7 +65,13 @@ def test_many_motions_at_once_are_the_motions_one_by_one() -> None:
     assert together.shape == (5, 7, 3)
     for i in range(5):
         for j in range(7):
-            np.testing.assert_array_equal(together[i, j], compose(a[i, 0], b[j]))
+            np.testing.assert_allclose(together[i, j], compose(a[i, 0], b[j]), rtol=0.0, atol=1e-13)
+            np.testing.assert_allclose(inverse(together)[i, j], inverse(together[i, j]), rtol=0.0, atol=1e-13)
+    for other in (b[::-1], b.T.copy().T, np.broadcast_to(b[0], b.shape)):  # whatever their layout, and not written to
+        kept = other.copy()
+        np.testing.assert_array_equal(compose(other, b), compose(kept, b))
+        np.testing.assert_array_equal(inverse(other), inverse(kept))
+        np.testing.assert_array_equal(other, kept)
 
 
 def test_points_are_copied() -> None:
