@@ -14,6 +14,7 @@ from slam_backend.smoothing.sightings import Sightings
 
 FIRST_DAMPING, MOST_DAMPING = 1e-4, 1e8
 LARGEST_STEP = 1e3  # [m, rad]; nothing is sought so far away
+CREEP = 10.0  # times the tolerance: so far from its end a descent may be that has used up the options' iterations
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,7 +56,10 @@ def find_mode(
 ) -> Mode:
     """Descend from where the graph stands.
 
-    A step that does not lower the cost is tried again with more damping (Levenberg, Marquardt).
+    A step that does not lower the cost is tried again with more damping (Levenberg, Marquardt). Where measurements lie
+    at the edge of the kernel a descent may creep, each step promising what the one before did. So it ends in the last
+    iteration of the options, too, if it can fall by no more than `CREEP` times the tolerance: by default half of a
+    squared distance of two, in a space of hundreds of dimensions.
 
     Args:
         graph: Key poses, odometry, measurements; its poses and landmarks are the start.
@@ -71,6 +75,7 @@ def find_mode(
     poses, landmarks = graph.poses.copy(), graph.landmarks.copy()
     empty, informations = np.zeros((0, 0)), np.zeros_like(graph.noises)
 
+    creep = CREEP if most is None else 1.0
     most = options.max_iterations if most is None else most
 
     def given_up(reason: str, iterations: int = 0, cost: float = np.inf) -> Mode:
@@ -97,7 +102,8 @@ def find_mode(
         trial_poses, trial_landmarks = poses.copy(), landmarks.copy()
         trial_poses[sought] += change.reshape(-1, 3)
         system.move(trial_landmarks, change)
-        if expected <= options.tolerance and damping == 0.0:
+        near = creep * options.tolerance if iteration == most else options.tolerance
+        if expected <= near and damping == 0.0:
             return Mode(
                 trial_poses, trial_landmarks, columns, factor, sightings, informations, cost - expected,
                 iteration, damping, "",

@@ -97,6 +97,25 @@ def test_without_noise_there_is_no_error():
     np.testing.assert_allclose(mode.landmarks, run.landmarks[graph.landmark_ids], atol=1e-8)
 
 
+def test_a_descent_that_creeps_has_ended_in_the_last_iteration():
+    """What can fall by five tolerances is a mode in the options' last iteration, but not where a slice ends.
+
+    What can fall by twenty is none.
+    """
+    run = small_run()
+    graph, camera = graph_of(run), camera_of(run)
+    after_two = find_mode(graph, camera, replace(TIGHT, max_iterations=2))
+    rough = find_mode(graph, camera, replace(TIGHT, tolerance=0.1))
+    assert rough.iterations == 3
+    promise = after_two.cost - rough.cost  # of the third step
+    near = replace(TIGHT, max_iterations=3, tolerance=promise / 5.0)
+    mode = find_mode(graph, camera, near)
+    assert mode.reason == ""
+    np.testing.assert_array_equal(mode.poses, rough.poses)
+    assert find_mode(graph, camera, near, 3).reason == "no convergence in 3 iterations"
+    assert find_mode(graph, camera, replace(near, tolerance=promise / 20.0)).reason == "no convergence in 3 iterations"
+
+
 def test_a_kernel_ignores_a_wrong_match():
     """One point taken for another landmark moves the paths by much under plain squares, hardly with the kernel."""
     run = small_run()
