@@ -11,8 +11,14 @@ from training.command_progress import trials_shown
 
 if TYPE_CHECKING:  # what computes is imported when the command runs, so that --help answers at once
     from training.bench_train import TrainBenchResult
+    from training.worker_timing import WorkerRow
 
 COMMAND = "bench train"
+WORKER_HEADINGS = ("workers", "median", "fastest", "mean", "times one", "balance", "work", "beside us")
+TOLD = (
+    "By the processors' own time: balance is the mean worker's over the slowest one's, work that of all beside one "
+    "worker. A step that nobody interrupts gains workers x balance / work. Beside us: what else a decision takes."
+)
 
 
 def bench_train(
@@ -55,25 +61,41 @@ def bench_train(
 
 def _print(console: Console, result: "TrainBenchResult") -> None:
     """Print both tables and the goals."""
-    from rich.table import Table
-
+    from training.text_tables import console_table
     from training.timed_bench import print_caveats, print_goals
+    from training.train_timing import ADAPTER_ALONE
 
-    table = Table("part", title="A decision of a robot, in one process", title_justify="left")
-    for column in ("median us", "least us", "share"):
-        table.add_column(column, justify="right")
-    total = sum(part.median_us for part in result.parts)
-    for part in result.parts:
-        table.add_row(
-            part.name, f"{part.median_us:.1f}", f"{part.min_us:.1f}", f"{100.0 * part.median_us / total:.1f} %"
+    total = sum(part.median_us for part in result.parts if part.name != ADAPTER_ALONE)
+    rows = [
+        (
+            part.name,
+            f"{part.median_us:.1f}",
+            f"{part.min_us:.1f}",
+            "" if part.name == ADAPTER_ALONE else f"{100.0 * part.median_us / total:.1f} %",
         )
-    console.print(table)
-    table = Table("workers", title="Environments alone", title_justify="left")
-    for column in ("decisions/s", "of the fastest step", "of all steps"):
-        table.add_column(column, justify="right")
-    for row in result.workers:
-        rates = (row.per_second, row.best_per_second, row.mean_per_second)
-        table.add_row(str(row.workers), *(f"{rate:,.0f}" for rate in rates))
-    console.print(table)
+        for part in result.parts
+    ]
+    headings = ("part", "median us", "least us", "share")
+    console.print(console_table("A decision of a robot, in one process", headings, rows))
+    if result.workers:
+        told = [_told(row) for row in result.workers]
+        console.print(console_table("Environments alone, decisions per second", WORKER_HEADINGS, told))
+        console.print(TOLD, highlight=False)
     print_goals(console, result.goals())
     print_caveats(console, result.machine, result.complete)
+
+
+def _told(row: "WorkerRow") -> tuple[str, ...]:
+    """Return the cells of a number of workers."""
+    from dataclasses import asdict
+
+    from training.seed_means import shown
+
+    return (
+        str(row.workers),
+        *(f"{rate:,.0f}" for rate in (row.per_second, row.best_per_second, row.mean_per_second)),
+        shown(asdict(row), "gain", 2),
+        f"{row.balance:.2f}",
+        "-" if row.work is None else f"{row.work:.2f}",
+        f"{row.beside_us:.0f}",
+    )

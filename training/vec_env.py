@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
-from slam_backend.errors import BoolArray, bad_argument, check_int
+from slam_backend.errors import BoolArray, FloatArray, bad_argument, check_int
 from training.vec_slots import MASK, WHOLE, MakeEnv, SlotBatch, Stepped
 from training.vec_workers import SlotWorkers
 from vslam_env import vslam_v0
@@ -63,6 +63,8 @@ class ExplorationVecEnv(VecEnv):  # type: ignore[misc]   # its types are not loo
 
     Attributes:
         first_slots: The first slot of each environment.
+        spent: (P, 2) float64 [s]. What the environments of each of P processes took in the last step: on the clock, and
+            of the processor. Zeros before the first one.
 
     Raises:
         ValueError: If there is no environment, spaces differ, or there are more workers than environments.
@@ -74,6 +76,7 @@ class ExplorationVecEnv(VecEnv):  # type: ignore[misc]   # its types are not loo
         self._masks: BoolArray | None = None
         ends = np.cumsum(self._slots.counts)
         self.first_slots: list[int] = [0, *ends[:-1].tolist()]
+        self.spent: FloatArray = np.zeros((max(workers, 1), 2))
         super().__init__(int(ends[-1]), self._slots.observation_space, self._slots.action_space)
 
     def seed(self, seed: int | None = None) -> list[int | None]:
@@ -106,6 +109,7 @@ class ExplorationVecEnv(VecEnv):  # type: ignore[misc]   # its types are not loo
     def step_wait(self) -> tuple[Any, NDArray[np.float32], BoolArray, list[dict[str, Any]]]:
         """Return observations, rewards (S,), dones (S,) and infos of the step that was begun."""
         stepped: Stepped = self._slots.receive()
+        self.spent = stepped.spent
         return self._handed(stepped.observations), stepped.rewards, stepped.dones, stepped.infos
 
     def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from slam_backend.errors import bad_argument
 from training.kept_trials import SINGLE_THREAD
-from training.vec_slots import Infos, MakeEnv, SlotBatch, Stepped, buffers
+from training.vec_slots import Infos, Layout, MakeEnv, SlotBatch, Stepped, buffers
 
 CLOSE_S = 5.0  # a worker that has not ended by then is killed
 
@@ -55,9 +55,9 @@ class SlotWorkers:
         context = get_context("spawn")
         memory = {
             name: context.RawArray("b", max(1, array.nbytes))
-            for name, array in buffers(self.observation_space, sample.num_slots).items()
+            for name, array in buffers(sample.layout, sample.num_slots).items()
         }
-        self._seen = _views(memory, self.observation_space, sample.num_slots)
+        self._seen = _views(memory, sample.layout, sample.num_slots)
         self._envs: list[slice] = []
         self._slots: list[slice] = []
         self._pipes: list[Connection] = []
@@ -108,8 +108,8 @@ class SlotWorkers:
             raise RuntimeError("step_wait: expected actions that were sent, got none. Call step_async() first.")
         self._sent = False
         told = self._answers()
-        rewards, dones = (np.concatenate([each[part] for each in told]) for part in (0, 1))
-        return Stepped(self._copied(), rewards, dones, [info for each in told for info in each[2]])
+        rewards, dones, spent = (np.concatenate([each[part] for each in told]) for part in (0, 1, 2))
+        return Stepped(self._copied(), rewards, dones, [info for each in told for info in each[3]], spent)
 
     def get(self, name: str, slots: Sequence[int]) -> list[Any]:
         """Return an attribute of the environments of some slots."""
@@ -204,11 +204,11 @@ class SlotWorkers:
         return {name: view.copy() for name, view in self._seen.items()}
 
 
-def _views(memory: Mapping[str, Any], space: spaces.Space[Any], slots: int) -> dict[str, NDArray[Any]]:
+def _views(memory: Mapping[str, Any], layout: Layout, slots: int) -> dict[str, NDArray[Any]]:
     """Return arrays (slots, ...) over shared memory."""
     return {
         name: np.frombuffer(memory[name], array.dtype, array.size).reshape(array.shape)
-        for name, array in buffers(space, slots).items()
+        for name, array in buffers(layout, slots).items()
     }
 
 
@@ -229,7 +229,7 @@ def _serve(pipe: Connection, packed: bytes, memory: Mapping[str, Any], part: sli
         try:
             if batch is None:
                 batch = SlotBatch(cloudpickle.loads(packed))
-                rows = {name: view[part] for name, view in _views(memory, batch.observation_space, slots).items()}
+                rows = {name: view[part] for name, view in _views(memory, batch.layout, slots).items()}
             answer = _obey(batch, rows, command, rest)
             pipe.send((False, answer))
         except Exception as error:
@@ -243,7 +243,7 @@ def _obey(batch: SlotBatch, rows: Mapping[str, NDArray[Any]], command: str, rest
         batch.send(rest[0])
         stepped = batch.receive()
         _show(rows, stepped.observations)
-        return stepped.rewards, stepped.dones, stepped.infos
+        return stepped.rewards, stepped.dones, stepped.spent, stepped.infos
     if command == "reset":
         observations, infos = batch.reset(*rest)
         _show(rows, observations)

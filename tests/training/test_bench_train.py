@@ -12,9 +12,10 @@ pytest.importorskip("stable_baselines3", reason="stable-baselines3 is not instal
 pytest.importorskip("sb3_contrib", reason="sb3-contrib is not installed: pip install .[train]")
 pytest.importorskip("tensorboard", reason="tensorboard is not installed: pip install .[train]")
 
-from training import bench_train
-from training.bench_train import Part, Replay, TrainBenchConfig, TrainBenchResult, WorkerRow, run_bench
+from training.bench_train import TrainBenchConfig, TrainBenchResult, run_bench
 from training.cli import app
+from training.train_timing import ADAPTER_ALONE, RECORDED, Part, Replay, record
+from training.worker_timing import WorkerRow, WorkerTimes, summarise_workers
 
 runner = CliRunner()
 SMALL = TrainBenchConfig(world="fig5", robots=1, envs=1, workers=(0,), steps=2)
@@ -22,36 +23,68 @@ SMALL = TrainBenchConfig(world="fig5", robots=1, envs=1, workers=(0,), steps=2)
 
 def test_a_replay_gives_what_was_recorded() -> None:
     """The same steps come round again, with the spaces of the environment, and are inside them."""
-    replay = Replay(SMALL.environment(), 3)
+    replay = Replay(record(SMALL.environment(), 3))
     replay.reset()
-    told = [replay.step(None) for _ in range(2 * bench_train.RECORDED)]
-    for first, second in zip(told, told[bench_train.RECORDED :], strict=False):
+    told = [replay.step(None) for _ in range(2 * RECORDED)]
+    for first, second in zip(told, told[RECORDED:], strict=False):
         assert first is second
-    for step in told[: bench_train.RECORDED]:
+    for step in told[:RECORDED]:
         assert replay.observation_space("robot_0").contains(step[0]["robot_0"])
     assert not np.array_equal(told[0][0]["robot_0"]["local_grid"], told[-1][0]["robot_0"]["local_grid"])
 
 
 def test_goals_are_judged() -> None:
     """The adapter must stay below its limit, and two workers must gain what was asked for."""
-    rows = (WorkerRow(1, 100.0, 110.0, 95.0), WorkerRow(2, 170.0, 200.0, 160.0))
-    result = TrainBenchResult({}, (Part("adapter", 4.0, 3.0),), rows, True)
+    rows = (_row(1, None), _row(2, 1.7), _row(4, 3.0))
+    parts = (Part("adapter, between steps", 9.0, 8.0), Part(ADAPTER_ALONE, 4.0, 3.0))
+    result = TrainBenchResult({}, parts, rows, True)
     adapter, gain = result.goals()
     assert (adapter["measured"], adapter["met"]) == (4.0, True)
     assert (gain["measured"], gain["met"]) == (pytest.approx(1.7), False)
 
 
+def _row(workers: int, gain: float | None) -> WorkerRow:
+    return WorkerRow(workers, 100.0, 110.0, 95.0, 5.0, 0.9, gain=gain)
+
+
+def test_times_of_workers_are_summed_up() -> None:
+    """Gain and work are medians of what each step took beside one worker; balance is mean over slowest."""
+    alone = WorkerTimes(
+        workers=1,
+        masks=np.array([0.0, 0.0, 1.0]),
+        steps=np.array([4.0, 6.0, 3.0]),
+        spent=np.array([[[4.0, 3.0]], [[5.0, 4.0]], [[3.0, 2.0]]]),
+    )
+    two = WorkerTimes(
+        workers=2,
+        masks=np.array([0.5, 0.0, 0.0]),
+        steps=np.array([1.5, 5.0, 2.5]),
+        spent=np.array([[[1.0, 1.0], [1.25, 2.0]], [[2.0, 3.0], [4.5, 3.0]], [[1.5, 1.0], [2.0, 1.0]]]),
+    )
+    first, second = summarise_workers((alone, two), slots=12)
+    assert (first.work, first.gain, first.gain_low, first.gain_high) == (None, None, None, None)
+    assert (first.balance, second.balance) == (1.0, 1.0)  # 3/4, 1, 1
+    assert second.gain == pytest.approx(1.6)  # 4/2, 6/5, 4/2.5
+    assert second.gain_low == pytest.approx(1.2)
+    assert second.gain_high == pytest.approx(2.0)
+    assert second.work == pytest.approx(1.0)  # 3/3, 6/4, 2/2
+    assert second.beside_us == pytest.approx(1e6 / 12 * 0.5)  # 1/4, 1/2, 1/2
+    rates = (second.per_second, second.best_per_second, second.mean_per_second)
+    np.testing.assert_allclose(rates, (12 / 2.5, 12 / 2.0, 36 / 9.5))
+    assert summarise_workers((two,), slots=12)[0].gain is None
+
+
 def test_stopping_early_leaves_what_there_is() -> None:
-    """A bench that is stopped before its second trial says what the first one measured, and that it is incomplete."""
+    """A bench that is stopped before its third trial says what the second one measured, and that it is incomplete."""
     asked: list[bool] = []
 
     def should_stop() -> bool:
         asked.append(True)
-        return len(asked) > 1
+        return len(asked) > 2
 
     result = run_bench(SMALL, should_stop=should_stop)
     assert not result.complete
-    assert [part.name for part in result.parts] == ["adapter", "masks"]
+    assert [part.name for part in result.parts] == [ADAPTER_ALONE, "masks"]
     assert result.workers == ()
 
 
@@ -64,7 +97,7 @@ def test_the_command_writes_its_figures(tmp_path: Path) -> None:
     assert result.exit_code == 0, result.output
     figures = json.loads(file.read_text())
     assert figures == json.loads((out / "metrics.json").read_text())
-    names = ["environment", "adapter", "masks", "network, drawing", "network, updating"]
+    names = ["environment", "adapter, between steps", ADAPTER_ALONE, "masks", "network, drawing", "network, updating"]
     assert [part["name"] for part in figures["parts"]] == names
     assert [row["workers"] for row in figures["workers"]] == [0]
     assert figures["complete"]

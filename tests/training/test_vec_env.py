@@ -1,5 +1,6 @@
 """`ExplorationVecEnv`: what Stable-Baselines3 gets is what each environment gives by itself."""
 
+import time
 from collections.abc import Iterator
 from functools import partial
 from typing import Any
@@ -161,6 +162,46 @@ def test_results_are_copies(where: str, request: pytest.FixtureRequest) -> None:
     assert not any(np.shares_memory(first[name], second[name]) for name in first)
     second["action_mask"][:] = 0
     assert all(mask[0] for mask in env.env_method("action_masks"))
+
+
+@pytest.mark.parametrize("where", ["here", "workers"])
+def test_nobody_shares_what_was_handed_out(where: str, request: pytest.FixtureRequest) -> None:
+    """What a step returned shares memory with no other step's; writing into it changes neither these nor what comes."""
+    env = make_vec_env(GOALS, 3) if where == "here" else request.getfixturevalue("workers")
+    twin = make_vec_env(GOALS, 3)
+    rng = np.random.default_rng(6)
+    for each in (env, twin):
+        each.seed(8)
+    handed, expected = [env.reset()], [twin.reset()]
+    for _ in range(6):  # over the end of an episode
+        actions = _goals(twin.env_method("action_masks"), rng)
+        (observations, rewards, dones, infos), (theirs, *_) = env.step(actions), twin.step(actions)
+        handed += [observations, {"rewards": rewards, "dones": dones}]
+        handed += [info["terminal_observation"] for info in infos if "terminal_observation" in info]
+        expected.append(theirs)
+        _assert_equal(observations, theirs)
+        for rows in observations.values():
+            rows[...] = 77
+    arrays = [array for each in handed for array in each.values()]
+    assert len(arrays) == 2 * 6 + len(handed[0]) * (7 + 6)  # rewards and dones; of 7 times, and of 6 slots' ends
+    for i, array in enumerate(arrays):
+        assert array.flags.writeable
+        assert not any(np.shares_memory(array, other) for other in arrays[:i])
+    _assert_equal(handed[0], expected[0])
+
+
+@pytest.mark.parametrize("where", ["here", "workers"])
+def test_time_in_environments_is_told(where: str, request: pytest.FixtureRequest) -> None:
+    """Per process there are the seconds that the last step's environments took, which are not more than it took."""
+    env = make_vec_env(GOALS, 3) if where == "here" else request.getfixturevalue("workers")
+    env.seed(3)
+    env.reset()
+    begin = time.perf_counter()
+    env.step(np.zeros(6, np.int64))
+    took = time.perf_counter() - begin
+    assert env.spent.shape == ((1, 2) if where == "here" else (2, 2))
+    assert (env.spent > 0.0).all()
+    assert (env.spent[:, 0] <= took).all()
 
 
 def test_seeds_repeat_and_differ() -> None:
