@@ -1,95 +1,105 @@
-"""Landmarks of all particles of two filters: taken out, moved by each particle's own motion, fused."""
+"""Landmarks of all particles of two filters: taken out, brought into one map."""
 
 from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend._packed import UNPACK, UPPER
-from slam_backend.errors import FloatArray, IntArray
+from slam_backend._joint_map_kernels import join, places, read
+from slam_backend._kernels import LANES
+from slam_backend._particle_maps import ParticleMaps
+from slam_backend.errors import FloatArray, IntArray, bad_argument
 from slam_backend.existence import ExistenceModel
-from slam_backend.filter import FastSlam
-from slam_backend.fusion import fuse_landmarks
 
 
 class Landmarks(NamedTuple):
-    """A filter's landmarks, by ascending id if all: values (n, 9, M), counts (n, M), and one row each of the others.
+    """The landmarks of one filter in some of its particles, wherever they lie.
 
-    The log-odds of existence are (n, M), None where the filter does not keep them.
+    Attributes:
+        maps: That hold them.
+        slots: (n,) which.
+        chosen: (M,) particles.
+        where: (n, M) at which of the maps' numbers each begins.
+        counts: (n, M), 0 where the particle lacks it.
     """
 
-    ids: IntArray
-    values: FloatArray
+    maps: ParticleMaps
+    slots: IntArray
+    chosen: IntArray
+    where: IntArray
     counts: IntArray
-    odds: FloatArray | None
-    descriptors: NDArray[np.float32]
-    identities: IntArray
 
     @classmethod
-    def of(cls, slam: FastSlam, ids: IntArray | None = None) -> Self:
-        """Return all of a filter, or those of these ids (n,) in their order."""
-        maps = slam._maps
+    def of(cls, maps: ParticleMaps, chosen: IntArray | None = None, ids: IntArray | None = None) -> Self:
+        """Return all by ascending id, or those of these ids (n,) in their order; in all particles or the chosen."""
         slots = maps.used_slots()
         if ids is not None:
             slots = slots[np.searchsorted(maps.ids[slots], ids)]
-        values, counts = maps.dense(slots)
-        return cls(
-            maps.ids[slots], values, counts.astype(np.int64), maps.dense_odds(slots), maps.descriptors[slots],
-            maps.identities[slots],
-        )  # fmt: skip
+        chosen = np.arange(maps.num_particles) if chosen is None else chosen
+        where, counts = places(slots, maps.row_of, maps.map_of, maps.maps, maps.counts, chosen, LANES)
+        return cls(maps, slots, chosen, where, counts)
 
-    def chosen(self, rows: IntArray) -> Self:
-        """Return those of these rows, in their order."""
-        odds = None if self.odds is None else self.odds[rows]
-        return type(self)(
-            self.ids[rows], self.values[rows], self.counts[rows], odds, self.descriptors[rows], self.identities[rows]
-        )
+    @property
+    def values(self) -> FloatArray:
+        """(n, 9, M) float64 [m, m^2]: means and upper triangles of covariances. A copy."""
+        return read(self.maps.values, self.where, LANES)
 
+    @property
+    def ids(self) -> IntArray:
+        """(n,) names."""
+        return np.asarray(self.maps.ids[self.slots])
 
-def odds_of(dense: Landmarks, chosen: IntArray, model: ExistenceModel | None) -> FloatArray:
-    """Return the log-odds of existence (n, M) that the chosen particles (M,) have: the prior, where they have none."""
-    if dense.odds is not None:
-        return np.take(dense.odds, chosen, axis=1)
-    return np.full((len(dense.ids), len(chosen)), 0.0 if model is None else model.log_odds_prior)
+    @property
+    def identities(self) -> IntArray:
+        """(n,) the caller's own names, -1 = none."""
+        return np.asarray(self.maps.identities[self.slots])
 
+    @property
+    def descriptors(self) -> NDArray[np.float32]:
+        """(n, d) looks."""
+        return np.asarray(self.maps.descriptors[self.slots])
 
-def move_landmarks(landmarks: FloatArray, motion: FloatArray) -> None:
-    """Move landmarks (n, 9, M) in place, each particle by its own motion (M, 3); covariances by Eq. 16 corrected."""
-    c, s = np.cos(motion[:, 2]), np.sin(motion[:, 2])
-    x, y = landmarks[:, 0].copy(), landmarks[:, 1].copy()
-    landmarks[:, 0] = c * x - s * y + motion[:, 0]
-    landmarks[:, 1] = s * x + c * y + motion[:, 1]
-    xx, xy, xz, yy, yz = (landmarks[:, i].copy() for i in range(3, 8))
-    landmarks[:, 3] = c * c * xx - 2.0 * c * s * xy + s * s * yy  # Eq. 16 *: R Sigma R^T
-    landmarks[:, 4] = c * s * (xx - yy) + (c * c - s * s) * xy
-    landmarks[:, 5] = c * xz - s * yz
-    landmarks[:, 6] = s * s * xx + 2.0 * c * s * xy + c * c * yy
-    landmarks[:, 7] = s * xz + c * yz
+    def odds(self, model: ExistenceModel | None) -> FloatArray:
+        """Return the log-odds of existence (n, M): the prior, where the filter does not keep them."""
+        if self.maps.log_odds_prior is None:
+            return np.full(self.counts.shape, 0.0 if model is None else model.log_odds_prior)
+        ancestors = self.maps.map_of[self.slots][:, None]
+        particles = np.where(ancestors > 0, self.maps.maps[ancestors, self.chosen], self.chosen)
+        return np.asarray(self.maps.odds[self.slots[:, None], particles])
 
 
-def fuse_rows(
-    a: tuple[FloatArray, IntArray], rows_a: IntArray, b: tuple[FloatArray, IntArray], rows_b: IntArray
-) -> None:
-    """Fuse b's rows into a's, in place, where a particle holds both; where it holds b's alone, take that.
+def joined_tiles(
+    a: Landmarks, b: Landmarks, rows_a: IntArray, rows_b: IntArray, motion: FloatArray, extra: float, scale: float
+) -> tuple[FloatArray, IntArray]:
+    """Bring the landmarks of two filters into the map frame of the first, and fuse those that both have.
 
-    Each side is (landmarks (n, 9, M), counts (n, M), 0 = not held).
+    Args:
+        a, b: Of either, in M particles each.
+        rows_a: (n,) row in a of each joint landmark, -1 if only b has it; `rows_b` likewise.
+        motion: (M, 3) by which each particle moves those of b.
+        extra: Added to all variances of either side before [m^2].
+        scale: Factor on all covariances then [-].
+
+    Returns:
+        The landmarks (n, blocks, 9, lanes) as `ParticleMaps.load_tiles` takes them, and their counts (n, M).
+
+    Raises:
+        ValueError: If two estimates of a landmark are exact along one direction.
     """
-    landmarks_a, landmarks_b = (side[0][rows].transpose(0, 2, 1) for side, rows in ((a, rows_a), (b, rows_b)))
-    in_a, in_b = a[1][rows_a] > 0, b[1][rows_b] > 0
-    row, particle = np.nonzero(in_a & in_b)
-    one, two = landmarks_a[row, particle], landmarks_b[row, particle]
-    means, covariances = fuse_landmarks(one[:, :3], one[:, 3:][:, UNPACK], two[:, :3], two[:, 3:][:, UNPACK])
-    fused = np.where((in_b & ~in_a)[..., None], landmarks_b, landmarks_a)
-    fused[row, particle] = np.concatenate([means, covariances[:, *UPPER]], axis=1)
-    a[0][rows_a] = fused.transpose(0, 2, 1)
-    a[1][rows_a] += b[1][rows_b]
+    tiles = np.zeros((len(rows_a), -(-len(motion) // LANES), 9, LANES))
+    counts = np.empty((len(rows_a), len(motion)), np.int64)
+    sides = a.maps.values, a.where, a.counts, b.maps.values, b.where, b.counts
+    if not join(*sides, rows_a, rows_b, motion, extra, scale, LANES, tiles, counts):
+        cure = "Give each landmark some uncertainty in every direction."
+        raise bad_argument("landmarks in common", "positive definite covariances", "singular ones", cure)
+    return tiles, counts
 
 
 def fuse_odds(
     model: ExistenceModel, odds_a: FloatArray, counts_a: IntArray, rows_a: IntArray,
     odds_b: FloatArray, counts_b: IntArray, rows_b: IntArray,
 ) -> None:  # fmt: skip
-    """Fuse the log-odds of existence (n, M) of b's rows into a's, in place, like `fuse_rows`, and before it.
+    """Fuse the log-odds of existence (n, M) of b's rows into a's, in place; where a particle has b's alone, take that.
 
     What either filter saw is independent given whether the landmark exists: log-odds add up, and the prior that both
     hold counts once. What then lies below the floor is given one more chance: it stays there until the next miss.

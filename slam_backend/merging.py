@@ -23,14 +23,7 @@ import math
 
 import numpy as np
 
-from slam_backend._joint_landmarks import (
-    Landmarks,
-    fuse_odds,
-    fuse_rows,
-    move_landmarks,
-    odds_of,
-    stack_descriptors,
-)
+from slam_backend._joint_landmarks import Landmarks, fuse_odds, joined_tiles, stack_descriptors
 from slam_backend._joint_robots import finish, joined_robots
 from slam_backend._pairing import pair_up
 from slam_backend.alignment import Alignment
@@ -38,8 +31,6 @@ from slam_backend.errors import FloatArray, IntArray
 from slam_backend.filter import FastSlam
 from slam_backend.fusion import fuse_descriptors
 from slam_backend.geometry import inverse, wrap_angle
-
-DIAGONAL = np.array([3, 6, 8])  # where a landmark's nine numbers hold its variances
 
 
 def inverse_alignment(alignment: Alignment) -> Alignment:
@@ -79,47 +70,46 @@ def merge_filters(
         landmarks.
     """
     count = max(a.num_particles, b.num_particles) if num_particles is None else num_particles
-    dense_a, dense_b = Landmarks.of(a), Landmarks.of(b)
-    shared_a, shared_b = np.searchsorted(dense_a.ids, pairs[:, 0]), np.searchsorted(dense_b.ids, pairs[:, 1])
-    common = dense_a.chosen(shared_a), dense_b.chosen(shared_b)
+    common = Landmarks.of(a._maps, ids=pairs[:, 0]), Landmarks.of(b._maps, ids=pairs[:, 1])
     pairing = pair_up(a.weights, common[0], b.weights, common[1], alignment, count, rng, known)
     from_a, from_b, motion, evidence, extra, scale = pairing
-
     joint = joined_robots(a, from_a, b, from_b, motion, rng)
     joint._path_log_weights[:] = a._path_log_weights[from_a] + b._path_log_weights[from_b] + evidence
 
-    values_a, counts_a = np.take(dense_a.values, from_a, axis=2), np.take(dense_a.counts, from_a, axis=1)
-    values_b, counts_b = np.take(dense_b.values, from_b, axis=2), np.take(dense_b.counts, from_b, axis=1)
+    of_a, of_b = Landmarks.of(a._maps, from_a), Landmarks.of(b._maps, from_b)
+    ids_a, ids_b = of_a.ids, of_b.ids
+    shared_a, shared_b = np.searchsorted(ids_a, pairs[:, 0]), np.searchsorted(ids_b, pairs[:, 1])
     model = a.options.existence
-    odds_a, odds_b = odds_of(dense_a, from_a, model), odds_of(dense_b, from_b, model)
-    for values in (values_a, values_b):  # either map bears half of what they do not explain
-        values[:, DIAGONAL] += 0.5 * extra
-        values[:, 3:] *= scale
-    move_landmarks(values_b, motion)
-    descriptors, identities = dense_a.descriptors.copy(), dense_a.identities.copy()
+    odds_a, odds_b = of_a.odds(model), of_b.odds(model)
+    descriptors, identities, looks_b = of_a.descriptors, of_a.identities, of_b.descriptors
     if len(shared_a):
-        seen_a, seen_b = counts_a[shared_a].max(axis=1), counts_b[shared_b].max(axis=1)
+        seen_a, seen_b = of_a.counts[shared_a].max(axis=1), of_b.counts[shared_b].max(axis=1)
         descriptors[shared_a] = fuse_descriptors(
-            descriptors[shared_a], np.maximum(seen_a, 1), dense_b.descriptors[shared_b], np.maximum(seen_b, 1)
+            descriptors[shared_a], np.maximum(seen_a, 1), looks_b[shared_b], np.maximum(seen_b, 1)
         )
         names = identities[shared_a]
-        identities[shared_a] = np.where(names < 0, dense_b.identities[shared_b], names)
+        identities[shared_a] = np.where(names < 0, of_b.identities[shared_b], names)
         if model is not None:
-            fuse_odds(model, odds_a, counts_a, shared_a, odds_b, counts_b, shared_b)
-        fuse_rows((values_a, counts_a), shared_a, (values_b, counts_b), shared_b)
-    own = np.setdiff1d(np.arange(len(dense_b.ids)), shared_b)  # b's landmarks that a does not have
+            fuse_odds(model, odds_a, of_a.counts, shared_a, odds_b, of_b.counts, shared_b)
+    own = np.setdiff1d(np.arange(len(ids_b)), shared_b)  # b's landmarks that a does not have
+    rows_a, rows_b = np.arange(len(ids_a) + len(own)), np.full(len(ids_a) + len(own), -1)
+    rows_a[len(ids_a) :], rows_b[len(ids_a) :], rows_b[shared_a] = -1, own, shared_b
+    # Either map bears half of what they do not explain.
+    tiles, counts = joined_tiles(of_a, of_b, rows_a, rows_b, motion, 0.5 * extra, scale)
     next_id = a._maps.next_id
     new_ids = next_id + np.arange(len(own))
-    joint._maps.load(
-        np.concatenate([values_a, values_b[own]]),
-        np.concatenate([counts_a, counts_b[own]]),
-        stack_descriptors(descriptors, dense_b.descriptors[own]),
-        np.concatenate([dense_a.ids, new_ids]),
-        np.concatenate([identities, dense_b.identities[own]]),
+    held = np.flatnonzero((counts > 0).any(axis=1))
+    joint._maps.load_tiles(
+        tiles,
+        counts[held],
+        stack_descriptors(descriptors, looks_b[own])[held],
+        np.concatenate([ids_a, new_ids])[held],
+        np.concatenate([identities, of_b.identities[own]])[held],
         next_id + len(own),
-        np.concatenate([odds_a, odds_b[own]]),
+        np.concatenate([odds_a, odds_b[own]])[held],
+        held,
     )
-    renamed = np.concatenate([pairs[:, ::-1], np.column_stack([dense_b.ids[own], new_ids])]).astype(np.int64)
+    renamed = np.concatenate([pairs[:, ::-1], np.column_stack([ids_b[own], new_ids])]).astype(np.int64)
     finish(joint, a, b, renamed)
     return joint, renamed
 
@@ -138,7 +128,7 @@ def motion_covariance(
     Returns:
         (3, 3) covariance of (tx, ty, theta) [m, m, rad].
     """
-    common_a, common_b = Landmarks.of(a, pairs[:, 0]), Landmarks.of(b, pairs[:, 1])
+    common_a, common_b = Landmarks.of(a._maps, ids=pairs[:, 0]), Landmarks.of(b._maps, ids=pairs[:, 1])
     count = max(a.num_particles, b.num_particles)
     motion = pair_up(a.weights, common_a, b.weights, common_b, alignment, count, rng).motion
     turns = wrap_angle(motion[:, 2] - alignment.theta)
