@@ -6,8 +6,8 @@ import numpy as np
 
 from slam_backend import _kernels
 from slam_backend._best_map import slots_held
-from slam_backend._jit import jit
-from slam_backend._kernels import LANES
+from slam_backend._jit import any_order, jit
+from slam_backend._kernels.layout import SHIFT
 from slam_backend._particle_maps import ParticleMaps
 from slam_backend.errors import FloatArray, IntArray
 from slam_backend.reports import PoseEstimate
@@ -29,49 +29,52 @@ def pose_mixture(means: FloatArray, covariances: FloatArray, weights: FloatArray
     return PoseEstimate(mean, covariance)
 
 
+@any_order
+def _sum(weights: FloatArray, one: FloatArray, two: FloatArray, count: int) -> float:
+    """Return the weighted sum of the products of two rows, up to `count`."""
+    total = 0.0
+    for i in range(count):
+        total += weights[i] * one[i] * two[i]
+    return total
+
+
 @jit
 def _mix(
     slots: Any, row_of: Any, map_of: Any, maps: Any, values: Any, counts: Any, best: int, weights: FloatArray,
-    lanes: int,
+    shift: int,
 ) -> tuple[FloatArray, FloatArray, IntArray]:  # fmt: skip
     """Return means (n, 3), covariances (n, 3, 3) and counts (n,) of landmarks, see `map_mixture`.
 
-    The number of lanes is an argument, for a compiled kernel would not notice that it changed in another file.
+    The number of lanes is an argument, 2 to the `shift`: a compiled kernel would not notice a change in another file.
     """
-    padded = counts.shape[1]
+    padded, size, lanes = counts.shape[1], len(weights), 1 << shift
     means, covariances = np.empty((len(slots), 3)), np.empty((len(slots), 3, 3))
     times = np.empty(len(slots), np.int64)
-    where, shares, mixed, scatter = np.empty(len(weights), np.int64), np.empty(len(weights)), np.empty(9), np.empty(6)
+    shares, own, ones = np.empty(size), np.empty((9, size)), np.ones(size)
     for i in range(len(slots)):
         row, ancestors = row_of[slots[i]], map_of[slots[i]]
         times[i] = counts[row, maps[ancestors, best] if ancestors > 0 else best]
-        holders, whole = 0, 0.0
-        for m in range(len(weights)):
+        holders = 0
+        for m in range(size):
             place = maps[ancestors, m] if ancestors > 0 else m
             if counts[row, place] > 0:
-                where[holders] = row * 9 * padded + place // lanes * 9 * lanes + place % lanes
+                at = row * 9 * padded + (place >> shift) * 9 * lanes + (place & (lanes - 1))
+                for c in range(9):
+                    own[c, holders] = values[at + c * lanes]
                 shares[holders] = weights[m]
-                whole += weights[m]
                 holders += 1
-        mixed[:], scatter[:] = 0.0, 0.0
+        whole = max(_sum(shares, ones, ones, holders), 1e-300)
         for h in range(holders):
-            shares[h] /= max(whole, 1e-300)
-            for c in range(9):
-                mixed[c] += shares[h] * values[where[h] + c * lanes]
-        means[i] = mixed[:3]
-        for h in range(holders):
-            x, y = values[where[h]] - mixed[0], values[where[h] + lanes] - mixed[1]
-            z, share = values[where[h] + 2 * lanes] - mixed[2], shares[h]
-            scatter[0] += share * x * x
-            scatter[1] += share * x * y
-            scatter[2] += share * x * z
-            scatter[3] += share * y * y
-            scatter[4] += share * y * z
-            scatter[5] += share * z * z
-        entry = 0
+            shares[h] /= whole
+        for axis in range(3):
+            means[i, axis] = _sum(shares, own[axis], ones, holders)
+            for h in range(holders):
+                own[axis, h] -= means[i, axis]
+        entry = 3
         for j in range(3):
             for k in range(j, 3):
-                covariances[i, j, k] = covariances[i, k, j] = mixed[3 + entry] + scatter[entry]
+                mixed = _sum(shares, own[entry], ones, holders) + _sum(shares, own[j], own[k], holders)
+                covariances[i, j, k] = covariances[i, k, j] = mixed
                 entry += 1
     return means, covariances, times
 
@@ -96,6 +99,6 @@ def map_mixture(
     """
     slots = slots_held(maps, best, min_count)
     means, covariances, times = _mix(
-        slots, maps.row_of, maps.map_of, maps.maps, maps.values, maps.counts, best, np.exp(log_weights), LANES
+        slots, maps.row_of, maps.map_of, maps.maps, maps.values, maps.counts, best, np.exp(log_weights), SHIFT
     )
     return means, covariances, maps.descriptors[slots], times, maps.ids[slots]
