@@ -38,7 +38,7 @@ class PathGraph:
             that is not known hangs on the origin, or on another robot's start.
         motions: (k, 3) float64 [m, m, rad]. Odometry from the previous key, in its frame.
         noises: (k, 3, 3) float64. Its covariance, likewise.
-        spreads: (k,) float64 [m^2]. How far the motion from the previous key scattered when paths were last drawn, or
+        spreads: (k,) float64 [m^2]. How far the motion from the previous key scattered when that was last asked, or
             as far as odometry says before that; see `LEVER`.
         slack: (k,) float64 [m^2]. How much those poses may move against each other that stand rigidly to the key.
         frame_keys, frame_offsets: (f,) int64, (f, 3) float64. Key of each frame, and the frame's pose seen from it.

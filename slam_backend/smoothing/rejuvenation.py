@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import lapack
 
 from slam_backend._blas import on_one_thread
 from slam_backend.errors import FloatArray, IntArray
@@ -18,11 +17,10 @@ from slam_backend.smoothing.duplicates import find_duplicates, without_duplicate
 from slam_backend.smoothing.extending import Places, extended, first_rows
 from slam_backend.smoothing.graph import PathGraph
 from slam_backend.smoothing.options import SmoothingOptions
-from slam_backend.smoothing.sampling import Draws, draw_paths, scouted
+from slam_backend.smoothing.sampling import Draws, draw_paths
 from slam_backend.smoothing.solving import Mode, find_mode
 
 NEAR = 10.0  # times the tolerance: a descent that is not followed by draws may end so much sooner
-SCOUTS = 32  # paths drawn to see what is rigid, while a long log is taken in
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -132,24 +130,21 @@ def rejuvenate(
             return Rejuvenation(graph, mode.reason, float("nan"), mode.iterations, None)
         if last:
             return drawn(grown, mode, camera, num_particles, rng, options, looks)
-        graph = settled(grown, mode, camera, options, rng)
+        graph = settled(grown, mode, camera, options)
         rest = [log.since(int(graph.latest[i]) + 1) for i, log in enumerate(rest)]
 
 
-def settled(
-    graph: PathGraph, mode: Mode, camera: FloatArray, options: SmoothingOptions, rng: np.random.Generator
-) -> PathGraph:
-    """Return the graph at its mode; if it has too many keys some are joined, the most rigid of a few paths drawn.
+def settled(graph: PathGraph, mode: Mode, camera: FloatArray, options: SmoothingOptions) -> PathGraph:
+    """Return the graph at its mode; if it has too many keys some are joined, those whose motions scatter least.
 
     Args:
         graph: Which has the mode.
         mode: Of use, with an empty `reason`.
         camera, options: As of `rejuvenate`.
-        rng: Source of these draws.
     """
     if graph.num_keys <= options.most_keys(len(graph.tips)):
         return at_mode(graph, mode)
-    return coarsened(at_mode(graph, mode, scouted(graph, mode, SCOUTS, rng)), camera, options)
+    return coarsened(at_mode(graph, mode, mode.spreads()), camera, options)
 
 
 def drawn(
@@ -208,10 +203,10 @@ def _particles(graph: PathGraph, mode: Mode, draws: Draws, weights: FloatArray) 
     tiles = draws.tiles if seen.all() else draws.tiles[seen]
     poses, starts = draws.poses[graph.tips], draws.poses[graph.heads]
     means = mode.poses[graph.tips]
-    joint = _covariance(mode.factor, mode.columns[graph.tips])
-    off = (poses - means[:, :, None])[mode.columns[graph.tips] >= 0].reshape(-1, poses.shape[2])
     covariances = np.zeros((len(means), 3, 3))
     sought = np.flatnonzero(mode.columns[graph.tips] >= 0)
+    joint = mode.covariance(graph.tips[sought])
+    off = (poses - means[:, :, None])[sought].reshape(-1, poses.shape[2])
     for place, robot in enumerate(sought):
         covariances[robot] = joint[3 * place : 3 * place + 3, 3 * place : 3 * place + 3]
     densities = -0.5 * np.einsum("im,im->m", off, np.linalg.solve(joint, off)) if len(off) else np.zeros(len(weights))
@@ -222,12 +217,3 @@ def _particles(graph: PathGraph, mode: Mode, draws: Draws, weights: FloatArray) 
         poses, starts, np.log(np.maximum(weights, 1e-300)), densities, graph.landmark_ids[seen], tiles,
         counts[seen].astype(np.int64), means, covariances,
     )  # fmt: skip
-
-
-def _covariance(factor: FloatArray, columns: IntArray) -> FloatArray:
-    """Return the joint marginal covariance (3 r, 3 r) of the poses that are sought, from the factor of U^T U."""
-    rows = (columns[columns >= 0][:, None] + np.arange(3)).ravel()
-    unit = np.zeros((len(factor), len(rows)), order="F")
-    unit[rows, np.arange(len(rows))] = 1.0
-    half = lapack.dtrtrs(factor, unit, lower=0, trans=1)[0]
-    return np.asarray(half.T @ half)

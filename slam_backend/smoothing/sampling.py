@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import lapack
 
 from slam_backend.errors import FloatArray, IntArray
 from slam_backend.geometry import between
@@ -54,7 +53,7 @@ class Draws:
 
 
 def draw_paths(graph: PathGraph, mode: Mode, num_particles: int, rng: np.random.Generator) -> Draws:
-    """Draw x^(i) = mode + U^-1 z, z ~ N(0, I), and replay each path.
+    """Draw x^(i) from the Gaussian about the mode, and replay each path.
 
     log w = log p(path given odometry) + log p(measurements given path) - log q(path). The first path is the mode. Where
     the weights of these say that the posterior is no such Gaussian, the same paths are bent (`bending`), and of both
@@ -66,7 +65,7 @@ def draw_paths(graph: PathGraph, mode: Mode, num_particles: int, rng: np.random.
         num_particles: M >= 1.
         rng: Source of the draws.
     """
-    poses, log_proposals = _poses(mode, num_particles, rng)
+    poses, log_proposals = mode.paths(num_particles, rng)
     straight = _weighed(graph, mode, poses, log_proposals)
     if straight.sample_size >= BENT_BELOW * num_particles:
         return straight
@@ -81,32 +80,6 @@ def _weighed(graph: PathGraph, mode: Mode, poses: FloatArray, log_proposals: Flo
     tiles, log_likelihood = replay(mode, rows, num_paths)
     log_odometry, spreads = weigh_odometry(graph, mode, rows, num_paths)
     return Draws(poses, tiles, log_likelihood + log_odometry - log_proposals, spreads)
-
-
-def scouted(graph: PathGraph, mode: Mode, num_paths: int, rng: np.random.Generator) -> FloatArray:
-    """Return how far the motions between keys scatter, from paths that are drawn but not replayed.
-
-    Args:
-        graph: Odometry.
-        mode: Of it, with the factor of its information.
-        num_paths: How many are drawn.
-        rng: Source of the draws.
-
-    Returns:
-        (k,) float64 [m^2], see `Draws.spreads`.
-    """
-    return weigh_odometry(graph, mode, lane_rows(_poses(mode, num_paths, rng)[0]), num_paths)[1]
-
-
-def _poses(mode: Mode, num_paths: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-    """Return paths (k, 3, M) from the Gaussian about the mode, which is the first of them, and their log q (M,)."""
-    normals = rng.standard_normal((num_paths, len(mode.factor))).T  # columns lie in a row, as LAPACK wants them
-    normals[:, 0] = 0.0
-    log_proposals = -0.5 * np.einsum("nm,nm->m", normals, normals)
-    spread = lapack.dtrtrs(mode.factor, normals, lower=0, overwrite_b=1)[0]
-    poses = np.repeat(mode.poses[:, :, None], num_paths, axis=2)
-    poses[mode.columns >= 0] += spread.reshape(-1, 3, num_paths)
-    return poses, log_proposals
 
 
 def lane_rows(poses: FloatArray) -> FloatArray:

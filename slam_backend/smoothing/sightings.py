@@ -18,7 +18,7 @@ class Sightings:
         keys, landmarks: (s,) int64.
         starts: (l + 1,) int64. Those of landmark i are starts[i] to starts[i + 1].
         frozen: (s,) bool.
-        centres, infos, slopes: (s, 3), (s, 6), (s, 3) float64. See `_kernels`.
+        centres, infos, slopes: (s, 3), (s, 6), (s, 3) float64. See `_kernels.forms`.
         counts: (s,) int64. Measurements in each.
         of_points: (n,) int64. Sighting of each raw measurement.
         squares: (n,) float64. Squared Mahalanobis distance of each, where it was last linearised.
@@ -38,32 +38,27 @@ class Sightings:
     @classmethod
     def of(cls, graph: PathGraph) -> Self:
         """Gather a graph's sightings; those of raw measurements are still to be linearised."""
-        k = graph.num_keys
-        codes = graph.point_landmarks * k + graph.frame_keys[graph.point_frames]
-        raw, of_points, counts = np.unique(codes, return_inverse=True, return_counts=True)
-        every = np.concatenate([graph.frozen_landmarks * k + graph.frozen_keys, raw])
-        order = np.argsort(every, kind="stable")
-        place = np.empty(len(order), dtype=np.int64)
-        place[order] = np.arange(len(order))
-        num_frozen = len(graph.frozen_keys)
-        landmarks, keys = np.divmod(every[order], k)
-
-        def placed(frozen: FloatArray) -> FloatArray:
-            result = np.zeros((len(order), frozen.shape[1]))
-            result[place[:num_frozen]] = frozen
-            return result
-
+        most, n = len(graph.frozen_keys) + len(graph.points), len(graph.points)
+        keys, landmarks, counts = (np.empty(most, dtype=np.int64) for _ in range(3))
+        starts, of_points = np.empty(len(graph.landmark_ids) + 1, dtype=np.int64), np.empty(n, dtype=np.int64)
+        frozen = np.empty(most, dtype=np.bool_)
+        centres, infos, slopes = np.empty((most, 3)), np.empty((most, 6)), np.empty((most, 3))
+        num = _kernels.gather(
+            graph.frozen_keys, graph.frozen_landmarks, graph.centres, graph.infos, graph.slopes, graph.counts,
+            graph.point_frames, graph.point_landmarks, graph.frame_keys, graph.num_keys, keys, landmarks, starts,
+            frozen, centres, infos, slopes, counts, of_points,
+        )  # fmt: skip
         return cls(
-            keys=keys,
-            landmarks=landmarks,
-            starts=np.searchsorted(landmarks, np.arange(len(graph.landmark_ids) + 1)),
-            frozen=order < num_frozen,
-            centres=placed(graph.centres),
-            infos=placed(graph.infos),
-            slopes=placed(graph.slopes),
-            counts=np.concatenate([graph.counts, counts])[order],
-            of_points=place[num_frozen + of_points],
-            squares=np.zeros(len(codes)),
+            keys=keys[:num],
+            landmarks=landmarks[:num],
+            starts=starts,
+            frozen=frozen[:num],
+            centres=centres[:num],
+            infos=infos[:num],
+            slopes=slopes[:num],
+            counts=counts[:num],
+            of_points=of_points,
+            squares=np.zeros(n),
         )
 
     def linearise(

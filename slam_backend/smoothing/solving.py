@@ -1,14 +1,14 @@
-"""The most probable paths and landmarks: Gauss-Newton over key poses, landmarks eliminated."""
+"""The most probable paths and landmarks: Gauss-Newton over key poses and landmarks, by a sparse factorisation."""
 
 from dataclasses import dataclass
+from typing import NamedTuple, Self
 
 import numpy as np
-from scipy.linalg import lapack
 
 from slam_backend.errors import FloatArray, IntArray
 from slam_backend.smoothing import _kernels
 from slam_backend.smoothing._kernels import FREE
-from slam_backend.smoothing.graph import PathGraph
+from slam_backend.smoothing.graph import LEVER, PathGraph
 from slam_backend.smoothing.options import SmoothingOptions
 from slam_backend.smoothing.sightings import Sightings
 
@@ -24,31 +24,54 @@ class Mode:
     Attributes:
         poses: (k, 3) float64 [m, m, rad], map frame; headings are not wrapped against each other.
         landmarks: (l, 3) float64 [m], map frame.
-        columns: (k,) int64. First row of each key in `factor`, `FREE` where the pose is given.
-        factor: (n, n) float64, upper triangle U with U^T U the information of the paths, landmarks integrated out.
+        columns: (k,) int64. First of each key's rows among those of the poses sought, `FREE` where it is given.
         sightings: As linearised there.
         odometry_infos: (k, 3, 3) float64. Information of the odometry from the key before; zeros where there is none.
         cost: Half the sum of squared distances (robust, and up to a constant of the frozen sightings).
         iterations: Systems solved.
         damping: Of the last system; where a descent that was not given the time goes on.
         reason: Why it is of no use; "" if it is of use. Poses and landmarks are then where the descent got to.
+        system: The last one, factored, if it is of use.
     """
 
     poses: FloatArray
     landmarks: FloatArray
     columns: IntArray
-    factor: FloatArray
     sightings: Sightings
     odometry_infos: FloatArray
     cost: float
     iterations: int
     damping: float
     reason: str
+    system: "_System | None" = None
 
     @property
     def unfinished(self) -> bool:
         """Whether nothing is wrong with the descent but that it was given too few iterations."""
         return bool(self.reason) and np.isfinite(self.cost)
+
+    def paths(self, num_paths: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+        """Draw paths from the Gaussian about the mode, if of use.
+
+        Args:
+            num_paths: M >= 1; the first is the mode.
+            rng: Source of the draws.
+
+        Returns:
+            (k, 3, M) float64 [m, m, rad], map frame, and the logarithm of the density of each (M,), up to a constant.
+        """
+        assert self.system is not None
+        return self.system.draw(self.poses, num_paths, rng)
+
+    def covariance(self, keys: IntArray) -> FloatArray:
+        """Return the joint covariance (3 r, 3 r) [m, m, rad] of r keys (r,) that are sought, if of use."""
+        assert self.system is not None
+        return self.system.covariance(self.columns[keys])
+
+    def spreads(self) -> FloatArray:
+        """Return how far the motions from the keys before scatter (k,) [m^2], headings felt at `LEVER`; if of use."""
+        assert self.system is not None
+        return self.system.spreads(self.poses)
 
 
 def find_mode(
@@ -70,16 +93,15 @@ def find_mode(
     """
     sought = graph.previous >= 0
     columns = np.where(sought, 3 * np.cumsum(sought) - 3, FREE)
-    size = 3 * int(sought.sum())
+    size = int(sought.sum())
     sightings = Sightings.of(graph)
     poses, landmarks = graph.poses.copy(), graph.landmarks.copy()
-    empty, informations = np.zeros((0, 0)), np.zeros_like(graph.noises)
-
+    informations = np.zeros_like(graph.noises)
     creep = CREEP if most is None else 1.0
     most = options.max_iterations if most is None else most
 
     def given_up(reason: str, iterations: int = 0, cost: float = np.inf) -> Mode:
-        return Mode(poses, landmarks, columns, empty, sightings, informations, cost, iterations, damping, reason)
+        return Mode(poses, landmarks, columns, sightings, informations, cost, iterations, damping, reason)
 
     if not size:
         return given_up("no pose to seek")
@@ -92,21 +114,19 @@ def find_mode(
     for iteration in range(1, most + 1):
         if not np.isfinite(cost):
             return given_up("a landmark at no finite place", iteration)
-        factor = system.factor(damping)
-        if factor is None:
+        if not system.factor(damping):
             return given_up("a singular system", iteration)
-        change = -lapack.dpotrs(factor, system.vector, lower=0)[0]
-        if not np.abs(change).max() < LARGEST_STEP:
+        change = system.solve()
+        if not np.abs(change[:size]).max() < LARGEST_STEP:
             return given_up("a descent that leaves the world", iteration)
-        expected = -0.5 * float(system.vector @ change)  # if the cost were a parabola
-        trial_poses, trial_landmarks = poses.copy(), landmarks.copy()
-        trial_poses[sought] += change.reshape(-1, 3)
-        system.move(trial_landmarks, change)
+        expected = -0.5 * float(np.vdot(system.vector, change)) - system.eased  # if the cost were a parabola
+        trial_poses, trial_landmarks = poses.copy(), landmarks + change[size:]
+        trial_poses[sought] += change[:size]
         near = creep * options.tolerance if iteration == most else options.tolerance
         if expected <= near and damping == 0.0:
             return Mode(
-                trial_poses, trial_landmarks, columns, factor, sightings, informations, cost - expected,
-                iteration, damping, "",
+                trial_poses, trial_landmarks, columns, sightings, informations, cost - expected, iteration, damping,
+                "", system,
             )  # fmt: skip
         trial_cost = system.form(trial_poses, trial_landmarks)
         if trial_cost <= cost + 1e-9 * abs(cost):
@@ -120,6 +140,36 @@ def find_mode(
     return given_up(f"no convergence in {most} iterations", most, cost)
 
 
+class _Pattern(NamedTuple):
+    """Where the blocks of a factor lie; see `_kernels.ordering.lay_out`."""
+
+    order: IntArray
+    ranks: IntArray
+    tops: IntArray
+    rows: IntArray
+    link_places: IntArray
+    cross_places: IntArray
+    row_tops: IntArray
+    row_columns: IntArray
+    row_places: IntArray
+
+    @classmethod
+    def of(cls, graph: PathGraph, columns: IntArray, seen: Sightings, num: int) -> Self:
+        """Choose an order in which the `num` poses and landmarks are eliminated, and lay out what that fills in."""
+        near = np.zeros((num, -(-num // 64)), dtype=np.uint64)
+        _kernels.neighbours(columns, graph.previous, seen.keys, seen.starts, near)
+        order, ranks = np.empty(num, dtype=np.int64), np.empty(num, dtype=np.int64)
+        filled = _kernels.minimum_degree(near, order)
+        tops, row_tops = np.empty(num + 1, dtype=np.int64), np.empty(num + 1, dtype=np.int64)
+        rows, row_columns, row_places = (np.empty(filled, dtype=np.int64) for _ in range(3))
+        links, cross = np.empty(len(columns), dtype=np.int64), np.empty(len(seen.keys), dtype=np.int64)
+        _kernels.lay_out(
+            near, order, columns, graph.previous, seen.keys, seen.starts, ranks, tops, rows, links, cross, row_tops,
+            row_columns, row_places,
+        )  # fmt: skip
+        return cls(order, ranks, tops, rows, links, cross, row_tops, row_columns, row_places)
+
+
 class _System:
     """Room for the normal equations, and what they are formed of."""
 
@@ -129,33 +179,68 @@ class _System:
     ) -> None:  # fmt: skip
         self.graph, self.columns, self.sightings = graph, columns, sightings
         self.informations, self.camera, self.options = informations, camera, options
-        self.matrix = np.zeros((size, size))
-        self.vector = np.zeros(size)
-        self.cross = np.zeros((len(sightings.keys), 3, 3))
-        self.spreads = np.zeros((len(graph.landmark_ids), 6))
-        self.forces = np.zeros((len(graph.landmark_ids), 3))
+        num, k = size + len(graph.landmark_ids), graph.num_keys
+        self.num_poses = size
+        self.pattern = _Pattern.of(graph, columns, sightings, num)
+        self.blocks, self.links = np.empty((num, 6)), np.empty((k, 3, 3))
+        self.cross = np.empty((len(sightings.keys), 3, 3))
+        self.vector = np.empty((num, 3))
+        self.pivots, self.values = np.empty((num, 6)), np.empty((len(self.pattern.rows), 9))
+        self.eased = 0.0  # by so much the cost would fall if landmarks alone moved
 
     def form(self, poses: FloatArray, landmarks: FloatArray) -> float:
         """Form the equations at poses (k, 3) and landmarks (l, 3), map frame; return the cost there."""
         seen, graph = self.sightings, self.graph
         loss = seen.linearise(graph, poses, landmarks, self.camera, self.options.noise_scale, self.options.kernel)
-        self.matrix.fill(0.0)
-        self.vector.fill(0.0)
-        return loss + _kernels.assemble(
+        cost, self.eased = _kernels.form(
             poses, landmarks, self.columns, graph.previous, graph.motions, self.informations, seen.keys, seen.starts,
-            seen.centres, seen.infos, seen.slopes, self.matrix, self.vector, self.cross, self.spreads, self.forces,
+            seen.centres, seen.infos, seen.slopes, self.blocks, self.links, self.cross, self.vector,
+        )  # fmt: skip
+        return loss + cost
+
+    def factor(self, damping: float) -> bool:
+        """Factor the equations, the diagonal of poses enlarged; return whether that is possible."""
+        p = self.pattern
+        return _kernels.factorise(
+            self.blocks, self.links, self.cross, damping, self.num_poses, p.order, p.tops, p.rows, p.link_places,
+            p.cross_places, p.row_tops, p.row_columns, p.row_places, self.pivots, self.values,
         )  # fmt: skip
 
-    def factor(self, damping: float) -> FloatArray | None:
-        """Return U with U^T U = the matrix, its diagonal enlarged, in the matrix's place; None if there is none."""
-        if damping:
-            self.matrix[np.diag_indices(len(self.matrix))] *= 1.0 + damping
-        upper, info = lapack.dpotrf(self.matrix.T, lower=0, overwrite_a=1, clean=0)
-        return upper if info == 0 else None
+    def solve(self) -> FloatArray:
+        """Return the change (n + l, 3) of poses and landmarks that the equations ask for."""
+        p = self.pattern
+        return _kernels.solve(self.pivots, self.values, p.order, p.tops, p.rows, -self.vector)
 
-    def move(self, landmarks: FloatArray, change: FloatArray) -> None:
-        """Move landmarks (l, 3), in place, with a change (n,) of the poses from where the equations were formed."""
-        seen = self.sightings
-        _kernels.move_landmarks(
-            landmarks, self.columns, seen.keys, seen.starts, self.cross, self.spreads, self.forces, change
-        )
+    def draw(self, poses: FloatArray, num_paths: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+        """Return paths about poses (k, 3) and their log densities, see `Mode.paths`."""
+        p, seen = self.pattern, self.sightings
+        drawn = (p.order < self.num_poses) | (p.row_tops[1:] > p.row_tops[:-1])
+        normals = rng.standard_normal((int(drawn.sum()), 3, num_paths))
+        normals[:, :, 0] = 0.0
+        paths, log_densities = np.empty((len(poses), 3, num_paths)), np.empty(num_paths)
+        _kernels.draw(
+            normals, poses, self.columns, seen.keys, seen.starts, self.blocks, self.cross, self.pivots, self.values,
+            p.order, p.ranks, p.tops, p.rows, p.row_tops, paths, log_densities,
+        )  # fmt: skip
+        return paths, log_densities
+
+    def covariance(self, columns: IntArray) -> FloatArray:
+        """Return the joint covariance (3 r, 3 r) of poses by their columns (r,)."""
+        p, nodes = self.pattern, columns // 3
+        result = np.empty((3 * len(nodes), 3 * len(nodes)))
+        unit = np.zeros(self.vector.shape)
+        for place, node in enumerate(nodes):
+            for axis in range(3):
+                unit[node, axis] = 1.0
+                solved = _kernels.solve(self.pivots, self.values, p.order, p.tops, p.rows, unit)
+                result[:, 3 * place + axis] = solved[nodes].ravel()
+                unit[node, axis] = 0.0
+        return 0.5 * (result + result.T)
+
+    def spreads(self, poses: FloatArray) -> FloatArray:
+        """Return how far motions to each pose (k, 3) scatter, see `Mode.spreads`."""
+        p = self.pattern
+        return _kernels.scatter_of_links(
+            poses, self.columns, self.graph.previous, LEVER, self.pivots, self.values, p.order, p.ranks, p.tops,
+            p.rows, p.row_tops, p.link_places,
+        )  # fmt: skip

@@ -10,6 +10,7 @@ from slam_backend.run_log import RobotLog
 from slam_backend.smoothing.extending import extended
 from slam_backend.smoothing.graph import PathGraph
 from slam_backend.smoothing.options import SmoothingOptions
+from slam_backend.smoothing.solving import Mode
 from training.batch_problem import BatchProblem
 from training.stereo_runs import RunSpec, StereoRun, simulate_run
 
@@ -50,6 +51,12 @@ def graph_of(run: StereoRun, skip: tuple[int, ...] = ()) -> PathGraph:
     start = PathGraph.at_starts(run.true_paths[:, 0])
     logs = [log.arrays() for log in logs_of(run, skip)]
     return extended(start, logs, run.spec.noise.motion, np.array(run.spec.noise.camera.mount))
+
+
+def upper(mode: Mode) -> FloatArray:
+    """Return U with U^T U the information of all poses sought, landmarks integrated out, by columns of the mode."""
+    covariance = mode.covariance(np.flatnonzero(mode.columns >= 0))
+    return np.asarray(np.linalg.cholesky(np.linalg.inv(covariance)).T)
 
 
 def plain_cost(run: StereoRun, paths: FloatArray, landmarks: dict[int, FloatArray]) -> float:

@@ -13,7 +13,7 @@ from slam_backend.run_log import RobotLog
 from slam_backend.smoothing.bending import bend
 from slam_backend.smoothing.extending import extended
 from slam_backend.smoothing.graph import PathGraph
-from slam_backend.smoothing.sampling import _poses, _weighed, draw_paths
+from slam_backend.smoothing.sampling import _weighed, draw_paths
 from slam_backend.smoothing.solving import find_mode
 
 PREVIOUS = np.array([2, 0, 4, -1, 3, 0])  # a tree whose keys do not lie in the order of its branches
@@ -87,7 +87,7 @@ def wandering(turn: float) -> tuple[PathGraph, Any]:
 def test_where_only_odometry_knows_the_path_bent_paths_are_drawn_from_the_posterior_itself():
     """Headings uncertain by half a radian in the end: straight paths are nearly all refused, bent ones weigh alike."""
     graph, mode = wandering(turn=0.1)
-    poses, log_proposals = _poses(mode, 200, np.random.default_rng(1))
+    poses, log_proposals = mode.paths(200, np.random.default_rng(1))
     assert _weighed(graph, mode, poses, log_proposals).sample_size < 20.0
     draws = draw_paths(graph, mode, 200, np.random.default_rng(1))
     assert np.ptp(draws.log_weights) < 1e-3
@@ -102,4 +102,4 @@ def test_straight_paths_stay_where_they_serve():
     mode = find_mode(graph, camera_of(run), TIGHT)
     draws = draw_paths(graph, mode, 60, np.random.default_rng(2))
     assert draws.sample_size > 30.0
-    np.testing.assert_array_equal(draws.poses, _poses(mode, 60, np.random.default_rng(2))[0])
+    np.testing.assert_array_equal(draws.poses, mode.paths(60, np.random.default_rng(2))[0])

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from small_problems import TIGHT, camera_of, logs_of, small_run
+from small_problems import TIGHT, camera_of, logs_of, small_run, upper
 
 from slam_backend.geometry import between, compose
 from slam_backend.smoothing.extending import extended
@@ -41,7 +41,7 @@ def in_order(graph):
 
 def covariance(graph, mode):
     """Return the joint covariance of all sought poses, in the order of `in_order`."""
-    half = np.linalg.inv(np.triu(mode.factor))
+    half = np.linalg.inv(upper(mode))
     columns = mode.columns[in_order(graph)]
     rows = (columns[columns >= 0][:, None] + np.arange(3)).ravel()
     return (half @ half.T)[np.ix_(rows, rows)]
@@ -123,7 +123,7 @@ def test_groups_without_landmarks_that_fix_the_motion_lie_as_the_merge_said(comm
     both = joined(a, b, motion, np.concatenate([shared, own]), uncertainty)
     mode = find_mode(both, camera_of(run), TIGHT)
     assert mode.reason == ""
-    half = np.linalg.inv(np.triu(mode.factor))
+    half = np.linalg.inv(upper(mode))
     first = mode.columns[both.heads[1]] + np.arange(3)
     claimed = (half @ half.T)[np.ix_(first, first)]
     if common:

@@ -1,0 +1,15 @@
+"""Compiled inner loops of the smoother: forms of sightings, normal equations, their factor, many paths at a time."""
+
+from slam_backend.smoothing._kernels.drawing import draw
+from slam_backend.smoothing._kernels.equations import FREE, form
+from slam_backend.smoothing._kernels.factoring import factorise, solve
+from slam_backend.smoothing._kernels.forms import condense, invert
+from slam_backend.smoothing._kernels.gathering import gather
+from slam_backend.smoothing._kernels.ordering import lay_out, minimum_degree, neighbours
+from slam_backend.smoothing._kernels.paths import LANES, POSE_ROWS, WORK_ROWS, odometry_of_paths, replay
+from slam_backend.smoothing._kernels.scattering import scatter_of_links
+
+__all__ = [
+    "FREE", "LANES", "POSE_ROWS", "WORK_ROWS", "condense", "draw", "factorise", "form", "gather", "invert",
+    "lay_out", "minimum_degree", "neighbours", "odometry_of_paths", "replay", "scatter_of_links", "solve",
+]  # fmt: skip

@@ -1,0 +1,144 @@
+"""Normal equations of key poses and landmarks, by blocks of 3 x 3.
+
+A *node* is a pose that is sought or a landmark: first the poses, by their columns, then all landmarks. With A the
+derivatives of a landmark in the key's frame by the pose, in map axes A = [[-1, 0, dy], [0, -1, -dx], [0, 0, 0]], and L
+the information of a sighting turned into these, a sighting adds A^T L A to the key, L to the landmark, A^T L between.
+"""
+
+import math
+
+import numpy as np
+
+from slam_backend._jit import jit
+from slam_backend.errors import FloatArray, IntArray
+from slam_backend.smoothing._kernels.forms import _inverse, _spun
+
+FREE = -1  # column of a pose that is given, not sought
+# Information [1/m^2] of a landmark about where it stands now, 1 km along each axis: where all its sightings have lost
+# their weight nothing else holds it. It takes part in every step, and moves nothing that has come to rest.
+WEAK = 1e-6
+
+
+@jit
+def _wrapped(angle: float) -> float:
+    """Return an angle [rad] in [-pi, pi)."""
+    return angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
+
+
+@jit
+def form(
+    poses: FloatArray, landmarks: FloatArray, columns: IntArray, previous: IntArray, motions: FloatArray,
+    link_infos: FloatArray, keys: IntArray, starts: IntArray, centres: FloatArray, infos: FloatArray,
+    slopes: FloatArray, blocks: FloatArray, links: FloatArray, cross: FloatArray, vector: FloatArray,
+) -> tuple[float, float]:  # fmt: skip
+    """Write the normal equations of n poses and l landmarks.
+
+    Args:
+        poses, landmarks: (k, 3), (l, 3) where to linearise.
+        columns: (k,) first row of each pose among those sought, `FREE` if it is given.
+        previous: (k,) key that odometry comes from, -1 for none. motions, link_infos: (k, 3), (k, 3, 3) that odometry,
+            in the frame of the previous key, and its information.
+        keys, starts: (s,) key of each sighting; those of landmark i are starts[i] to starts[i + 1].
+        centres, infos, slopes: Of the sightings.
+        blocks: (n + l, 6), result: second derivatives by each node.
+        links: (k, 3, 3), result: by a key (rows) and the one before (columns), where both are sought.
+        cross: (s, 3, 3), result: by pose (rows) and landmark (columns), where the pose is sought.
+        vector: (n + l, 3), result: slope of the cost.
+
+    Returns:
+        Half the sum of squares of odometry, and of frozen sightings' forms up to a constant; infinite if a landmark is
+        at no finite place. And by how much the cost would fall if landmarks alone moved.
+    """
+    blocks[:] = 0.0
+    vector[:] = 0.0
+    cost = 0.0
+    cosines, sines = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    f, g, h = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    r = np.empty(3)
+    for b in range(len(poses)):  # odometry
+        a = previous[b]
+        if a < 0:
+            continue
+        c, s = cosines[a], sines[a]
+        dx, dy = poses[b, 0] - poses[a, 0], poses[b, 1] - poses[a, 1]
+        mx, my = c * dx + s * dy, -s * dx + c * dy
+        r[0], r[1] = mx - motions[b, 0], my - motions[b, 1]
+        r[2] = _wrapped(poses[b, 2] - poses[a, 2] - motions[b, 2])
+        g[:] = 0.0
+        g[0, 0], g[0, 1], g[1, 0], g[1, 1], g[2, 2] = c, s, -s, c, 1.0
+        f[:] = -g
+        f[0, 2], f[1, 2] = my, -mx
+        w = link_infos[b]
+        for side in range(2):
+            column = columns[b] if side else columns[a]
+            if column < 0:
+                continue
+            own = column // 3
+            left = g if side else f
+            for i in range(3):
+                for j in range(3):
+                    h[i, j] = left[0, i] * w[0, j] + left[1, i] * w[1, j] + left[2, i] * w[2, j]
+            at = 0
+            for i in range(3):
+                vector[own, i] += h[i, 0] * r[0] + h[i, 1] * r[1] + h[i, 2] * r[2]
+                for j in range(i, 3):
+                    blocks[own, at] += h[i, 0] * left[0, j] + h[i, 1] * left[1, j] + h[i, 2] * left[2, j]
+                    at += 1
+            if side and columns[a] >= 0:
+                for i in range(3):
+                    for j in range(3):
+                        links[b, i, j] = h[i, 0] * f[0, j] + h[i, 1] * f[1, j] + h[i, 2] * f[2, j]
+        for i in range(3):
+            for j in range(3):
+                cost += 0.5 * r[i] * w[i, j] * r[j]
+    first_landmark = len(blocks) - len(landmarks)
+    turned, p = np.empty(6), np.empty(6)
+    eased = 0.0
+    for landmark in range(len(landmarks)):
+        first, last = starts[landmark], starts[landmark + 1]
+        block, force = blocks[first_landmark + landmark], vector[first_landmark + landmark]
+        block[0] = block[3] = block[5] = WEAK
+        for q in range(first, last):
+            key = keys[q]
+            c, s = cosines[key], sines[key]
+            dx, dy = landmarks[landmark, 0] - poses[key, 0], landmarks[landmark, 1] - poses[key, 1]
+            u0 = c * dx + s * dy - centres[q, 0]
+            u1 = -s * dx + c * dy - centres[q, 1]
+            u2 = landmarks[landmark, 2] - centres[q, 2]
+            n = infos[q]
+            l0 = n[0] * u0 + n[1] * u1 + n[2] * u2
+            l1 = n[1] * u0 + n[3] * u1 + n[4] * u2
+            l2 = n[2] * u0 + n[4] * u1 + n[5] * u2
+            cost += u0 * (0.5 * l0 - slopes[q, 0]) + u1 * (0.5 * l1 - slopes[q, 1]) + u2 * (0.5 * l2 - slopes[q, 2])
+            e0, e1, e2 = l0 - slopes[q, 0], l1 - slopes[q, 1], l2 - slopes[q, 2]
+            m0, m1 = c * e0 - s * e1, s * e0 + c * e1
+            force[0] += m0
+            force[1] += m1
+            force[2] += e2
+            _spun(c, s, n, turned)
+            for i in range(6):
+                block[i] += turned[i]
+            if columns[key] < 0:
+                continue
+            own = columns[key] // 3
+            x, mine = cross[q], blocks[own]
+            x[0, 0], x[0, 1], x[0, 2] = -turned[0], -turned[1], -turned[2]
+            x[1, 0], x[1, 1], x[1, 2] = -turned[1], -turned[3], -turned[4]
+            x[2, 0] = dy * turned[0] - dx * turned[1]
+            x[2, 1] = dy * turned[1] - dx * turned[3]
+            x[2, 2] = dy * turned[2] - dx * turned[4]
+            vector[own, 0] -= m0
+            vector[own, 1] -= m1
+            vector[own, 2] += dy * m0 - dx * m1
+            mine[0] += turned[0]
+            mine[1] += turned[1]
+            mine[2] -= x[2, 0]
+            mine[3] += turned[3]
+            mine[4] -= x[2, 1]
+            mine[5] += dy * x[2, 0] - dx * x[2, 1]
+        if not _inverse(block, p) > 0.0:
+            return np.inf, 0.0
+        m0, m1, m2 = force[0], force[1], force[2]
+        eased += 0.5 * (p[0] * m0 * m0 + p[3] * m1 * m1 + p[5] * m2 * m2)
+        eased += p[1] * m0 * m1 + p[2] * m0 * m2 + p[4] * m1 * m2
+    return cost, eased

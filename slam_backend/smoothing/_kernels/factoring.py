@@ -1,0 +1,141 @@
+"""Cholesky's factor of the normal equations by blocks of 3 x 3, and solutions.
+
+Blocks are kept as `ordering.lay_out` says, each as nine numbers row by row. A pivot is a lower triangle, by rows, with
+the reciprocals of its diagonal (6).
+"""
+
+import math
+
+import numpy as np
+
+from slam_backend._jit import inlined, jit
+from slam_backend.errors import FloatArray, IntArray
+
+
+@inlined
+def _added(values: FloatArray, place: int, block: FloatArray) -> None:
+    """Add a block (3, 3) where `lay_out` says."""
+    if place == 0:
+        return
+    out = values[abs(place) - 1]
+    for i in range(3):
+        for j in range(3):
+            if place > 0:
+                out[3 * i + j] += block[i, j]
+            else:
+                out[3 * j + i] += block[i, j]
+
+
+@jit
+def factorise(
+    blocks: FloatArray, links: FloatArray, cross: FloatArray, damping: float, num_poses: int, order: IntArray,
+    tops: IntArray, rows: IntArray, link_places: IntArray, cross_places: IntArray, row_tops: IntArray,
+    row_columns: IntArray, row_places: IntArray, pivots: FloatArray, values: FloatArray,
+) -> bool:  # fmt: skip
+    """Write the factor of the normal equations, column by column from those to the left; False if there is none.
+
+    Args:
+        blocks, links, cross: As `form` wrote them.
+        damping: The diagonal of each pose is enlarged by this share.
+        num_poses: The nodes before this one are poses.
+        order, tops, rows, link_places, cross_places, row_tops, row_columns, row_places: As of `lay_out`.
+        pivots, values: (N, 6), (filled, 9), results.
+    """
+    num = len(order)
+    values[:] = 0.0
+    for b in range(len(link_places)):
+        _added(values, link_places[b], links[b])
+    for q in range(len(cross_places)):
+        _added(values, cross_places[q], cross[q])
+    where = np.empty(num, dtype=np.int64)
+    for j in range(num):
+        node = order[j]
+        first, last = tops[j], tops[j + 1]
+        for p in range(first, last):
+            where[rows[p]] = p
+        d00, d10, d20 = blocks[node, 0], blocks[node, 1], blocks[node, 2]
+        d11, d21, d22 = blocks[node, 3], blocks[node, 4], blocks[node, 5]
+        if node < num_poses:
+            d00, d11, d22 = d00 + damping * d00, d11 + damping * d11, d22 + damping * d22
+        for n in range(row_tops[j], row_tops[j + 1]):
+            p = row_places[n]
+            m = values[p]
+            m0, m1, m2, m3, m4, m5, m6, m7, m8 = m[0], m[1], m[2], m[3], m[4], m[5], m[6], m[7], m[8]
+            d00 -= m0 * m0 + m1 * m1 + m2 * m2
+            d10 -= m3 * m0 + m4 * m1 + m5 * m2
+            d20 -= m6 * m0 + m7 * m1 + m8 * m2
+            d11 -= m3 * m3 + m4 * m4 + m5 * m5
+            d21 -= m6 * m3 + m7 * m4 + m8 * m5
+            d22 -= m6 * m6 + m7 * m7 + m8 * m8
+            for o in range(p + 1, tops[row_columns[n] + 1]):
+                v, out = values[o], values[where[rows[o]]]
+                for i in range(0, 9, 3):
+                    v0, v1, v2 = v[i], v[i + 1], v[i + 2]
+                    out[i] -= v0 * m0 + v1 * m1 + v2 * m2
+                    out[i + 1] -= v0 * m3 + v1 * m4 + v2 * m5
+                    out[i + 2] -= v0 * m6 + v1 * m7 + v2 * m8
+        if not d00 > 0.0:
+            return False
+        i0 = 1.0 / math.sqrt(d00)
+        l10, l20 = d10 * i0, d20 * i0
+        d11 -= l10 * l10
+        if not d11 > 0.0:
+            return False
+        i1 = 1.0 / math.sqrt(d11)
+        l21 = (d21 - l20 * l10) * i1
+        d22 -= l20 * l20 + l21 * l21
+        if not d22 > 0.0:
+            return False
+        i2 = 1.0 / math.sqrt(d22)
+        pivot = pivots[j]
+        pivot[0], pivot[1], pivot[2], pivot[3], pivot[4], pivot[5] = i0, l10, i1, l20, l21, i2
+        for p in range(first, last):
+            v = values[p]
+            for i in range(0, 9, 3):
+                v0 = v[i] * i0
+                v1 = (v[i + 1] - v0 * l10) * i1
+                v[i], v[i + 1] = v0, v1
+                v[i + 2] = (v[i + 2] - v0 * l20 - v1 * l21) * i2
+    return True
+
+
+@jit
+def solve(
+    pivots: FloatArray, values: FloatArray, order: IntArray, tops: IntArray, rows: IntArray, vector: FloatArray
+) -> FloatArray:
+    """Return the x (N, 3) with (normal equations) x = vector (N, 3), both by node.
+
+    Args:
+        pivots, values: As `factorise` wrote them.
+        order, tops, rows: As of `lay_out`.
+        vector: (N, 3).
+    """
+    num = len(order)
+    x, result = np.empty((num, 3)), np.empty((num, 3))
+    for j in range(num):
+        x[j] = vector[order[j]]
+    for j in range(num):
+        pivot = pivots[j]
+        x0 = x[j, 0] * pivot[0]
+        x1 = (x[j, 1] - pivot[1] * x0) * pivot[2]
+        x2 = (x[j, 2] - pivot[3] * x0 - pivot[4] * x1) * pivot[5]
+        x[j, 0], x[j, 1], x[j, 2] = x0, x1, x2
+        for p in range(tops[j], tops[j + 1]):
+            v, out = values[p], x[rows[p]]
+            out[0] -= v[0] * x0 + v[1] * x1 + v[2] * x2
+            out[1] -= v[3] * x0 + v[4] * x1 + v[5] * x2
+            out[2] -= v[6] * x0 + v[7] * x1 + v[8] * x2
+    for j in range(num - 1, -1, -1):
+        x0, x1, x2 = x[j, 0], x[j, 1], x[j, 2]
+        for p in range(tops[j], tops[j + 1]):
+            v, y = values[p], x[rows[p]]
+            x0 -= v[0] * y[0] + v[3] * y[1] + v[6] * y[2]
+            x1 -= v[1] * y[0] + v[4] * y[1] + v[7] * y[2]
+            x2 -= v[2] * y[0] + v[5] * y[1] + v[8] * y[2]
+        pivot = pivots[j]
+        x2 *= pivot[5]
+        x1 = (x1 - pivot[4] * x2) * pivot[2]
+        x0 = (x0 - pivot[1] * x1 - pivot[3] * x2) * pivot[0]
+        x[j, 0], x[j, 1], x[j, 2] = x0, x1, x2
+        result[order[j], 0], result[order[j], 1], result[order[j], 2] = x0, x1, x2
+    return result

@@ -1,0 +1,145 @@
+"""Many paths at a time, in blocks of lanes: their landmarks, their odometry, and how rigid they are."""
+
+import math
+
+from slam_backend._jit import lanes
+from slam_backend.errors import FloatArray, IntArray
+from slam_backend.smoothing._kernels.equations import WEAK
+
+LANES = 64
+
+# Rows of a block of poses and of the workspace of `replay`.
+PX, PY, COS, SIN, HEADING = (LANES * k for k in range(5))
+POSE_ROWS = 5
+A00, A01, A02, A11, A12, A22, B0, B1, B2, ENERGY = (LANES * k for k in range(10))
+WORK_ROWS = 10
+
+
+@lanes
+def replay(
+    poses: FloatArray, num_keys: int, num_blocks: int, landmarks: FloatArray, keys: IntArray, starts: IntArray,
+    centres: FloatArray, infos: FloatArray, slopes: FloatArray, work: FloatArray, tiles: FloatArray,
+    log_likelihood: FloatArray,
+) -> None:  # fmt: skip
+    """Give each path the landmarks that its sightings ask for, and the log-likelihood of these, up to a constant.
+
+    Args:
+        poses: (num_blocks * num_keys * 5 * LANES,) x, y, cos, sin, heading of each block and key.
+        num_keys, num_blocks: k, and the number of blocks of lanes.
+        landmarks: (l, 3) about which forms are evaluated, map frame.
+        keys, starts, centres, infos, slopes: Sightings, those of landmark i are starts[i] to starts[i + 1].
+        work: (WORK_ROWS * LANES,) room.
+        tiles: (l * num_blocks * 9 * LANES,), result: mean (3) and covariance (6) per lane. Landmarks without sightings
+            are left alone.
+        log_likelihood: (num_blocks * LANES,), result.
+    """
+    log_likelihood[:] = 0.0
+    for landmark in range(len(landmarks)):
+        first, last = starts[landmark], starts[landmark + 1]
+        if first == last:
+            continue
+        x, y, z = landmarks[landmark, 0], landmarks[landmark, 1], landmarks[landmark, 2]
+        for block in range(num_blocks):
+            for i in range(WORK_ROWS * LANES):
+                work[i] = 0.0
+            for i in range(LANES):
+                work[A00 + i] = work[A11 + i] = work[A22 + i] = WEAK
+            for q in range(first, last):
+                base = (block * num_keys + keys[q]) * POSE_ROWS * LANES
+                pose = poses[base : base + POSE_ROWS * LANES]
+                o0, o1, o2 = centres[q, 0], centres[q, 1], centres[q, 2]
+                n0, n1, n2, n3, n4, n5 = infos[q, 0], infos[q, 1], infos[q, 2], infos[q, 3], infos[q, 4], infos[q, 5]
+                g0, g1, g2 = slopes[q, 0], slopes[q, 1], slopes[q, 2]
+                for i in range(LANES):
+                    c, s = pose[COS + i], pose[SIN + i]
+                    dx, dy = x - pose[PX + i], y - pose[PY + i]
+                    u0, u1, u2 = c * dx + s * dy - o0, c * dy - s * dx - o1, z - o2
+                    l0 = n0 * u0 + n1 * u1 + n2 * u2
+                    l1 = n1 * u0 + n3 * u1 + n4 * u2
+                    l2 = n2 * u0 + n4 * u1 + n5 * u2
+                    work[ENERGY + i] += u0 * (0.5 * l0 - g0) + u1 * (0.5 * l1 - g1) + u2 * (0.5 * l2 - g2)
+                    e0, e1 = l0 - g0, l1 - g1
+                    work[B0 + i] += c * e0 - s * e1
+                    work[B1 + i] += s * e0 + c * e1
+                    work[B2 + i] += l2 - g2
+                    work[A00 + i] += c * c * n0 - 2.0 * c * s * n1 + s * s * n3
+                    work[A01 + i] += c * s * (n0 - n3) + (c * c - s * s) * n1
+                    work[A02 + i] += c * n2 - s * n4
+                    work[A11 + i] += s * s * n0 + 2.0 * c * s * n1 + c * c * n3
+                    work[A12 + i] += s * n2 + c * n4
+                    work[A22 + i] += n5
+            base = (landmark * num_blocks + block) * 9 * LANES
+            tile = tiles[base : base + 9 * LANES]
+            out = log_likelihood[block * LANES : (block + 1) * LANES]
+            for i in range(LANES):
+                a, b, d = work[A00 + i], work[A01 + i], work[A02 + i]
+                e, f, h = work[A11 + i], work[A12 + i], work[A22 + i]
+                p, q1, r = e * h - f * f, d * f - b * h, b * f - d * e
+                det = a * p + b * q1 + d * r
+                inverse = 1.0 / det
+                s00, s01, s02 = p * inverse, q1 * inverse, r * inverse
+                s11, s12, s22 = (a * h - d * d) * inverse, (b * d - a * f) * inverse, (a * e - b * b) * inverse
+                b0, b1, b2 = work[B0 + i], work[B1 + i], work[B2 + i]
+                m0 = s00 * b0 + s01 * b1 + s02 * b2
+                m1 = s01 * b0 + s11 * b1 + s12 * b2
+                m2 = s02 * b0 + s12 * b1 + s22 * b2
+                tile[i] = x - m0
+                tile[LANES + i] = y - m1
+                tile[2 * LANES + i] = z - m2
+                tile[3 * LANES + i], tile[4 * LANES + i], tile[5 * LANES + i] = s00, s01, s02
+                tile[6 * LANES + i], tile[7 * LANES + i], tile[8 * LANES + i] = s11, s12, s22
+                work[ENERGY + i] = 0.5 * (b0 * m0 + b1 * m1 + b2 * m2) - work[ENERGY + i]
+                work[A00 + i] = det
+            for i in range(LANES):
+                out[i] += work[ENERGY + i] - 0.5 * math.log(work[A00 + i])
+
+
+@lanes
+def odometry_of_paths(
+    poses: FloatArray, num_keys: int, num_blocks: int, num_paths: int, previous: IntArray, mode: FloatArray,
+    motions: FloatArray, infos: FloatArray, lever: float, log_density: FloatArray, spreads: FloatArray,
+) -> None:  # fmt: skip
+    """Weigh paths by odometry, and say how rigid they are from each key to the next.
+
+    Args:
+        poses, num_keys, num_blocks: As in `replay`.
+        num_paths: M; the lanes after these are copies.
+        previous, motions, infos: (k,), (k, 3), (k, 3, 3) odometry from the previous key and its information.
+        mode: (k, 3) motion from the previous key in the most probable path.
+        lever: [m] At which an error of the heading counts.
+        log_density: (num_blocks * LANES,), result: log p(path given odometry) up to a constant.
+        spreads: (k,), result [m^2]: mean square of what the motion from the previous key differs from that of the mode.
+    """
+    log_density[:] = 0.0
+    for b in range(num_keys):
+        a = previous[b]
+        spreads[b] = 0.0
+        if a < 0:
+            continue
+        u0, u1, u2 = motions[b, 0], motions[b, 1], motions[b, 2]
+        d0, d1, d2 = mode[b, 0] - u0, mode[b, 1] - u1, mode[b, 2] - u2
+        w = infos[b]
+        w00, w01, w02, w11, w12, w22 = w[0, 0], w[0, 1], w[0, 2], w[1, 1], w[1, 2], w[2, 2]
+        total = 0.0
+        for block in range(num_blocks):
+            base_a, base_b = (block * num_keys + a) * POSE_ROWS * LANES, (block * num_keys + b) * POSE_ROWS * LANES
+            first = poses[base_a : base_a + POSE_ROWS * LANES]
+            second = poses[base_b : base_b + POSE_ROWS * LANES]
+            out = log_density[block * LANES : (block + 1) * LANES]
+            for i in range(LANES):
+                c, s = first[COS + i], first[SIN + i]
+                dx, dy = second[PX + i] - first[PX + i], second[PY + i] - first[PY + i]
+                r0, r1 = c * dx + s * dy - u0, c * dy - s * dx - u1
+                r2 = second[HEADING + i] - first[HEADING + i] - u2
+                r2 = r2 - 2.0 * math.pi * math.floor((r2 + math.pi) / (2.0 * math.pi))
+                out[i] -= 0.5 * (w00 * r0 * r0 + w11 * r1 * r1 + w22 * r2 * r2) + (
+                    w01 * r0 * r1 + w02 * r0 * r2 + w12 * r1 * r2
+                )
+            for i in range(min(LANES, num_paths - block * LANES)):
+                c, s = first[COS + i], first[SIN + i]
+                dx, dy = second[PX + i] - first[PX + i], second[PY + i] - first[PY + i]
+                r0, r1 = c * dx + s * dy - u0 - d0, c * dy - s * dx - u1 - d1
+                r2 = second[HEADING + i] - first[HEADING + i] - u2 - d2
+                r2 = r2 - 2.0 * math.pi * math.floor((r2 + math.pi) / (2.0 * math.pi))
+                total += r0 * r0 + r1 * r1 + lever * lever * r2 * r2
+        spreads[b] = total / num_paths

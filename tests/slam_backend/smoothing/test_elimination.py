@@ -1,0 +1,186 @@
+"""The sparse factorisation against dense matrices: its order, solutions, covariances, spreads and draws."""
+
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from small_problems import TIGHT, camera_of, graph_of, small_run
+
+from slam_backend.errors import FloatArray
+from slam_backend.geometry import between
+from slam_backend.smoothing import _kernels
+from slam_backend.smoothing.coarsening import at_mode, coarsened
+from slam_backend.smoothing.graph import LEVER, PathGraph
+from slam_backend.smoothing.options import SmoothingOptions
+from slam_backend.smoothing.sightings import Sightings
+from slam_backend.smoothing.solving import Mode, find_mode
+
+
+class Problem(NamedTuple):
+    """A graph, its mode, and the dense information of its poses and landmarks, (N, 3, N, 3)."""
+
+    graph: PathGraph
+    mode: Mode
+    dense: FloatArray
+
+
+def problem(robots: int, max_keys: int) -> Problem:
+    """Return one of each kind: raw and frozen sightings, poses that are given, landmarks that poses share."""
+    run = small_run(robots)
+    camera = camera_of(run)
+    options = SmoothingOptions(max_keys=max_keys, further_keys=0, fresh_keys=6, kernel=0.0)
+    graph = graph_of(run)
+    mode = find_mode(graph, camera, TIGHT)
+    graph = coarsened(at_mode(graph, mode, mode.spreads()), camera, options)
+    mode = find_mode(graph, camera, TIGHT)
+    system, seen = mode.system, mode.sightings
+    assert system is not None
+    n = system.num_poses
+    size = n + len(graph.landmarks)
+    dense = np.zeros((size, 3, size, 3))
+    for node, block in enumerate(system.blocks):
+        dense[node, :, node] = block[[[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
+    for b, a in enumerate(graph.previous):
+        if a >= 0 and min(mode.columns[a], mode.columns[b]) >= 0:
+            i, j = mode.columns[[b, a]] // 3
+            dense[i, :, j], dense[j, :, i] = system.links[b], system.links[b].T
+    for q, (key, landmark) in enumerate(zip(seen.keys, seen.landmarks, strict=True)):
+        if mode.columns[key] >= 0:
+            i, j = mode.columns[key] // 3, n + landmark
+            dense[i, :, j] += system.cross[q]
+            dense[j, :, i] += system.cross[q].T
+    return Problem(graph, mode, dense)
+
+
+PROBLEMS = {"one robot": problem(1, 12), "two robots": problem(2, 1000)}
+
+
+@pytest.fixture(params=PROBLEMS)
+def posed(request: pytest.FixtureRequest) -> Problem:
+    """Return each of them in turn."""
+    return PROBLEMS[request.param]
+
+
+def information(posed: Problem) -> FloatArray:
+    """Return that of the poses (3 n, 3 n), landmarks integrated out as one learns it."""
+    assert posed.mode.system is not None
+    size = posed.dense.shape[0] * 3
+    whole, n = posed.dense.reshape(size, size), 3 * posed.mode.system.num_poses
+    return np.asarray(whole[:n, :n] - whole[:n, n:] @ np.linalg.solve(whole[n:, n:], whole[n:, :n]))
+
+
+def test_a_node_with_the_fewest_neighbours_goes_first(posed):
+    """The order is that of the textbook with sets for neighbours, and so is what it fills in."""
+    size = len(posed.dense)
+    near = [set(np.flatnonzero(row)) - {i} for i, row in enumerate(np.abs(posed.dense).sum(axis=(1, 3)) > 0)]
+    words = np.zeros((size, -(-size // 64)), dtype=np.uint64)
+    for node, others in enumerate(near):
+        for other in others:
+            words[node, other // 64] |= np.uint64(1) << np.uint64(other % 64)
+    order = np.empty(size, dtype=np.int64)
+    filled = _kernels.minimum_degree(words, order)
+    assert sorted(order.tolist()) == list(range(size))
+    left, count = set(range(size)), 0
+    for node in order.tolist():
+        assert len(near[node]) == min(len(near[other]) for other in left)
+        left.remove(node)
+        count += len(near[node])
+        for other in near[node]:
+            near[other] = (near[other] | near[node]) - {other, node}
+    assert filled == count
+    assert posed.mode.system is not None
+    assert len(posed.mode.system.pattern.rows) == count
+
+
+@pytest.mark.parametrize("damping", [0.0, 0.3])
+def test_the_solution_is_the_dense_one(posed, damping):
+    """Factored block by block, the damped equations have the solution that numpy finds."""
+    system, dense = posed.mode.system, posed.dense.copy()
+    assert system is not None
+    size = 3 * len(dense)
+    whole = dense.reshape(size, size)
+    each = np.arange(3 * system.num_poses)
+    whole[each, each] *= 1.0 + damping
+    assert system.factor(damping)
+    found = system.solve()
+    assert system.factor(0.0)
+    np.testing.assert_allclose(found.ravel(), -np.linalg.solve(whole, system.vector.ravel()), rtol=1e-6, atol=1e-12)
+
+
+def test_what_is_not_positive_definite_has_no_factor(posed):
+    """A node of negative information anywhere is told."""
+    system = posed.mode.system
+    assert system is not None
+    for node in (0, len(system.blocks) - 1):
+        kept = system.blocks[node].copy()
+        system.blocks[node] = -kept
+        assert not system.factor(0.0)
+        system.blocks[node] = kept
+    assert system.factor(0.0)
+
+
+def test_covariances_of_poses_are_the_dense_ones(posed):
+    """The inverse of the information with all landmarks integrated out."""
+    found = posed.mode.covariance(np.flatnonzero(posed.mode.columns >= 0))
+    np.testing.assert_allclose(found @ information(posed), np.eye(len(found)), atol=1e-6)
+
+
+def test_spreads_are_those_of_the_dense_covariance(posed):
+    """Derivatives of motions by differences, and the dense inverse, give how far each motion scatters."""
+    graph, mode = posed.graph, posed.mode
+    covariance, found = np.linalg.inv(information(posed)), mode.spreads()
+    for b, a in enumerate(graph.previous):
+        if a < 0:
+            assert found[b] == 0.0
+            continue
+        rows, columns = [], []
+        for key in (a, b):
+            for axis in range(3 if mode.columns[key] >= 0 else 0):
+                ahead, behind = mode.poses.copy(), mode.poses.copy()
+                ahead[key, axis] += 1e-6
+                behind[key, axis] -= 1e-6
+                columns.append((between(ahead[a], ahead[b]) - between(behind[a], behind[b])) / 2e-6)
+                rows.append(mode.columns[key] + axis)
+        by = np.array(columns).T
+        scatter = np.diag(by @ covariance[np.ix_(rows, rows)] @ by.T)
+        assert found[b] == pytest.approx(scatter[0] + scatter[1] + LEVER**2 * scatter[2], rel=1e-5)
+
+
+def test_densities_of_paths_are_the_dense_ones(posed):
+    """Though some landmarks are drawn with the poses, log q is that of the path alone."""
+    mode = posed.mode
+    paths, log_densities = mode.paths(40, np.random.default_rng(3))
+    off = (paths - mode.poses[:, :, None])[mode.columns >= 0].reshape(-1, 40)
+    expected = -0.5 * np.einsum("im,ij,jm->m", off, information(posed), off)
+    np.testing.assert_allclose(log_densities - log_densities[0], expected - expected[0], rtol=1e-6, atol=1e-6)
+    assert np.ptp(expected) > 1.0
+    np.testing.assert_array_equal(paths[:, :, 0], mode.poses)
+
+
+def test_sightings_are_gathered_as_by_sorting():
+    """Frozen sightings and raw measurements, in no order, are put in that of landmarks and keys, and added up."""
+    rng = np.random.default_rng(4)
+    keys, landmarks, frames = 5, 4, 9
+    frozen = np.sort(rng.choice(keys * landmarks, 8, replace=False))
+    graph = PathGraph(
+        robots=np.zeros(keys, dtype=np.int64), poses=np.zeros((keys, 3)), landmarks=np.zeros((landmarks, 3)),
+        landmark_ids=np.arange(landmarks), heads=np.zeros(1, dtype=np.int64), tips=np.zeros(1, dtype=np.int64),
+        latest=np.zeros(1, dtype=np.int64), frozen_keys=frozen % keys, frozen_landmarks=frozen // keys,
+        centres=rng.normal(size=(8, 3)), infos=rng.normal(size=(8, 6)), slopes=rng.normal(size=(8, 3)),
+        counts=rng.integers(1, 5, 8), frame_keys=rng.integers(0, keys, frames), points=np.zeros((60, 3)),
+        point_frames=rng.integers(0, frames, 60), point_landmarks=rng.integers(0, landmarks, 60),
+    )  # fmt: skip
+    seen = Sightings.of(graph)
+    of_raw = graph.point_landmarks * keys + graph.frame_keys[graph.point_frames]
+    raw, counts = np.unique(of_raw, return_counts=True)
+    codes = seen.landmarks * keys + seen.keys
+    np.testing.assert_array_equal(codes, np.sort(np.concatenate([frozen, raw]), kind="stable"))
+    np.testing.assert_array_equal(codes[seen.frozen], frozen)
+    np.testing.assert_array_equal(codes[seen.of_points], of_raw)
+    assert not seen.frozen[seen.of_points].any()
+    np.testing.assert_array_equal(seen.counts[seen.frozen], graph.counts)
+    np.testing.assert_array_equal(seen.counts[~seen.frozen], counts)
+    np.testing.assert_array_equal(seen.starts, np.searchsorted(seen.landmarks, np.arange(landmarks + 1)))
+    for name in ("centres", "infos", "slopes"):
+        np.testing.assert_array_equal(getattr(seen, name)[seen.frozen], getattr(graph, name))
+        assert not getattr(seen, name)[~seen.frozen].any()
