@@ -2,7 +2,7 @@
 
 Pairs are taken in blocks of `WIDTH`, of which all that is read lies together: one record of `RECORD` rows per landmark,
 each row one number of each pair. Loops over a row are plain arithmetic, which the compiler turns into vector
-instructions. What `_pairing` says of chi^2 and tau^2 holds here; the plain form of it all stands in the tests.
+instructions. What `merging` says of chi^2 and tau^2 holds here; the plain form of it all stands in the tests.
 """
 
 import math

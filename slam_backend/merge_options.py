@@ -18,8 +18,8 @@ class MergeOptions:
             that all particles share (Sec. 3.2, see `docs/errata.md`).
         merged_particles: Of the joint filter; None: as many as the larger of the two.
         straighten: Before a merge both sides' particles are drawn anew from the posterior of whole paths
-            (`FastSlam.rejuvenate`), and their maps have to align once more. False: maps are taken as the filters bent
-            them.
+            (`FastSlam.rejuvenate`; over some steps, where smoothers work in slices), and their maps have to align once
+            more. False: maps are taken as the filters bent them.
         sure: An attempt is refused, as long as waiting helps, while so many standard deviations of the motion among the
             particles that the merge would make reach 0.5 m or 5 degrees; 0: never for that.
         watch_steps: A merge is watched for so many steps in which robots of both sides are in contact, and can be
