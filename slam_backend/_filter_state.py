@@ -18,10 +18,11 @@ from slam_backend.errors import FloatArray, IntArray, bad_argument, check_int, c
 from slam_backend.filter_options import FilterOptions
 from slam_backend.reports import PoseEstimate, StepReport
 from slam_backend.run_log import RobotLog
+from slam_backend.smoothing.holding import add_share
 from slam_backend.smoothing.rejuvenation import Particles
 
 POSES = ("_poses", "_starts", "_means", "_covariances")  # (K, 3 or 6, P), of each robot
-KEPT = (*POSES, "_blind", "_log_weights", "_path_log_weights", "_weights")
+KEPT = (*POSES, "_frame", "_blind", "_log_weights", "_path_log_weights", "_weights")
 OTHERS_KEPT = ("steps", "estimates", "maps", "logs", "options", "rng")
 
 
@@ -36,6 +37,8 @@ class FilterState:
         _poses: (K, 3, P) float64 [m, m, rad]. Of each robot (x_t^[m]).
         _starts: (K, 3, P) likewise. Where each robot started; spreads at a merge.
         _means, _covariances: (K, 3, P), (K, 6, P). N(x^, P^) of each particle before sampling.
+        _frame: (3, 3) float64 [m, m, rad]. Covariance of a motion of the whole map that the particles do not show, as
+            their frame was held when they were drawn anew; estimates have their share of it.
         _blind: (K,) bool. Whether that was propagated since the last sighting.
         _log_weights: (M,) since the last resampling, normalised; `_weights` (M,) as the last step left them.
         _path_log_weights: (M,) accumulated along the ancestral line (Eq. 12).
@@ -63,6 +66,7 @@ class FilterState:
         self._starts = aligned((k, 3, padded), np.float64)
         self._means = aligned((k, 3, padded), np.float64)
         self._covariances = aligned((k, 6, padded), np.float64)
+        self._frame = np.zeros((3, 3))
         self._blind = np.zeros(k, dtype=np.bool_)
         self._log_weights = np.full(m, -np.log(m))
         self._path_log_weights = np.zeros(m)
@@ -91,6 +95,12 @@ class FilterState:
         """Return a robot's pose over all particles, map frame."""
         return pose_mixture(self._means[robot], self._covariances[robot], self._weights)
 
+    def _widen(self) -> None:
+        """Give the estimates of the poses, as the particles show them, their share of what these do not show."""
+        if self._frame.any():
+            for estimate in self._estimates:
+                add_share(self._frame, estimate.mean[None], estimate.covariance[None])
+
     # ------------------------------------------------------------------ other particles, other robots
 
     def _become(self, ancestors: IntArray) -> None:
@@ -113,6 +123,7 @@ class FilterState:
         self._poses[:, :, :m], self._starts[:, :, :m] = new.poses, new.starts
         self._means[:] = self._poses
         self._covariances.fill(0.0)
+        self._frame[:] = new.frame
         self._blind.fill(False)
         self._log_weights[:], self._path_log_weights[:] = new.log_weights, new.log_densities
         self._weights[:] = np.exp(new.log_weights)
@@ -140,6 +151,8 @@ class FilterState:
     ) -> None:
         """Log what the robots did and measured in the step before `_steps`, and what that was taken for."""
         for robot, turn in enumerate(turns):
+            if exact[robot] is not None:
+                self._frame.fill(0.0)  # it is known now
             if turn.size or moves[robot] is not None or exact[robot] is not None:
                 ids = report.associations[robot]
                 self._logs[robot].append(

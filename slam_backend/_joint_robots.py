@@ -28,6 +28,7 @@ def joined_robots(
     )
     _join_poses(joint, a, from_a, b, from_b, motion)
     joint._blind[:] = np.concatenate([a._blind, b._blind])
+    joint._frame[:] = a._frame
     return joint
 
 
@@ -52,7 +53,10 @@ def finish(joint: FastSlam, a: FastSlam, b: FastSlam, renamed: IntArray) -> None
     """Give a joint filter, whose map is loaded, its step count, estimates and logs; `renamed` as of `merge_filters`."""
     joint._steps = max(a._steps, b._steps)
     joint._estimates = [joint._mixture(robot) for robot in range(joint.num_robots)]
+    joint._widen()
     joint._logs = [log.copy() for log in a._logs] + [log.renamed(renamed[:, 0], renamed[:, 1]) for log in b._logs]
     if joint._rejuvenation is not None and a._rejuvenation is not None and b._rejuvenation is not None:
         starts = [slam._starts[:, :, : slam.num_particles] for slam in (a, b, joint)]
-        joint._rejuvenation.join(a._rejuvenation, b._rejuvenation, starts, renamed, joint._assumed.camera)
+        joint._rejuvenation.join(
+            a._rejuvenation, b._rejuvenation, starts, (a._frame, b._frame), renamed, joint._assumed.camera
+        )

@@ -11,13 +11,14 @@ from slam_backend._blas import on_one_thread
 from slam_backend._particle_maps import ParticleMaps
 from slam_backend.errors import FloatArray, IntArray
 from slam_backend.filter_options import FilterOptions
-from slam_backend.geometry import compose, inverse
+from slam_backend.geometry import compose, inverse, rotate_covariances
 from slam_backend.log_arrays import LogArrays
 from slam_backend.reports import PoseEstimate
 from slam_backend.run_log import RobotLog
 from slam_backend.smoothing.coarsening import coarsened
 from slam_backend.smoothing.extending import Places, first_rows
 from slam_backend.smoothing.graph import PathGraph, mean_pose, scattered
+from slam_backend.smoothing.holding import add_share
 from slam_backend.smoothing.joining import joined
 from slam_backend.smoothing.options import SmoothingOptions
 from slam_backend.smoothing.reassociation import Known, Refused, taken_up
@@ -183,7 +184,7 @@ class RejuvenationStep:
     @on_one_thread
     def join(
         self, a: "RejuvenationStep", b: "RejuvenationStep", starts: Sequence[FloatArray],
-        renamed: IntArray, camera: FloatArray,
+        frames: tuple[FloatArray, FloatArray], renamed: IntArray, camera: FloatArray,
     ) -> None:  # fmt: skip
         """Go on as the smoothers of two groups did that are one now, and be due at the next step.
 
@@ -191,6 +192,7 @@ class RejuvenationStep:
             a, b: Theirs; they stay as they are.
             starts: Three arrays (K, 3, M): where the robots of a, of b, and of both, a's first, started; in a's frame,
                 in b's, in a's.
+            frames: Two covariances (3, 3) of what a's and b's particles do not show of their maps' frames.
             renamed: (n, 2) rows (name in b, name in the joint map).
             camera: (7,) as kernels take it.
         """
@@ -203,8 +205,13 @@ class RejuvenationStep:
             own, other = (_thinned(graph, robots, camera, options) for graph in (own, other))
         robot = int(np.flatnonzero(other.previous[other.heads] < 0)[0])  # one that defines b's frame
         start = starts[2][len(starts[0]) + robot]
-        motion = compose(mean_pose(start), inverse(other.poses[other.heads[robot]]))
-        self._graph = joined(own, other, motion, renamed, scattered(start))
+        began = other.poses[other.heads[robot]]
+        motion = compose(mean_pose(start), inverse(began))
+        spreads = scattered(start)[None], np.zeros((1, 3, 3))
+        for frame, pose, spread in zip(frames, (mean_pose(start), began), spreads, strict=True):
+            add_share(frame, pose[None], spread)
+        spread = spreads[0][0] + rotate_covariances(float(motion[2]), spreads[1][0])
+        self._graph = joined(own, other, motion, renamed, spread)
         self._draft = None if options.slice_steps is None else Draft(graph=self._graph)
         moved = [{step: compose(motion, guess) for step, guess in guesses.items()} for guesses in b._guesses]
         self._guesses = [dict(guesses) for guesses in a._guesses] + moved

@@ -183,6 +183,7 @@ class FastSlam(FilterKnowledge):
             turns, buffers, self._maps.ids, weights, (self._means, self._covariances), threshold
         )  # fmt: skip
         self._write_down(turns, moves, exact, report)
+        self._widen()
         for slots in deserted:
             self._maps.release(slots)
         if report.resampled:

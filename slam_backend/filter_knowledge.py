@@ -13,6 +13,7 @@ from slam_backend.geometry import between, rotate_covariances
 from slam_backend.landmark_map import LandmarkMap, MapOutline
 from slam_backend.reports import PoseEstimate
 from slam_backend.run_log import RobotLog
+from slam_backend.smoothing.holding import of_points
 
 
 class FilterKnowledge(FilterState):
@@ -110,7 +111,10 @@ class FilterKnowledge(FilterState):
         best, least = self.best_particle, max(min_count, 1)
         if estimate == "best":
             return LandmarkMap._trusted(*best_map(self._maps, best, least))
-        return LandmarkMap._trusted(*map_mixture(self._maps, best, self._log_weights, least))
+        means, covariances, *rest = map_mixture(self._maps, best, self._log_weights, least)
+        if self._frame.any():
+            covariances += of_points(self._frame, means)
+        return LandmarkMap._trusted(means, covariances, *rest)
 
     def outline(self, min_count: int = 1) -> MapOutline:
         """Return the outline of `map(min_count=min_count)`, much faster."""

@@ -16,6 +16,7 @@ from slam_backend.smoothing.coarsening import at_mode, coarsened, compacted
 from slam_backend.smoothing.duplicates import find_duplicates, without_duplicates
 from slam_backend.smoothing.extending import Places, extended, first_rows
 from slam_backend.smoothing.graph import PathGraph
+from slam_backend.smoothing.holding import holding, move_poses, move_tiles
 from slam_backend.smoothing.options import SmoothingOptions
 from slam_backend.smoothing.sampling import Draws, draw_paths
 from slam_backend.smoothing.solving import Mode, find_mode
@@ -43,7 +44,8 @@ class Particles:
     """M particles from the posterior of whole paths.
 
     Attributes:
-        poses, starts: (K, 3, M) float64 [m, m, rad], map frame. Newest pose and start of each robot.
+        poses, starts: (K, 3, M) float64 [m, m, rad], map frame. Newest pose and start of each robot. A start that is
+            given stays where it is; all else is held, see `holding`.
         log_weights: (M,) float64, normalised.
         log_densities: (M,) float64. Of the newest poses under the Gaussian about the mode, up to a constant: 0 for the
             first particle, whose path is the mode, unless more than M were drawn.
@@ -51,6 +53,7 @@ class Particles:
         tiles: (l, P / 64, 9, 64) float64. Their means (3) and covariances (6), map frame, in blocks of lanes.
         counts: (l,) int64. Measurements of each.
         means, covariances: (K, 3), (K, 3, 3) float64. The newest poses under the Gaussian about the mode.
+        frame: (3, 3) float64 [m, m, rad]. Covariance of the motion of the whole map that the particles do not show.
     """
 
     poses: FloatArray
@@ -62,6 +65,7 @@ class Particles:
     counts: IntArray
     means: FloatArray
     covariances: FloatArray
+    frame: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -210,10 +214,17 @@ def _particles(graph: PathGraph, mode: Mode, draws: Draws, weights: FloatArray) 
     for place, robot in enumerate(sought):
         covariances[robot] = joint[3 * place : 3 * place + 3, 3 * place : 3 * place + 3]
     densities = -0.5 * np.einsum("im,im->m", off, np.linalg.solve(joint, off)) if len(off) else np.zeros(len(weights))
+    frame = np.zeros((3, 3))
+    rows = np.flatnonzero(np.isin(np.flatnonzero(seen), graph.point_landmarks))
+    if (held := holding(tiles[rows], mode.landmarks[seen][rows], poses, means, weights)) is not None:
+        move_tiles(tiles, held.motions)
+        move_poses(poses, held.motions, np.arange(len(poses)))
+        move_poses(starts, held.motions, np.flatnonzero(mode.columns[graph.heads] >= 0))
+        frame = held.scatter
     for array in (poses, starts):
         array[:, 2] = wrap_angle(array[:, 2])
     means[:, 2] = wrap_angle(means[:, 2])
     return Particles(
         poses, starts, np.log(np.maximum(weights, 1e-300)), densities, graph.landmark_ids[seen], tiles,
-        counts[seen].astype(np.int64), means, covariances,
+        counts[seen].astype(np.int64), means, covariances, frame,
     )  # fmt: skip

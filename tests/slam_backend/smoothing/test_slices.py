@@ -117,7 +117,7 @@ def test_snapshots_catch_a_descent_in_the_middle():
 def test_a_descent_that_keeps_failing_blocks_nothing(slice_steps):
     """What cannot be smoothed is left out, the report says so, and the smoother goes on with what comes next."""
     run = small_run(length=8.0)
-    smoothing = SmoothingOptions(max_iterations=1, tolerance=1e-3, slice_steps=slice_steps)
+    smoothing = SmoothingOptions(max_iterations=1, tolerance=1e-5, slice_steps=slice_steps)
     slam = run.build_filter(20, "fastslam2", 1, landmark_noise=0.0, rejuvenate_every=6, smoothing=smoothing)
     reasons = [slam.step(**reading).rejuvenation for reading in run.readings()]
     told = [report.reason for report in reasons if report is not None]

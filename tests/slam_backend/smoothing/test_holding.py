@@ -1,0 +1,185 @@
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from small_problems import small_run
+
+from slam_backend.errors import FloatArray
+from slam_backend.filter import FastSlam
+from slam_backend.geometry import between, compose, inverse, rotation, transform_points, wrap_angle
+from slam_backend.smoothing import rejuvenation
+from slam_backend.smoothing._kernels import LANES
+from slam_backend.smoothing.holding import add_share, holding, move_tiles, of_points
+from training.stereo_runs import RunSpec, simulate_run
+
+SCATTER = np.array([[0.04, 0.01, -0.02], [0.01, 0.09, 0.03], [-0.02, 0.03, 0.05]])
+UPPER = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])
+
+
+def laned(values: FloatArray) -> FloatArray:
+    """Return rows (n, 9, M) in blocks of lanes, the surplus ones copies of the first."""
+    surplus = -values.shape[2] % LANES
+    padded = np.concatenate([values, np.repeat(values[:, :, :1], surplus, axis=2)], axis=2)
+    return np.ascontiguousarray(padded.reshape(len(values), 9, -1, LANES).transpose(0, 2, 1, 3))
+
+
+def unlaned(tiles: FloatArray, count: int) -> FloatArray:
+    """Return what `laned` took."""
+    return tiles.transpose(0, 2, 1, 3).reshape(len(tiles), 9, -1)[:, :, :count]
+
+
+def random_maps(landmarks: int, count: int, rng: np.random.Generator) -> FloatArray:
+    """Return means and covariances (n, 9, M) of landmarks in a square of 10 m."""
+    roots = 0.05 * rng.standard_normal((landmarks, count, 3, 3))
+    spreads = (roots @ roots.transpose(0, 1, 3, 2))[..., *UPPER] + 1e-4 * np.eye(3)[UPPER]
+    means = np.repeat(rng.uniform(-5.0, 5.0, (landmarks, 1, 3)), count, axis=1)
+    return np.ascontiguousarray(np.concatenate([means, spreads], axis=2).transpose(0, 2, 1))
+
+
+def moved_plainly(values: FloatArray, motions: FloatArray) -> FloatArray:
+    """Return the landmarks (n, 9, M) of each particle, moved by its motion (M, 3), one by one."""
+    result = values.copy()
+    for m, motion in enumerate(motions):
+        turn = np.eye(3)
+        turn[:2, :2] = rotation(motion[2])
+        for n in range(len(values)):
+            spread = np.zeros((3, 3))
+            spread[UPPER] = values[n, 3:, m]
+            spread = spread + np.triu(spread, 1).T
+            result[n, :3, m] = turn @ values[n, :3, m] + [*motion[:2], 0.0]
+            result[n, 3:, m] = (turn @ spread @ turn.T)[UPPER]
+    return result
+
+
+def open_run(seed: int = 103) -> tuple[FastSlam, list[FloatArray], list[int]]:
+    """Return a filter at the end of a coarse run, its poses step by step, and the steps in which it was rejuvenated."""
+    run = simulate_run(RunSpec(length=40.0, landmarks=150, measurements=5, preset="coarse"), seed)
+    slam = run.build_filter(60, "fastslam2", seed, rejuvenate_every=20)
+    poses, drawn = [], []
+    for step, reading in enumerate(run.readings()):
+        if slam.step(**reading).rejuvenation is not None:
+            drawn.append(step)
+        poses.append(slam.pose().mean)
+    return slam, poses, drawn
+
+
+def test_landmarks_are_moved_as_one_by_one():
+    """The compiled kernel moves means and covariances of each particle by its own motion; surplus lanes stay."""
+    rng = np.random.default_rng(1)
+    values, motions = random_maps(5, 70, rng), rng.normal(size=(70, 3))
+    tiles = laned(values)
+    before = tiles.copy()
+    move_tiles(tiles, motions)
+    np.testing.assert_allclose(unlaned(tiles, 70), moved_plainly(values, motions), atol=1e-12)
+    np.testing.assert_array_equal(tiles[:, 1, :, 6:], before[:, 1, :, 6:])
+
+
+def test_a_scattered_frame_scatters_poses_and_points():
+    """To first order: J C J^T with the derivatives of a moved pose, and of a moved point, by the motion."""
+    rng = np.random.default_rng(2)
+    poses, covariances = rng.normal(size=(4, 3)), np.zeros((4, 3, 3))
+    add_share(SCATTER, poses, covariances)
+    small = 1e-6 * np.eye(3)
+    for pose, covariance in zip(poses, covariances, strict=True):
+        slopes = np.array([(compose(by, pose) - compose(-by, pose)) / 2e-6 for by in small]).T
+        np.testing.assert_allclose(covariance, slopes @ SCATTER @ slopes.T, atol=1e-8)
+        point = np.array([*pose[:2], 0.7])
+        slopes = np.array([(transform_points(by, point[:2]) - transform_points(-by, point[:2])) / 2e-6 for by in small])
+        of_point = of_points(SCATTER, point[None])[0]
+        np.testing.assert_allclose(of_point[:2, :2], slopes.T @ SCATTER @ slopes, atol=1e-8)
+        assert not of_point[2].any()
+
+
+def test_particles_that_differ_by_a_motion_alone_are_brought_together():
+    """Rigid copies of one map are moved back onto it, and the covariance is that of what had moved them."""
+    rng = np.random.default_rng(3)
+    motions, count = rng.normal(size=(50, 3)) * [0.3, 0.2, 0.1], 50
+    values = random_maps(6, count, rng)
+    landmarks, pose = values[:, :3, 0], np.array([1.0, 2.0, 0.5])
+    poses = compose(motions, pose).T[None]
+    weights = rng.uniform(0.5, 1.5, count)
+    weights /= weights.sum()
+    held = holding(laned(moved_plainly(values, motions)), landmarks, poses, pose[None], weights)
+    assert held is not None
+    np.testing.assert_allclose(compose(held.motions, motions), 0.0, atol=1e-12)
+    np.testing.assert_allclose(held.scatter, (weights * motions.T) @ motions, atol=1e-12)
+
+
+@pytest.mark.parametrize("apart", [0.0, 0.01])
+def test_what_says_nothing_of_the_turn_holds_nothing(apart: float):
+    """Landmarks in one place would turn particles at random, by which poses scatter more; one landmark says nothing."""
+    rng = np.random.default_rng(4)
+    values = random_maps(2, 80, rng)
+    values[1, :3] = values[0, :3] + apart
+    landmarks, pose = values[:, :3, 0].copy(), np.array([3.0, 1.0, 0.2])
+    values[:, :2] += 0.05 * rng.standard_normal((2, 2, 80))
+    poses = pose[None, :, None] + 0.05 * rng.standard_normal((1, 3, 80))
+    weights = np.full(80, 1.0 / 80)
+    assert holding(laned(values), landmarks, poses, pose[None], weights) is None
+    assert holding(laned(values[:1]), landmarks[:1], poses, pose[None], weights) is None
+
+
+def test_what_particles_no_longer_show_is_claimed_all_the_same():
+    """Right after new particles their scatter and the frame's share are together what the smoother says of the pose."""
+    run = small_run(length=8.0)
+    slam = run.build_filter(2000, "fastslam2", 1)
+    for reading in run.readings():
+        slam.step(**reading)
+    assert slam.rejuvenate().reason == ""
+    said = slam.pose()
+    off = slam.particles()[0] - said.mean
+    off[:, 2] = wrap_angle(off[:, 2])
+    shown = np.asarray(slam.weights * off.T @ off)
+    both = shown[None].copy()
+    add_share(slam._frame, said.mean[None], both)
+    assert np.trace(shown[:2, :2]) < np.trace(said.covariance[:2, :2])
+    np.testing.assert_allclose(np.sqrt(np.diag(both[0])), np.sqrt(np.diag(said.covariance)), rtol=0.25)
+
+
+def test_starts_that_are_given_stay_and_an_exact_pose_needs_no_share():
+    """All particles keep the start that they were given; once told where the robot is, the filter is sure of it."""
+    slam, _, drawn = open_run()
+    assert drawn
+    assert slam._frame.any()
+    starts = slam._starts[0, :, : slam.num_particles]
+    np.testing.assert_array_equal(starts, np.repeat(starts[:, :1], slam.num_particles, axis=1))
+    slam.step([None], [None], poses=[np.array([1.0, 2.0, 0.3])])
+    np.testing.assert_allclose(slam.pose().covariance, 0.0, atol=1e-12)
+
+
+def test_maps_of_all_particles_claim_their_share():
+    """Of the same particles a mixture claims more of each landmark by what the frame adds; its means are the same."""
+    slam, _, _ = open_run()
+    widened = slam.map("mixture")
+    share = of_points(slam._frame, widened.means)
+    slam._frame[:] = 0.0
+    narrow = slam.map("mixture")
+    np.testing.assert_array_equal(widened.means, narrow.means)
+    np.testing.assert_allclose(widened.covariances - narrow.covariances, share, atol=1e-12)
+    assert (np.trace(share, axis1=1, axis2=2) > 0.0).all()
+
+
+def test_without_it_the_frame_wanders_between_two_draws(monkeypatch: pytest.MonkeyPatch):
+    """Poses are thrown back less at each draw where the frame is held than where survivors carry it along."""
+
+    def thrown() -> float:
+        squares = []
+        for seed in (102, 103, 104):
+            _, poses, drawn = open_run(seed)
+            steps = [np.hypot(*between(a, b)[:2]) for a, b in pairwise(poses)]
+            squares += [(steps[step - 1] - np.median(steps)) ** 2 for step in drawn]
+        return float(np.sqrt(np.mean(squares)))
+
+    held = thrown()
+    monkeypatch.setattr(rejuvenation, "holding", lambda *arguments: None)
+    assert held < 0.6 * thrown()
+
+
+def test_a_motion_and_its_inverse_leave_landmarks_where_they_were():
+    """Moving there and back is the identity."""
+    rng = np.random.default_rng(6)
+    values, motions = random_maps(4, 64, rng), rng.normal(size=(64, 3))
+    tiles = laned(values)
+    move_tiles(tiles, motions)
+    move_tiles(tiles, inverse(motions))
+    np.testing.assert_allclose(unlaned(tiles, 64), values, atol=1e-10)
