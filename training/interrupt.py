@@ -8,10 +8,13 @@ from types import FrameType
 
 
 @contextmanager
-def interrupt_flag() -> Iterator[Callable[[], bool]]:
+def interrupt_flag(on_press: Callable[[], None] = lambda: None) -> Iterator[Callable[[], bool]]:
     """Give a function that tells whether Ctrl-C was pressed; pressed a second time it interrupts as usual.
 
     Outside the main thread, where Python delivers no signals, nothing is changed.
+
+    Args:
+        on_press: Called when it is pressed first, between two operations of the main thread, to tell the user so.
     """
     pressed = threading.Event()
     if threading.current_thread() is not threading.main_thread():
@@ -22,6 +25,7 @@ def interrupt_flag() -> Iterator[Callable[[], bool]]:
     def press(number: int, frame: FrameType | None) -> None:
         pressed.set()
         signal.signal(signal.SIGINT, usual)
+        on_press()
 
     signal.signal(signal.SIGINT, press)
     try:

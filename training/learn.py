@@ -1,6 +1,7 @@
 """A training: MaskablePPO built from a configuration, run, saved, and gone on with as if it had never stopped."""
 
 import random
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -110,16 +111,8 @@ class Training:
         }
         save_model(file, self.model.policy.actor_weights(), about)
 
-    def restore(self) -> None:
-        """Go on from the folder's checkpoint.
-
-        Raises:
-            ValueError: If there is none, it is damaged, or of another configuration or version.
-        """
-        kept = read_checkpoint(self._folder / CHECKPOINT_FILE)
-        if (kept["config"], kept["seed"]) != (self.config.to_mapping(), self.config.seed):
-            cure = "Give back the folder its own config.toml, or train anew."
-            raise bad_argument("resume", "a checkpoint of the folder's configuration", "a checkpoint of another", cure)
+    def restore(self, kept: Mapping[str, Any]) -> None:
+        """Go on from what `kept_of` read."""
         model = self.model
         model.policy.load_state_dict(kept["policy"])
         model.policy.optimizer.load_state_dict(kept["optimizer"])
@@ -137,6 +130,19 @@ class Training:
     def close(self) -> None:
         """Close the environments and their processes."""
         self.env.close()
+
+
+def kept_of(folder: Path, config: TrainConfig) -> dict[str, Any]:
+    """Return the checkpoint of a training's folder.
+
+    Raises:
+        ValueError: If there is none, it is damaged, or of another configuration or version.
+    """
+    kept = read_checkpoint(folder / CHECKPOINT_FILE)
+    if (kept["config"], kept["seed"]) != (config.to_mapping(), config.seed):
+        cure = "Give back the folder its own config.toml, or train anew."
+        raise bad_argument("resume", "a checkpoint of the folder's configuration", "a checkpoint of another", cure)
+    return kept
 
 
 def check_device(device: str) -> str:

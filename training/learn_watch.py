@@ -32,20 +32,27 @@ class TrainingWatch(BaseCallback):  # type: ignore[misc]   # its types are not l
         self._save, self._every = save, every
         self._tell: Callable[[Row], None] = lambda row: None
         self._should_stop: Callable[[], bool] = lambda: False
+        self._count: Callable[[int], None] = lambda decisions: None
         self.rows: list[Row] = []
         self._sums: list[dict[str, float]] = [{} for _ in range(env.num_envs)]
         self._ended: list[Row] = []
         self._begun = 0
         self.stopped = False
 
-    def listen(self, on_update: Callable[[Row], None], should_stop: Callable[[], bool]) -> None:
+    def listen(
+        self,
+        on_update: Callable[[Row], None],
+        should_stop: Callable[[], bool],
+        on_step: Callable[[int], None] = lambda decisions: None,
+    ) -> None:
         """Be told of rollouts, and be asked whether to stop.
 
         Args:
             on_update: Called with the row of each rollout.
             should_stop: Asked between two rollouts; then a checkpoint is saved and the training ends.
+            on_step: Called with the number of decisions so far, after each step of all environments.
         """
-        self._tell, self._should_stop = on_update, should_stop
+        self._tell, self._should_stop, self._count = on_update, should_stop, on_step
 
     def get_state(self) -> dict[str, Any]:
         """Return what it has summed up."""
@@ -75,6 +82,7 @@ class TrainingWatch(BaseCallback):  # type: ignore[misc]   # its types are not l
             if done:
                 self._ended.append(_finished(sums, info))
                 self._sums[slot] = {}
+        self._count(self.model.num_timesteps)
         return True
 
     def _on_rollout_end(self) -> None:

@@ -82,12 +82,13 @@ class RunFolder:
         return write_whole(self.path / name, text)
 
 
-def read_config(path: Path, command: str) -> tuple[dict[str, Any], int]:
+def read_config(path: Path, command: str, option: str = "config") -> tuple[dict[str, Any], int]:
     """Read the config and seed of an earlier run.
 
     Args:
         path: Its `config.toml`, or the run folder.
         command: The command that wants to repeat it.
+        option: By which the user named it.
 
     Raises:
         ValueError: If the file is missing or damaged, or another command wrote it.
@@ -95,16 +96,16 @@ def read_config(path: Path, command: str) -> tuple[dict[str, Any], int]:
     file = path / CONFIG_FILE if path.is_dir() else path
     expected = f"the {CONFIG_FILE} of an earlier run"
     if not file.is_file():
-        raise bad_argument("config", expected, "no such file", f"Check {str(file)!r}.")
+        raise bad_argument(option, expected, "no such file", f"Check {str(file)!r}.")
     try:
         content = tomllib.loads(file.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise bad_argument("config", expected, "a broken file", f"Correct {str(file)!r}: {error}.") from error
+        raise bad_argument(option, expected, "a broken file", f"Correct {str(file)!r}: {error}.") from error
     if content.get("command") != command:
-        raise bad_argument("config", f"a run of {command!r}", content.get("command"), "Use the command that wrote it.")
+        raise bad_argument(option, f"a run of {command!r}", content.get("command"), "Use the command that wrote it.")
     config, seed = content.get("config"), content.get("seed")
     if not isinstance(config, dict) or not isinstance(seed, int):
-        raise bad_argument("config", "a table [config] and a whole number seed", "none", f"Add them to {str(file)!r}.")
+        raise bad_argument(option, "a table [config] and a whole number seed", "none", f"Add them to {str(file)!r}.")
     return config, seed
 
 

@@ -13,6 +13,7 @@ from training.compiling import prepare
 if TYPE_CHECKING:  # what computes is imported when the command runs, so that --help answers at once
     from training.learn import Training
     from training.learn_config import TrainConfig
+    from training.learn_watch import Row
     from training.run_folder import RunFolder
 
 COMMAND = "train"
@@ -42,8 +43,9 @@ def train(
 ) -> None:
     """Train one network for all robots by PPO with masked goal actions; play it with vslam run --policy FOLDER.
 
-    Ctrl-C ends it after the running rollout and saves; --resume FOLDER then goes on and ends with the same weights as
-    a training that never stopped. A killed one loses what came after its last checkpoint.
+    Ctrl-C ends it after the running rollout and saves; pressed again, it ends
+    at once. --resume FOLDER then goes on from the last checkpoint and ends with
+    the same weights as a training that never stopped, even if it was killed.
     """
     from slam_backend.errors import bad_argument, check_int
     from training.learn_config import TrainConfig
@@ -51,7 +53,7 @@ def train(
     from training.run_folder import RunFolder, installed_versions, read_config
 
     need_learner()
-    from training.learn import Training, check_device
+    from training.learn import Training, check_device, kept_of
 
     given = {"preset": preset, "world": world, "robots": robots, "steps": steps, "envs": envs, "seed": seed}
     if workers is not None:
@@ -64,8 +66,9 @@ def train(
         if others:
             cure = "A training goes on with its own; --workers, --device and --json may be given."
             raise bad_argument("resume", "no other options that decide the training", others, cure)
-        values, kept_seed = read_config(resume, COMMAND)
+        values, kept_seed = read_config(resume, COMMAND, "resume")
         chosen = TrainConfig.from_mapping(values | {"seed": kept_seed})
+        kept = kept_of(resume, chosen)  # what is wrong with it shows before anything is compiled
     crew = default_workers(chosen) if workers is None else workers
     if resume is None:
         # A bad world shows before there is a folder.
@@ -77,9 +80,12 @@ def train(
     training = Training(chosen, folder.path, crew, device)
     try:
         if resume is not None:
-            training.restore()
+            training.restore(kept)
         complete, seconds = _run_live(console, training)
         _finish(console, folder, training, complete, seconds, json)
+    except KeyboardInterrupt:
+        _tell_how_to_go_on(console, folder.path)
+        raise
     finally:
         training.close()
 
@@ -110,33 +116,47 @@ def _run_live(console: Console, training: "Training") -> tuple[bool, float]:
         Whether it is complete, and how long it took [s].
     """
     import time
+    from contextlib import ExitStack
+    from functools import partial
 
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
     from training.interrupt import interrupt_flag
 
     columns = (
-        TextColumn("{task.completed:,.0f} of {task.total:,.0f} decisions"),
-        BarColumn(20),
+        TextColumn("{task.completed:,.0f} of {task.total:,.0f}"),
+        BarColumn(None),
         TextColumn("{task.fields[told]}"),
         TimeElapsedColumn(),
         TextColumn("left"),
         TimeRemainingColumn(),
     )
     config, begin = training.config, time.perf_counter()
-    with interrupt_flag() as interrupted, Progress(*columns, console=console, speed_estimate_period=300.0) as bar:
-        total = config.updates * config.rollout
-        task = bar.add_task("", total=total, completed=len(training.rows) * config.rollout, told="first rollout")
+    total, done = config.updates * config.rollout, len(training.rows) * config.rollout
+    if done >= total:
+        console.print("This training is complete already.", highlight=False)
+        return True, 0.0
+    with ExitStack() as stack:
+        bar = stack.enter_context(Progress(*columns, console=console, expand=True, speed_estimate_period=300.0))
+        told = _told(training.rows[-1]) if done else "first rollout"
+        task = bar.add_task("", total=total, completed=done, told=told)
+        on_press = partial(bar.update, task, told="Ctrl-C: saves after this rollout")
+        interrupted = stack.enter_context(interrupt_flag(on_press))
 
-        def on_update(row: dict[str, float]) -> None:
-            told = f"return {row['return']:.3f}, E {row['map_error']:.2f} m, recall {row['map_recall']:.2f}"
-            bar.update(task, completed=row["steps"], told=told)
+        def on_update(row: "Row") -> None:
+            if not interrupted():
+                bar.update(task, told=_told(row))
 
-        training.watch.listen(on_update, interrupted)
+        training.watch.listen(on_update, interrupted, lambda decisions: bar.update(task, completed=decisions))
         complete = training.run()
     if not complete:
         console.print("Stopped; the checkpoint holds all until here.", highlight=False)
     return complete, time.perf_counter() - begin
+
+
+def _told(row: "Row") -> str:
+    """Return what the bar says of a rollout."""
+    return f"return {row['return']:.2f}, E {row['map_error']:.2f} m, recall {row['map_recall']:.2f}"
 
 
 def _finish(
@@ -161,4 +181,14 @@ def _finish(
     if complete:
         console.print(f"Next: vslam evaluate {folder.path}", soft_wrap=True, highlight=False)
     else:
-        console.print(f"Go on: vslam train --resume {folder.path}", soft_wrap=True, highlight=False)
+        _tell_how_to_go_on(console, folder.path)
+
+
+def _tell_how_to_go_on(console: Console, folder: Path) -> None:
+    """Say how a training that was stopped goes on, if it can."""
+    from training.learn_checkpoint import CHECKPOINT_FILE
+
+    text = "Stopped before the first checkpoint: nothing was saved."
+    if (folder / CHECKPOINT_FILE).is_file():
+        text = f"Go on: vslam train --resume {folder}"
+    console.print(text, soft_wrap=True, highlight=False)

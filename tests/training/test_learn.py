@@ -24,7 +24,8 @@ from sb3_contrib import MaskablePPO
 from agents.goal_network import logits
 from agents.trained import load_model
 from training.cli import app
-from training.learn import Training, check_device
+from training.interrupt import interrupt_flag
+from training.learn import Training, check_device, kept_of
 from training.learn_checkpoint import CHECKPOINT_FILE, read_checkpoint, write_checkpoint
 from training.learn_config import TrainConfig
 from training.learn_network import GoalPolicy
@@ -77,9 +78,11 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any
 def _trained(folder: Path, stop_after: int | None = None, resume: bool = False) -> dict[str, Any]:
     training = Training(SMOKE, folder)
     if resume:
-        training.restore()
-    training.watch.listen(lambda row: None, lambda: len(training.rows) == stop_after)
+        training.restore(kept_of(folder, SMOKE))
+    counted: list[int] = []
+    training.watch.listen(lambda row: None, lambda: len(training.rows) == stop_after, counted.append)
     assert training.run() == (stop_after is None)
+    assert counted == list(range(20 if resume else 4, 20 if stop_after else 52, 4))  # told of each step, and no other
     training.close()
     weights: dict[str, Any] = training.model.policy.actor_weights()
     return weights
@@ -165,23 +168,22 @@ def test_rows_tell_of_episodes(whole: tuple[Path, dict[str, Any]]) -> None:
 
 def test_damaged_checkpoints_are_refused(whole: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
     """A missing, cut, foreign or changed checkpoint, one of another configuration or version, is told with its cure."""
-    training = Training(SMOKE, tmp_path)
     file = tmp_path / CHECKPOINT_FILE
     with pytest.raises(ValueError, match="resume: expected the checkpoint of a training, got no such file"):
-        training.restore()
+        kept_of(tmp_path, SMOKE)
     bytes_whole = (whole[0] / CHECKPOINT_FILE).read_bytes()
     file.write_bytes(bytes_whole[: len(bytes_whole) // 2])
     with pytest.raises(ValueError, match=r"resume: .* got a broken file of \d+. .* was cut off or changed"):
-        training.restore()
+        kept_of(tmp_path, SMOKE)
     file.write_bytes(b"something else")
     with pytest.raises(ValueError, match=r"resume: .* got a broken file. .* is none: train anew"):
-        training.restore()
+        kept_of(tmp_path, SMOKE)
     file.write_bytes(bytes_whole.replace(b'"torch": "', b'"torch": "0', 1))
     with pytest.raises(ValueError, match=r"resume: expected a checkpoint made with torch .* Install torch==0"):
-        training.restore()
+        kept_of(tmp_path, SMOKE)
     write_checkpoint(file, {"config": {**SMOKE.to_mapping(), "gamma": 0.5}, "seed": 5})
     with pytest.raises(ValueError, match="resume: expected a checkpoint of the folder's configuration"):
-        training.restore()
+        kept_of(tmp_path, SMOKE)
 
 
 def test_a_missing_gpu_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -212,6 +214,42 @@ def test_bad_configurations_are_refused(values: dict[str, Any], says: str) -> No
 
 
 @pytest.mark.slow
+def test_a_second_ctrl_c_tells_how_to_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is interrupted at once says whether a checkpoint is there, and with which command it goes on."""
+    out = tmp_path / "run"
+
+    def interrupted(training: Training) -> bool:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Training, "run", interrupted)
+    begin = ["train", "--preset", "smoke", "--workers", "0"]
+    result = runner.invoke(app, [*begin, "--out", str(out)])
+    assert result.exit_code == 130
+    assert "Stopped before the first checkpoint: nothing was saved." in result.output
+    monkeypatch.undo()
+    result = runner.invoke(app, ["train", "--resume", str(out), "--workers", "0"])
+    assert "resume: expected the checkpoint of a training, got no such file" in str(result.exception)
+    training = Training(TrainConfig.from_mapping({"preset": "smoke"}), out)
+    training.watch.listen(lambda row: None, lambda: True)
+    training.run()
+    monkeypatch.setattr(Training, "run", interrupted)
+    result = runner.invoke(app, ["train", "--resume", str(out), "--workers", "0"])
+    assert f"Go on: vslam train --resume {out}" in result.output.replace("\n", "")
+
+
+def test_a_press_is_told_once() -> None:
+    """The first Ctrl-C calls what tells of it and raises the flag; the second one interrupts."""
+    told: list[str] = []
+    with interrupt_flag(lambda: told.append("pressed")) as pressed:
+        assert not pressed()
+        signal.raise_signal(signal.SIGINT)
+        assert pressed()
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+    assert told == ["pressed"]
+
+
+@pytest.mark.slow
 def test_the_commands_train_go_on_evaluate_and_play(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Ctrl-C saves, `--resume` ends the training, `evaluate` compares with paired seeds, `run` plays the model."""
     out = tmp_path / "run"
@@ -236,6 +274,9 @@ def test_the_commands_train_go_on_evaluate_and_play(tmp_path: Path, monkeypatch:
     assert metrics["decisions"] == 48
     assert (out / "learning.png").stat().st_size > 10_000
     assert len((out / "curves.csv").read_text().splitlines()) == 4
+    result = runner.invoke(app, ["train", "--resume", str(out), "--workers", "0"])
+    assert "This training is complete already." in result.output
+    assert json.loads((out / "metrics.json").read_text())["decisions"] == 48
     result = runner.invoke(app, ["train", "--resume", str(out), "--steps", "96"])
     assert "resume: expected no other options that decide the training, got ['steps']" in str(result.exception)
 
