@@ -1,20 +1,17 @@
 """Fewer key poses: what is known best of a path becomes rigid, so that a long run needs no more room than a short one.
 
 Where the newest keys end, measurements are condensed once for all. If there are still more keys than allowed, those
-neighbours become one whose relative pose is known best, in the mean over the paths just drawn: the second then stands
-rigidly to the first, what was measured from it is moved there, and the odometry between them is spent.
+neighbours become one whose relative pose is known best: the second then stands rigidly to the first, what was measured
+from it is moved there, and the odometry between them is spent.
 """
 
-import heapq
 from dataclasses import replace
 
 import numpy as np
 
-from slam_backend._packed import UNPACK, UPPER
 from slam_backend.errors import BoolArray, FloatArray, IntArray
-from slam_backend.geometry import between, compose, rotation
-from slam_backend.smoothing.extending import chained
-from slam_backend.smoothing.graph import NONE, PathGraph
+from slam_backend.smoothing import _kernels
+from slam_backend.smoothing.graph import PathGraph
 from slam_backend.smoothing.options import SmoothingOptions
 from slam_backend.smoothing.sightings import Sightings
 from slam_backend.smoothing.solving import Mode
@@ -26,45 +23,98 @@ OF_POINTS = ("points", "point_noises", "given", "point_frames", "point_landmarks
 def coarsened(graph: PathGraph, camera: FloatArray, options: SmoothingOptions) -> PathGraph:
     """Return the graph with old keys condensed and at most `most_keys` of them, if the fresh ones allow.
 
+    Odometry is chained over old keys from which nothing was measured; they go if they have a successor. Landmarks and
+    frames that nothing is left of go as well.
+
     Args:
-        graph: At its mode, with what paths drawn there say of its spreads; see `at_mode`.
+        graph: At its mode, with what is known there of its spreads; see `at_mode`.
         camera: As in `find_mode`.
         options: How many keys, and how many of them fresh, of all robots together.
     """
-    share = max(1, options.fresh_keys // len(graph.tips))
-    fresh = np.zeros(graph.num_keys, dtype=np.bool_)
-    for robot in range(len(graph.tips)):
-        fresh[np.flatnonzero(graph.robots == robot)[-share:]] = True
-    condensed = _without_blind(_condensed(graph, fresh, camera, options), fresh)
-    representatives, slack = _representatives(condensed, graph.spreads, fresh, options.most_keys(len(graph.tips)))
-    return compacted(_joined(replace(condensed, slack=slack), representatives))
+    fresh = _fresh(graph, options)
+    graph, seen = _consistent(graph, fresh, camera, options)
+    rows = np.flatnonzero(seen.frozen | ~fresh[seen.keys])  # what is frozen from now on
+    k, sighted = graph.num_keys, np.zeros(graph.num_keys, dtype=np.bool_)
+    sighted[seen.keys[rows]] = True
+    previous, motions, noises = graph.previous.copy(), graph.motions.copy(), graph.noises.copy()
+    slack, roots, numbers = graph.slack.copy(), np.empty(k, dtype=np.int64), np.empty(k, dtype=np.int64)
+    offsets = np.empty((k, 3))
+    _kernels.join_keys(
+        graph.robots, graph.poses, graph.linked, previous, motions, noises, graph.spreads, slack, fresh, sighted,
+        options.most_keys(len(graph.tips)), roots, numbers, offsets,
+    )  # fmt: skip
+    kept, n = np.flatnonzero(numbers >= 0), len(rows)
+    frozen_keys, frozen_landmarks, counts = (np.empty(n, dtype=np.int64) for _ in range(3))
+    centres, infos, slopes = np.empty((n, 3)), np.empty((n, 6)), np.empty((n, 3))
+    num = _kernels.add_sightings(
+        rows, seen.keys, seen.landmarks, seen.centres, seen.infos, seen.slopes, seen.counts, roots, offsets,
+        frozen_keys, frozen_landmarks, centres, infos, slopes, counts,
+    )  # fmt: skip
+    fewer = replace(
+        graph,
+        robots=graph.robots[kept],
+        poses=graph.poses[kept],
+        previous=previous[kept],
+        motions=motions[kept],
+        noises=noises[kept],
+        spreads=graph.spreads[kept],
+        slack=slack[kept],
+        frame_keys=numbers[graph.frame_keys],
+        **_of_points(graph, fresh[graph.frame_keys[graph.point_frames]]),
+        frozen_keys=numbers[frozen_keys[:num]],
+        frozen_landmarks=frozen_landmarks[:num],
+        centres=centres[:num],
+        infos=infos[:num],
+        slopes=slopes[:num],
+        counts=counts[:num],
+        heads=numbers[graph.heads],
+        tips=numbers[graph.tips],
+    )
+    return compacted(fewer)
 
 
 def at_mode(graph: PathGraph, mode: Mode, spreads: FloatArray | None = None) -> PathGraph:
-    """Return the graph with the poses and landmarks of the mode, and the spreads (k,) [m^2] of paths drawn there."""
+    """Return the graph with the poses and landmarks of the mode, and the spreads (k,) [m^2] of motions there."""
     graph = replace(graph, poses=mode.poses, landmarks=mode.landmarks)
     return graph if spreads is None else replace(graph, spreads=spreads)
 
 
-def _condensed(graph: PathGraph, fresh: BoolArray, camera: FloatArray, options: SmoothingOptions) -> PathGraph:
-    """Freeze what was measured from keys that are no longer fresh, but for what the smoothed path contradicts."""
-    old = ~fresh[graph.frame_keys[graph.point_frames]]
-    seen = _linearised(graph, camera, options)
-    if options.kernel and (lost := old & (seen.squares > CONTRADICTION * options.kernel)).any():
-        graph = replace(graph, **{name: getattr(graph, name)[~lost] for name in OF_POINTS})
-        seen = _linearised(graph, camera, options)
-    frozen = seen.frozen | ~fresh[seen.keys]
-    keep = fresh[graph.frame_keys[graph.point_frames]]
+def compacted(graph: PathGraph) -> PathGraph:
+    """Return the graph without the frames from which, and the landmarks of which, nothing was measured."""
+    frames, of_frames = _used(len(graph.frame_keys), graph.point_frames)
+    landmarks, of_landmarks = _used(len(graph.landmark_ids), graph.point_landmarks, graph.frozen_landmarks)
     return replace(
         graph,
-        **{name: getattr(graph, name)[keep] for name in OF_POINTS},
-        frozen_keys=seen.keys[frozen],
-        frozen_landmarks=seen.landmarks[frozen],
-        centres=seen.centres[frozen],
-        infos=seen.infos[frozen],
-        slopes=seen.slopes[frozen],
-        counts=seen.counts[frozen],
+        frame_keys=graph.frame_keys[frames],
+        frame_offsets=graph.frame_offsets[frames],
+        point_frames=of_frames[graph.point_frames],
+        point_landmarks=of_landmarks[graph.point_landmarks],
+        frozen_landmarks=of_landmarks[graph.frozen_landmarks],
+        landmark_ids=graph.landmark_ids[landmarks],
+        landmarks=graph.landmarks[landmarks],
     )
+
+
+def _fresh(graph: PathGraph, options: SmoothingOptions) -> BoolArray:
+    """Return (k,) which keys are each robot's newest, which keep their raw measurements."""
+    share = max(1, options.fresh_keys // len(graph.tips))
+    fresh = np.zeros(graph.num_keys, dtype=np.bool_)
+    for robot in range(len(graph.tips)):
+        fresh[np.flatnonzero(graph.robots == robot)[-share:]] = True
+    return fresh
+
+
+def _consistent(
+    graph: PathGraph, fresh: BoolArray, camera: FloatArray, options: SmoothingOptions
+) -> tuple[PathGraph, Sightings]:
+    """Return the graph without old measurements that the smoothed path contradicts, and its sightings, linearised."""
+    seen = _linearised(graph, camera, options)
+    if options.kernel:
+        lost = seen.squares > CONTRADICTION * options.kernel
+        if lost.any() and (lost := lost & ~fresh[graph.frame_keys[graph.point_frames]]).any():
+            graph = replace(graph, **_of_points(graph, ~lost))
+            seen = _linearised(graph, camera, options)
+    return graph, seen
 
 
 def _linearised(graph: PathGraph, camera: FloatArray, options: SmoothingOptions) -> Sightings:
@@ -74,136 +124,15 @@ def _linearised(graph: PathGraph, camera: FloatArray, options: SmoothingOptions)
     return seen
 
 
-def _without_blind(graph: PathGraph, fresh: BoolArray) -> PathGraph:
-    """Chain the odometry over keys from which nothing was measured; they lose their successors."""
-    sighted = np.zeros(graph.num_keys, dtype=np.bool_)
-    sighted[graph.frozen_keys] = True
-    sighted[graph.frame_keys[graph.point_frames]] = True
-    blind = ~sighted & ~fresh & graph.linked
-    if not blind.any():
-        return graph
-    previous, motions, noises = graph.previous.copy(), graph.motions.copy(), graph.noises.copy()
-    for key in np.flatnonzero(graph.linked):  # in the order of time
-        before = previous[key]
-        while blind[before]:
-            motions[key], noises[key] = chained(motions[before], noises[before], motions[key], noises[key])
-            before = previous[before]
-        previous[key] = before
-    return replace(graph, previous=previous, motions=motions, noises=noises)
+def _of_points(graph: PathGraph, chosen: BoolArray) -> dict[str, np.ndarray]:
+    """Return some of the raw measurements, by the names of their columns."""
+    rows = np.flatnonzero(chosen)
+    return {name: getattr(graph, name)[rows] for name in OF_POINTS}
 
 
-def _representatives(
-    graph: PathGraph, cost: FloatArray, fresh: BoolArray, most_keys: int
-) -> tuple[IntArray, FloatArray]:
-    """Return (k,) the key that each stands rigidly to, itself or an earlier one, or `NONE`; and new slacks (k,)."""
-    k = graph.num_keys
-    representative = np.arange(k)
-    following = np.full(k, NONE)
-    linked = np.flatnonzero(graph.linked)
-    following[graph.previous[linked]] = linked  # a blind key was replaced by its successor, if it has one
-    needed = np.ones(k, dtype=np.bool_)
-    needed[linked] = following[graph.previous[linked]] == linked
-    representative[~needed] = NONE
-    surplus = int(needed.sum()) - most_keys
-    slack, previous = graph.slack.copy(), graph.previous.copy()
-    heap = [(cost[b] + slack[b] + slack[previous[b]], int(b)) for b in linked if needed[b] and not fresh[b]]
-    heapq.heapify(heap)
-    while surplus > 0 and heap:
-        price, b = heapq.heappop(heap)
-        a = int(previous[b])
-        if representative[b] != b or price < cost[b] + slack[a] + slack[b]:
-            if representative[b] == b:
-                heapq.heappush(heap, (cost[b] + slack[a] + slack[b], b))
-            continue
-        representative[b] = a
-        slack[a] += slack[b] + cost[b]
-        after = int(following[b])
-        following[a] = after
-        if after >= 0:
-            previous[after] = a
-        surplus -= 1
-    return representative, slack
-
-
-def _joined(graph: PathGraph, representative: IntArray) -> PathGraph:
-    """Move all that hangs on a key to the one it now stands rigidly to."""
-    kept = representative == np.arange(len(representative))
-    root = np.maximum(representative, 0)
-    while (representative[root] != root).any():
-        root = representative[root]
-    offsets = between(graph.poses[root], graph.poses)
-    offsets[kept] = 0.0
-    number = np.cumsum(kept) - 1
-    before = np.maximum(graph.previous, 0)
-    turn = np.zeros((len(kept), 3, 3))
-    turn[:, :2, :2], turn[:, 2, 2] = rotation(offsets[before, 2]), 1.0
-    moved = _moved(graph, np.flatnonzero(~kept[graph.frozen_keys]), offsets)
-    sightings = _combined(root[graph.frozen_keys], graph.frozen_landmarks, *moved, graph.counts)
-    return replace(
-        graph,
-        robots=graph.robots[kept],
-        poses=graph.poses[kept],
-        previous=np.where(graph.previous >= 0, number[root[before]], NONE)[kept],
-        motions=compose(offsets[before], graph.motions)[kept],
-        noises=(turn @ graph.noises @ turn.transpose(0, 2, 1))[kept],
-        spreads=graph.spreads[kept],
-        slack=graph.slack[kept],
-        frame_keys=number[root[graph.frame_keys]],
-        frozen_keys=number[sightings[0]],
-        frozen_landmarks=sightings[1],
-        centres=sightings[2],
-        infos=sightings[3],
-        slopes=sightings[4],
-        counts=sightings[5],
-        heads=number[graph.heads],
-        tips=number[graph.tips],
-    )
-
-
-def _moved(graph: PathGraph, rows: IntArray, offsets: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return centres, informations and slopes of the frozen sightings, `rows` of them moved by their keys' offsets."""
-    centres, infos, slopes = graph.centres.copy(), graph.infos.copy(), graph.slopes.copy()
-    by = offsets[graph.frozen_keys[rows]]
-    turn = np.zeros((len(by), 3, 3))
-    turn[:, :2, :2], turn[:, 2, 2] = rotation(by[:, 2]), 1.0
-    centres[rows] = np.einsum("nij,nj->ni", turn, centres[rows])
-    centres[rows, :2] += by[:, :2]
-    infos[rows] = (turn @ infos[rows][:, UNPACK] @ turn.transpose(0, 2, 1))[:, *UPPER]
-    slopes[rows] = np.einsum("nij,nj->ni", turn, slopes[rows])
-    return centres, infos, slopes
-
-
-def _combined(
-    keys: IntArray, landmarks: IntArray, centres: FloatArray, infos: FloatArray, slopes: FloatArray, counts: IntArray
-) -> tuple[IntArray, IntArray, FloatArray, FloatArray, FloatArray, IntArray]:
-    """Add up the forms of each pair of key and landmark, about the centre of the first."""
-    if not len(keys):
-        return keys, landmarks, centres, infos, slopes, counts
-    order = np.argsort(landmarks * (keys.max() + 1) + keys, kind="stable")  # which is nearly theirs already
-    keys, landmarks = keys[order], landmarks[order]
-    centres, infos, slopes, counts = centres[order], infos[order], slopes[order], counts[order]
-    new = np.ones(len(keys), dtype=np.bool_)
-    new[1:] = (keys[1:] != keys[:-1]) | (landmarks[1:] != landmarks[:-1])
-    first, other = np.flatnonzero(new), np.flatnonzero(~new)
-    shift = centres[first][np.cumsum(new)[other] - 1] - centres[other]
-    slopes[other] -= np.einsum("nij,nj->ni", infos[other][:, UNPACK], shift)
-    return (
-        keys[first], landmarks[first], centres[first], np.add.reduceat(infos, first), np.add.reduceat(slopes, first),
-        np.add.reduceat(counts, first),
-    )  # fmt: skip
-
-
-def compacted(graph: PathGraph) -> PathGraph:
-    """Return the graph without the frames from which, and the landmarks of which, nothing was measured."""
-    frames = np.unique(graph.point_frames)
-    landmarks = np.unique(np.concatenate([graph.point_landmarks, graph.frozen_landmarks]))
-    return replace(
-        graph,
-        frame_keys=graph.frame_keys[frames],
-        frame_offsets=graph.frame_offsets[frames],
-        point_frames=np.searchsorted(frames, graph.point_frames),
-        point_landmarks=np.searchsorted(landmarks, graph.point_landmarks),
-        frozen_landmarks=np.searchsorted(landmarks, graph.frozen_landmarks),
-        landmark_ids=graph.landmark_ids[landmarks],
-        landmarks=graph.landmarks[landmarks],
-    )
+def _used(num: int, *rows: IntArray) -> tuple[IntArray, IntArray]:
+    """Return which of `num` rows any of these name, and what each of those is called among them."""
+    used = np.zeros(num, dtype=np.bool_)
+    for column in rows:
+        used[column] = True
+    return np.flatnonzero(used), np.cumsum(used) - 1

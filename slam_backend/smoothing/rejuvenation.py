@@ -181,7 +181,8 @@ def drawn(
         return Rejuvenation(graph, f"an effective sample size of {ess:.1f}", ess, mode.iterations, None)
     if looks is not None and len(looks.ids):
         duplicates = find_duplicates(grown, mode, draws, _descriptors(grown, looks), looks.gate)
-        graph = compacted(without_duplicates(graph, duplicates))
+        if len(duplicates):
+            graph = compacted(without_duplicates(graph, duplicates))
     return Rejuvenation(graph, "", ess, mode.iterations, _particles(grown, mode, chosen, weights))
 
 

@@ -1,5 +1,6 @@
 """Compiled inner loops of the smoother: forms of sightings, normal equations, their factor, many paths at a time."""
 
+from slam_backend.smoothing._kernels.coarsening import add_sightings, join_keys
 from slam_backend.smoothing._kernels.drawing import draw
 from slam_backend.smoothing._kernels.equations import FREE, form
 from slam_backend.smoothing._kernels.factoring import factorise, solve
@@ -10,6 +11,7 @@ from slam_backend.smoothing._kernels.paths import LANES, POSE_ROWS, WORK_ROWS, o
 from slam_backend.smoothing._kernels.scattering import scatter_of_links
 
 __all__ = [
-    "FREE", "LANES", "POSE_ROWS", "WORK_ROWS", "condense", "draw", "factorise", "form", "gather", "invert",
-    "lay_out", "minimum_degree", "neighbours", "odometry_of_paths", "replay", "scatter_of_links", "solve",
+    "FREE", "LANES", "POSE_ROWS", "WORK_ROWS", "add_sightings", "condense", "draw", "factorise", "form", "gather",
+    "invert", "join_keys", "lay_out", "minimum_degree", "neighbours", "odometry_of_paths", "replay",
+    "scatter_of_links", "solve",
 ]  # fmt: skip

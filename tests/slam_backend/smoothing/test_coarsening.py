@@ -1,6 +1,8 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
+from plain_coarsening import plainly_coarsened
 from small_problems import TIGHT, camera_of, graph_of, logs_of, small_run, upper
 
 from slam_backend.geometry import compose
@@ -155,3 +157,26 @@ def test_a_graph_is_not_changed_by_what_is_made_of_it():
         np.testing.assert_array_equal(getattr(graph, name), value)
     for name, value in kept.items():
         np.testing.assert_array_equal(getattr(fewer, name), value)
+
+
+@pytest.mark.parametrize("max_keys", [3, 14, 30, 1000])
+@pytest.mark.parametrize("kernel", [0.0, 0.2])
+def test_keys_are_joined_as_by_the_plain_program(max_keys, kernel):
+    """Kernels leave the same keys as numpy: blind ones, measurements that contradict, and joining twice included."""
+    run = small_run(2, length=8.0)
+    options = SmoothingOptions(max_keys=max_keys, further_keys=0, fresh_keys=6, kernel=kernel)
+    graph = graph_of(run, skip=(3, 4, 7))
+    blind = graph.point_frames == 5  # that a key measured nothing is the exception
+    names = ("points", "point_noises", "given", "point_frames", "point_landmarks")
+    graph = replace(graph, **{name: getattr(graph, name)[~blind] for name in names})
+    for _ in range(2):
+        mode = find_mode(graph, camera_of(run), TIGHT)
+        graph = at_mode(graph, mode, mode.spreads())
+        found, expected = (how(graph, camera_of(run), options) for how in (coarsened, plainly_coarsened))
+        assert found.num_keys <= max(options.most_keys(2), 8)
+        for name in graph.__dataclass_fields__:
+            one, other = getattr(found, name), getattr(expected, name)
+            assert one.dtype == other.dtype
+            np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-7, err_msg=name)
+        options = replace(options, max_keys=max(2, max_keys - 2))
+        graph = found

@@ -1,0 +1,199 @@
+"""Keys become one with the key before, and what was measured from them is added up, as `coarsened` asks for."""
+
+import math
+
+import numpy as np
+
+from slam_backend._jit import inlined, jit
+from slam_backend.errors import BoolArray, FloatArray, IntArray
+from slam_backend.smoothing._kernels.forms import _spun
+
+NONE = -1
+
+
+@inlined
+def _wrapped_heading(angle: float) -> float:
+    """Return an angle [rad] in [-pi, pi)."""
+    return (angle + math.pi) % (2.0 * math.pi) - math.pi
+
+
+@inlined
+def _compose(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
+    """Write the motion a followed by b, all (3,) [m, m, rad]; `out` may be b."""
+    c, s = math.cos(a[2]), math.sin(a[2])
+    x, y = a[0] + c * b[0] - s * b[1], a[1] + s * b[0] + c * b[1]
+    out[0], out[1], out[2] = x, y, _wrapped_heading(a[2] + b[2])
+
+
+@inlined
+def _turned(c: float, s: float, a: FloatArray, out: FloatArray) -> None:
+    """Write R A R^T for a symmetric A (3, 3) and the rotation (c, s) about the vertical; `out` may be A."""
+    a00, a01, a02, a11, a12, a22 = a[0, 0], a[0, 1], a[0, 2], a[1, 1], a[1, 2], a[2, 2]
+    out[0, 0] = c * c * a00 - 2.0 * c * s * a01 + s * s * a11
+    out[0, 1] = c * s * (a00 - a11) + (c * c - s * s) * a01
+    out[0, 2] = c * a02 - s * a12
+    out[1, 1] = s * s * a00 + 2.0 * c * s * a01 + c * c * a11
+    out[1, 2] = s * a02 + c * a12
+    out[2, 2] = a22
+    out[1, 0], out[2, 0], out[2, 1] = out[0, 1], out[0, 2], out[1, 2]
+
+
+@jit
+def chain(first: FloatArray, first_noise: FloatArray, motion: FloatArray, noise: FloatArray) -> None:
+    """Put a motion before another, in place, and its covariance, to first order.
+
+    Args:
+        first, first_noise: (3,) [m, m, rad], (3, 3) in the frame in which it begins.
+        motion, noise: (3,), (3, 3) of what follows, in the frame to which the first one leads; changed: both together.
+    """
+    c, s = math.cos(first[2]), math.sin(first[2])
+    ahead, left = -(s * motion[0] + c * motion[1]), c * motion[0] - s * motion[1]
+    _turned(c, s, noise, noise)
+    n02, n12, n22 = first_noise[0, 2], first_noise[1, 2], first_noise[2, 2]
+    noise[0, 0] += first_noise[0, 0] + 2.0 * ahead * n02 + ahead * ahead * n22
+    noise[0, 1] += first_noise[0, 1] + left * n02 + ahead * n12 + ahead * left * n22
+    noise[1, 1] += first_noise[1, 1] + 2.0 * left * n12 + left * left * n22
+    noise[0, 2] += n02 + ahead * n22
+    noise[1, 2] += n12 + left * n22
+    noise[2, 2] += n22
+    noise[1, 0], noise[2, 0], noise[2, 1] = noise[0, 1], noise[0, 2], noise[1, 2]
+    _compose(first, motion, motion)
+
+
+@jit
+def join_keys(
+    robots: IntArray, poses: FloatArray, linked: BoolArray, previous: IntArray, motions: FloatArray,
+    noises: FloatArray, costs: FloatArray, slack: FloatArray, fresh: BoolArray, sighted: BoolArray, most_keys: int,
+    roots: IntArray, numbers: IntArray, offsets: FloatArray,
+) -> int:  # fmt: skip
+    """Say which keys are left, and where the others stand to them; odometry is carried there.
+
+    Old keys from which nothing was measured are chained away if they have a successor. Then, as long as there are too
+    many, the old key goes whose motion from the key before costs least with what either has cost already: it stands
+    rigidly to the key before from then on.
+
+    Args:
+        robots, poses: (k,), (k, 3) of the keys, in the order of time.
+        linked: (k,) whether a key comes after another of the same robot.
+        previous, motions, noises: (k,), (k, 3), (k, 3, 3) the odometry to each; changed: that of a key that is left
+            begins at another one that is left, by its new number.
+        costs, slack: (k,) [m^2] what joining a key to the one before costs; what each has cost, changed.
+        fresh: (k,) whether a key stays in any case.
+        sighted: (k,) whether anything was measured from it.
+        most_keys: So many may be left.
+        roots: (k,), result: the key to which each stands rigidly, itself if it is left, `NONE` if it was chained away.
+        numbers: (k,), result: new number of each that is left, `NONE` of the others.
+        offsets: (k, 3), result: pose of each seen from its root.
+
+    Returns:
+        How many are left.
+    """
+    k = len(robots)
+    following = np.full(k, NONE)
+    for b in range(k):
+        if linked[b]:
+            a = previous[b]
+            while linked[a] and not sighted[a] and not fresh[a]:
+                chain(motions[a], noises[a], motions[b], noises[b])
+                a = previous[a]
+            previous[b] = a
+            following[a] = b
+    before, left = previous.copy(), 0
+    for b in range(k):
+        roots[b] = b if not linked[b] or following[previous[b]] == b else NONE
+        left += roots[b] == b
+    while left > most_keys:
+        best, least = NONE, np.inf
+        for b in range(k):
+            if linked[b] and roots[b] == b and not fresh[b]:
+                price = costs[b] + slack[before[b]] + slack[b]
+                if price < least:
+                    best, least = b, price
+        if best == NONE:
+            break
+        a, after = before[best], following[best]
+        roots[best] = a
+        slack[a] += slack[best] + costs[best]
+        following[a] = after
+        if after >= 0:
+            before[after] = a
+        left -= 1
+    number = 0
+    for b in range(k):
+        numbers[b] = NONE
+        if roots[b] == b:
+            numbers[b] = number
+            number += 1
+    for b in range(k):
+        offsets[b] = 0.0
+        if roots[b] == b or roots[b] == NONE:
+            continue
+        while roots[roots[b]] != roots[b]:
+            roots[b] = roots[roots[b]]
+        a = roots[b]
+        c, s = math.cos(poses[a, 2]), math.sin(poses[a, 2])
+        dx, dy = poses[b, 0] - poses[a, 0], poses[b, 1] - poses[a, 1]
+        offsets[b, 0], offsets[b, 1] = c * dx + s * dy, -s * dx + c * dy
+        offsets[b, 2] = _wrapped_heading(poses[b, 2] - poses[a, 2])
+    for b in range(k):
+        a = previous[b]
+        if roots[b] != b or a < 0:
+            continue
+        previous[b] = numbers[roots[a]]
+        if roots[a] != a:
+            _compose(offsets[a], motions[b], motions[b])
+            _turned(math.cos(offsets[a, 2]), math.sin(offsets[a, 2]), noises[b], noises[b])
+    return number
+
+
+@jit
+def add_sightings(
+    rows: IntArray, keys: IntArray, landmarks: IntArray, centres: FloatArray, infos: FloatArray, slopes: FloatArray,
+    counts: IntArray, roots: IntArray, offsets: FloatArray, new_keys: IntArray, new_landmarks: IntArray,
+    new_centres: FloatArray, new_infos: FloatArray, new_slopes: FloatArray, new_counts: IntArray,
+) -> int:  # fmt: skip
+    """Move sightings to the keys to which theirs stand rigidly, and add up the forms of each pair.
+
+    Args:
+        rows: (n,) which sightings, those of a landmark one after the other; reordered: by key in each landmark.
+        keys, landmarks, centres, infos, slopes, counts: Of all sightings.
+        roots, offsets: As `join_keys` wrote them.
+        new_keys, new_landmarks, new_centres, new_infos, new_slopes, new_counts: (n, ...), results, of which the first
+            rows are written; keys by their old numbers. A sum lies about the centre of its first part.
+
+    Returns:
+        How many there are.
+    """
+    for n in range(1, len(rows)):
+        row, at = rows[n], n
+        while at > 0 and landmarks[rows[at - 1]] == landmarks[row] and roots[keys[rows[at - 1]]] > roots[keys[row]]:
+            rows[at] = rows[at - 1]
+            at -= 1
+        rows[at] = row
+    num = 0
+    info = np.empty(6)
+    for row in rows:
+        key, landmark, offset = roots[keys[row]], landmarks[row], offsets[keys[row]]
+        x, y, z = centres[row, 0], centres[row, 1], centres[row, 2]
+        g0, g1, g2 = slopes[row, 0], slopes[row, 1], slopes[row, 2]
+        info[:] = infos[row]
+        if roots[keys[row]] != keys[row]:
+            c, s = math.cos(offset[2]), math.sin(offset[2])
+            x, y = c * x - s * y + offset[0], s * x + c * y + offset[1]
+            g0, g1 = c * g0 - s * g1, s * g0 + c * g1
+            _spun(c, s, infos[row], info)
+        if num > 0 and new_keys[num - 1] == key and new_landmarks[num - 1] == landmark:
+            d0, d1, d2 = new_centres[num - 1, 0] - x, new_centres[num - 1, 1] - y, new_centres[num - 1, 2] - z
+            new_slopes[num - 1, 0] += g0 - (info[0] * d0 + info[1] * d1 + info[2] * d2)
+            new_slopes[num - 1, 1] += g1 - (info[1] * d0 + info[3] * d1 + info[4] * d2)
+            new_slopes[num - 1, 2] += g2 - (info[2] * d0 + info[4] * d1 + info[5] * d2)
+            for i in range(6):
+                new_infos[num - 1, i] += info[i]
+            new_counts[num - 1] += counts[row]
+            continue
+        new_keys[num], new_landmarks[num], new_counts[num] = key, landmark, counts[row]
+        new_centres[num, 0], new_centres[num, 1], new_centres[num, 2] = x, y, z
+        new_slopes[num, 0], new_slopes[num, 1], new_slopes[num, 2] = g0, g1, g2
+        new_infos[num] = info
+        num += 1
+    return num

@@ -1,0 +1,173 @@
+"""Keys joined with the arrays of numpy, one thing after the other: what the compiled kernels are compared with."""
+
+import heapq
+from dataclasses import replace
+
+import numpy as np
+
+from slam_backend._packed import UNPACK, UPPER
+from slam_backend.errors import BoolArray, FloatArray, IntArray
+from slam_backend.geometry import between, compose, rotation
+from slam_backend.smoothing.coarsening import CONTRADICTION, OF_POINTS, compacted
+from slam_backend.smoothing.extending import chained
+from slam_backend.smoothing.graph import NONE, PathGraph
+from slam_backend.smoothing.options import SmoothingOptions
+from slam_backend.smoothing.sightings import Sightings
+
+
+def plainly_coarsened(graph: PathGraph, camera: FloatArray, options: SmoothingOptions) -> PathGraph:
+    """Return what `coarsened` does."""
+    share = max(1, options.fresh_keys // len(graph.tips))
+    fresh = np.zeros(graph.num_keys, dtype=np.bool_)
+    for robot in range(len(graph.tips)):
+        fresh[np.flatnonzero(graph.robots == robot)[-share:]] = True
+    condensed = _without_blind(_condensed(graph, fresh, camera, options), fresh)
+    representatives, slack = _representatives(condensed, graph.spreads, fresh, options.most_keys(len(graph.tips)))
+    return compacted(_joined(replace(condensed, slack=slack), representatives))
+
+
+def _condensed(graph: PathGraph, fresh: BoolArray, camera: FloatArray, options: SmoothingOptions) -> PathGraph:
+    """Freeze what was measured from keys that are no longer fresh, but for what the smoothed path contradicts."""
+    old = ~fresh[graph.frame_keys[graph.point_frames]]
+    seen = _linearised(graph, camera, options)
+    if options.kernel and (lost := old & (seen.squares > CONTRADICTION * options.kernel)).any():
+        graph = replace(graph, **{name: getattr(graph, name)[~lost] for name in OF_POINTS})
+        seen = _linearised(graph, camera, options)
+    frozen = seen.frozen | ~fresh[seen.keys]
+    keep = fresh[graph.frame_keys[graph.point_frames]]
+    return replace(
+        graph,
+        **{name: getattr(graph, name)[keep] for name in OF_POINTS},
+        frozen_keys=seen.keys[frozen],
+        frozen_landmarks=seen.landmarks[frozen],
+        centres=seen.centres[frozen],
+        infos=seen.infos[frozen],
+        slopes=seen.slopes[frozen],
+        counts=seen.counts[frozen],
+    )
+
+
+def _linearised(graph: PathGraph, camera: FloatArray, options: SmoothingOptions) -> Sightings:
+    """Return all that was measured as forms, linearised where the graph's poses and landmarks are."""
+    seen = Sightings.of(graph)
+    seen.linearise(graph, graph.poses, graph.landmarks, camera, options.noise_scale, options.kernel)
+    return seen
+
+
+def _without_blind(graph: PathGraph, fresh: BoolArray) -> PathGraph:
+    """Chain the odometry over keys from which nothing was measured; they lose their successors."""
+    sighted = np.zeros(graph.num_keys, dtype=np.bool_)
+    sighted[graph.frozen_keys] = True
+    sighted[graph.frame_keys[graph.point_frames]] = True
+    blind = ~sighted & ~fresh & graph.linked
+    if not blind.any():
+        return graph
+    previous, motions, noises = graph.previous.copy(), graph.motions.copy(), graph.noises.copy()
+    for key in np.flatnonzero(graph.linked):  # in the order of time
+        before = previous[key]
+        while blind[before]:
+            motions[key], noises[key] = chained(motions[before], noises[before], motions[key], noises[key])
+            before = previous[before]
+        previous[key] = before
+    return replace(graph, previous=previous, motions=motions, noises=noises)
+
+
+def _representatives(
+    graph: PathGraph, cost: FloatArray, fresh: BoolArray, most_keys: int
+) -> tuple[IntArray, FloatArray]:
+    """Return (k,) the key that each stands rigidly to, itself or an earlier one, or `NONE`; and new slacks (k,)."""
+    k = graph.num_keys
+    representative = np.arange(k)
+    following = np.full(k, NONE)
+    linked = np.flatnonzero(graph.linked)
+    following[graph.previous[linked]] = linked  # a blind key was replaced by its successor, if it has one
+    needed = np.ones(k, dtype=np.bool_)
+    needed[linked] = following[graph.previous[linked]] == linked
+    representative[~needed] = NONE
+    surplus = int(needed.sum()) - most_keys
+    slack, previous = graph.slack.copy(), graph.previous.copy()
+    heap = [(cost[b] + slack[b] + slack[previous[b]], int(b)) for b in linked if needed[b] and not fresh[b]]
+    heapq.heapify(heap)
+    while surplus > 0 and heap:
+        price, b = heapq.heappop(heap)
+        a = int(previous[b])
+        if representative[b] != b or price < cost[b] + slack[a] + slack[b]:
+            if representative[b] == b:
+                heapq.heappush(heap, (cost[b] + slack[a] + slack[b], b))
+            continue
+        representative[b] = a
+        slack[a] += slack[b] + cost[b]
+        after = int(following[b])
+        following[a] = after
+        if after >= 0:
+            previous[after] = a
+        surplus -= 1
+    return representative, slack
+
+
+def _joined(graph: PathGraph, representative: IntArray) -> PathGraph:
+    """Move all that hangs on a key to the one it now stands rigidly to."""
+    kept = representative == np.arange(len(representative))
+    root = np.maximum(representative, 0)
+    while (representative[root] != root).any():
+        root = representative[root]
+    offsets = between(graph.poses[root], graph.poses)
+    offsets[kept] = 0.0
+    number = np.cumsum(kept) - 1
+    before = np.maximum(graph.previous, 0)
+    turn = np.zeros((len(kept), 3, 3))
+    turn[:, :2, :2], turn[:, 2, 2] = rotation(offsets[before, 2]), 1.0
+    moved = _moved(graph, np.flatnonzero(~kept[graph.frozen_keys]), offsets)
+    sightings = _combined(root[graph.frozen_keys], graph.frozen_landmarks, *moved, graph.counts)
+    return replace(
+        graph,
+        robots=graph.robots[kept],
+        poses=graph.poses[kept],
+        previous=np.where(graph.previous >= 0, number[root[before]], NONE)[kept],
+        motions=compose(offsets[before], graph.motions)[kept],
+        noises=(turn @ graph.noises @ turn.transpose(0, 2, 1))[kept],
+        spreads=graph.spreads[kept],
+        slack=graph.slack[kept],
+        frame_keys=number[root[graph.frame_keys]],
+        frozen_keys=number[sightings[0]],
+        frozen_landmarks=sightings[1],
+        centres=sightings[2],
+        infos=sightings[3],
+        slopes=sightings[4],
+        counts=sightings[5],
+        heads=number[graph.heads],
+        tips=number[graph.tips],
+    )
+
+
+def _moved(graph: PathGraph, rows: IntArray, offsets: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return centres, informations and slopes of the frozen sightings, `rows` of them moved by their keys' offsets."""
+    centres, infos, slopes = graph.centres.copy(), graph.infos.copy(), graph.slopes.copy()
+    by = offsets[graph.frozen_keys[rows]]
+    turn = np.zeros((len(by), 3, 3))
+    turn[:, :2, :2], turn[:, 2, 2] = rotation(by[:, 2]), 1.0
+    centres[rows] = np.einsum("nij,nj->ni", turn, centres[rows])
+    centres[rows, :2] += by[:, :2]
+    infos[rows] = (turn @ infos[rows][:, UNPACK] @ turn.transpose(0, 2, 1))[:, *UPPER]
+    slopes[rows] = np.einsum("nij,nj->ni", turn, slopes[rows])
+    return centres, infos, slopes
+
+
+def _combined(
+    keys: IntArray, landmarks: IntArray, centres: FloatArray, infos: FloatArray, slopes: FloatArray, counts: IntArray
+) -> tuple[IntArray, IntArray, FloatArray, FloatArray, FloatArray, IntArray]:
+    """Add up the forms of each pair of key and landmark, about the centre of the first."""
+    if not len(keys):
+        return keys, landmarks, centres, infos, slopes, counts
+    order = np.argsort(landmarks * (keys.max() + 1) + keys, kind="stable")  # which is nearly theirs already
+    keys, landmarks = keys[order], landmarks[order]
+    centres, infos, slopes, counts = centres[order], infos[order], slopes[order], counts[order]
+    new = np.ones(len(keys), dtype=np.bool_)
+    new[1:] = (keys[1:] != keys[:-1]) | (landmarks[1:] != landmarks[:-1])
+    first, other = np.flatnonzero(new), np.flatnonzero(~new)
+    shift = centres[first][np.cumsum(new)[other] - 1] - centres[other]
+    slopes[other] -= np.einsum("nij,nj->ni", infos[other][:, UNPACK], shift)
+    return (
+        keys[first], landmarks[first], centres[first], np.add.reduceat(infos, first), np.add.reduceat(slopes, first),
+        np.add.reduceat(counts, first),
+    )  # fmt: skip
