@@ -19,6 +19,28 @@ _WALL = 255
 
 
 @jit
+def known_bounds(cells: Any) -> tuple[int, int, int, int]:
+    """Return first row, first column, height and width of the cells (300, 300) that are known; zeros if none is."""
+    columns = np.zeros(GRID_SIZE, np.uint8)
+    first_row, last_row = GRID_SIZE, -1
+    for row in range(GRID_SIZE):
+        known = np.uint8(0)
+        for col in range(GRID_SIZE):
+            known |= cells[row, col]
+            columns[col] |= cells[row, col]
+        if known != UNKNOWN:
+            first_row, last_row = min(first_row, row), row
+    if last_row < 0:
+        return 0, 0, 0, 0
+    first_col, last_col = 0, GRID_SIZE - 1
+    while columns[first_col] == UNKNOWN:
+        first_col += 1
+    while columns[last_col] == UNKNOWN:
+        last_col -= 1
+    return first_row, first_col, last_row - first_row + 1, last_col - first_col + 1
+
+
+@jit
 def known_box(cells: Any, row: int, col: int, height: int, width: int) -> Any:
     """Cut the known box out of a grid, and pad it with the cells around.
 
@@ -33,9 +55,9 @@ def known_box(cells: Any, row: int, col: int, height: int, width: int) -> Any:
         (height + 2 PAD, width + 2 PAD) uint8, its first cell being (row - PAD, col - PAD) of the grid.
     """
     box = np.full((height + 2 * PAD, width + 2 * PAD), OUTSIDE, np.uint8)
+    first, last = max(col - PAD, 0), min(col + width + PAD, GRID_SIZE)
     for grid_row in range(max(row - PAD, 0), min(row + height + PAD, GRID_SIZE)):
-        for grid_col in range(max(col - PAD, 0), min(col + width + PAD, GRID_SIZE)):
-            box[grid_row - row + PAD, grid_col - col + PAD] = cells[grid_row, grid_col]
+        box[grid_row - row + PAD, first - col + PAD : last - col + PAD] = cells[grid_row, first:last]
     return box
 
 

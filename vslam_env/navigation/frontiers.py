@@ -10,10 +10,10 @@ from scipy.optimize import linear_sum_assignment
 
 from slam_backend._jit import jit
 from slam_backend.errors import BoolArray, FloatArray, check_array
-from vslam_env.navigation._arguments import pose_floats, positions_array
+from vslam_env.navigation._arguments import check_cells, pose_floats, positions_array
 from vslam_env.navigation._frontier_search import HEADING, LENGTH, NUM_COLUMNS, SIZE, XY, frontier_rows
 from vslam_env.navigation._painting import CELL, GRID_SIZE, HALF_WIDTH
-from vslam_env.navigation.planning import distance_map
+from vslam_env.navigation.planning import DistanceMap, distance_map, ways_from
 
 NUM_SLOTS = 16
 ROBOT_RADIUS = 0.2  # [m]
@@ -47,6 +47,11 @@ class Frontiers:
 def _frontier_rows(cells: NDArray[np.uint8], start_xy: ArrayLike, radius: float, ignored: BoolArray) -> FloatArray:
     """Return what `find_frontiers` finds as (n, 5) rows (x, y, heading, size, length)."""
     ways = distance_map(cells, start_xy, radius)
+    return _rows_of(ways, ignored)
+
+
+def _rows_of(ways: DistanceMap, ignored: BoolArray) -> FloatArray:
+    """Return the frontiers of a map of ways as rows, nearest first."""
     rows: FloatArray = frontier_rows(ways.box, ways.cost, ways.parent, ignored, *ways.corner)
     return rows[rows[:, LENGTH].argsort(kind="stable")]
 
@@ -91,6 +96,20 @@ def _distances(goals: Any, places: Any) -> Any:
         for j in range(len(places)):
             distances[i, j] = np.hypot(goals[i, 0] - places[j, 0], goals[i, 1] - places[j, 1])
     return distances
+
+
+@jit
+def _visit(slots: Any, x: float, y: float, theta: float, teammates: Any, visits: Any) -> bool:
+    """Add to the visits (16,) of the slots what the robot and its teammates (k, 2) count; tell if patience ran out."""
+    ran_out = False
+    for i in range(NUM_SLOTS):
+        at_goal = np.hypot(slots[i, 0] - x, slots[i, 1] - y) <= AT_GOAL
+        looked = at_goal and math.cos(slots[i, HEADING] - theta) > math.cos(LOOKING)
+        for k in range(len(teammates)):
+            at_goal |= np.hypot(slots[i, 0] - teammates[k, 0], slots[i, 1] - teammates[k, 1]) <= AT_GOAL
+        visits[i] += (1 if at_goal else 0) + (LOOK_COUNTS - 1 if looked else 0)
+        ran_out |= visits[i] >= PATIENCE
+    return ran_out
 
 
 @jit
@@ -192,7 +211,8 @@ class CandidateSlots:
         """
         x, y, theta = pose_floats(pose)
         self._count_visits(x, y, theta, positions_array(teammates, "teammates"))
-        found = _frontier_rows(cells, (x, y), ROBOT_RADIUS, self._given_up)
+        check_cells(cells)
+        found = _rows_of(ways_from(cells, x, y, ROBOT_RADIUS), self._given_up)
 
         costs = np.fmin(_distances(self._rows, found), SAME_GOAL)  # NaN, of empty slots, becomes SAME_GOAL
         slots, sources = linear_sum_assignment(costs)
@@ -200,11 +220,8 @@ class CandidateSlots:
 
     def _count_visits(self, x: float, y: float, theta: float, teammates: FloatArray) -> None:
         """Count who is at a goal, and give up what is unknown around goals where patience has run out."""
-        here = np.array([[x, y]])
-        at_goal = (_distances(self._rows, np.vstack([here, teammates])) <= AT_GOAL).any(axis=1)
-        looking = np.cos(self._rows[:, HEADING] - theta) > math.cos(LOOKING)
-        looked = looking & (_distances(self._rows, here)[:, 0] <= AT_GOAL)
-        self._visits = self._visits + at_goal + (LOOK_COUNTS - 1) * looked
+        if not _visit(self._rows, x, y, theta, teammates, self._visits):
+            return
         for slot in np.flatnonzero(self._visits >= PATIENCE):
             along = (np.arange(GRID_SIZE) + 0.5) * CELL - HALF_WIDTH
             goal_x, goal_y = self._rows[slot, XY]

@@ -110,7 +110,7 @@ class LandmarkSensor:
         poses = np.ascontiguousarray(poses, dtype=np.float64)
         robots, most = len(poses), config.max_measurements
         visible = self.visible(poses)
-        num_false = np.minimum(rng.poisson(config.false_points, robots), most)
+        num_false = [min(number, most) for number in rng.poisson(config.false_points, robots).tolist()]
         keys = rng.random(visible.shape)
         ids, points = np.empty(robots * most, np.int64), np.empty((robots * most, 3))
         descriptors = np.empty((robots * most, self._descriptors.shape[1]))
@@ -119,7 +119,7 @@ class LandmarkSensor:
             visible,
             keys,
             config.detection_probability,
-            most - num_false,
+            np.array([most - number for number in num_false]),
             self._landmarks.positions,
             self._descriptors,
             poses,
@@ -130,12 +130,12 @@ class LandmarkSensor:
             descriptors,
         )
         ids, points, descriptors = ids[:total], points[:total], descriptors[:total]
-        extra = int(num_false.sum())
+        extra = sum(num_false)
         if extra:
             ids = np.concatenate([ids, np.full(extra, -1)])
             points = np.concatenate([points, self._false_points(extra, rng)])
             descriptors = np.concatenate([descriptors, self._false_descriptors(extra, rng)])
-            order = _mixed(counts.tolist(), num_false.tolist(), rng.random(len(ids)).tolist())
+            order = _mixed(counts.tolist(), num_false, rng.random(len(ids)).tolist())
             ids, points, descriptors, counts = ids[order], points[order], descriptors[order], counts + num_false
         noise = rng.standard_normal((len(ids), 3 + descriptors.shape[1]))
         sharp, looks = np.empty(len(ids), np.bool_), np.empty(descriptors.shape, np.float32)
