@@ -14,8 +14,9 @@ from slam_backend._particle_maps import ParticleMaps
 from slam_backend._rejuvenated_maps import write_maps
 from slam_backend._rejuvenation_step import RejuvenationStep
 from slam_backend._turns import Assumed
-from slam_backend.errors import FloatArray, IntArray, bad_argument, check_int, check_seed
+from slam_backend.errors import IntArray, bad_argument, check_int, check_seed
 from slam_backend.filter_options import FilterOptions
+from slam_backend.input_log import RobotInput
 from slam_backend.reports import PoseEstimate, StepReport
 from slam_backend.run_log import RobotLog
 from slam_backend.smoothing.holding import add_share
@@ -142,25 +143,19 @@ class FilterState:
 
     # ------------------------------------------------------------------ what a step leaves behind
 
-    def _write_down(
-        self,
-        turns: Sequence[Turn],
-        moves: Sequence[FloatArray | None],
-        exact: Sequence[FloatArray | None],
-        report: StepReport,
-    ) -> None:
+    def _write_down(self, turns: Sequence[Turn], inputs: Sequence[RobotInput], report: StepReport) -> None:
         """Log what the robots did and measured in the step before `_steps`, and what that was taken for."""
-        for robot, turn in enumerate(turns):
-            if exact[robot] is not None:
+        for robot, (turn, (move, _, _, exact)) in enumerate(zip(turns, inputs, strict=True)):
+            if exact is not None:
                 self._frame.fill(0.0)  # it is known now
-            if turn.size or moves[robot] is not None or exact[robot] is not None:
+            if turn.size or move is not None or exact is not None:
                 ids = report.associations[robot]
                 self._logs[robot].append(
-                    self._steps - 1, moves[robot], exact[robot], turn.points,
+                    self._steps - 1, move, exact, turn.points,
                     ids if turn.keep is None else ids[turn.keep], turn.noises if turn.given else None,
                 )  # fmt: skip
                 if self._rejuvenation is not None:
-                    self._rejuvenation.note(robot, self._steps - 1, self._estimates[robot], exact[robot] is not None)
+                    self._rejuvenation.note(robot, self._steps - 1, self._estimates[robot], exact is not None)
                     if turn.names is None:
                         self._rejuvenation.note_refused(robot, self._steps - 1, ids, turn.descriptors)
 

@@ -6,7 +6,8 @@ import numpy as np
 
 from slam_backend import _kernels
 from slam_backend.camera import StereoCamera
-from slam_backend.errors import FloatArray, IntArray, bad_argument, check_array
+from slam_backend.errors import FloatArray, bad_argument, check_array
+from slam_backend.input_log import RobotInput
 from slam_backend.measurements import Measurements
 
 FARTHEST_MOVE = 1e4  # [m, rad]; no robot moves so far between two steps
@@ -17,8 +18,8 @@ FARTHEST_POSE = 1e6  # [m, rad]; no robot goes so far from its start
 
 def check_step(
     k: int, size: int, camera: StereoCamera, odometry: Any, measurements: Any, identities: Any, poses: Any
-) -> tuple[list[FloatArray | None], list[Measurements | None], list[IntArray | None], list[FloatArray | None]]:
-    """Return the arguments of `FastSlam.step` for k robots as lists of checked arrays.
+) -> list[RobotInput]:
+    """Return the arguments of `FastSlam.step` for k robots, checked, robot by robot.
 
     Args:
         k: Number of robots.
@@ -44,12 +45,11 @@ def check_step(
             raise bad_argument(name, f"a sequence with one entry per robot ({k})", got, "Use None for no reading.")
     identities = none if identities is None else identities
     poses = none if poses is None else poses
-    moves: list[FloatArray | None] = []
-    names: list[IntArray | None] = []
-    exact: list[FloatArray | None] = []
+    inputs = []
     for robot in range(k):
         move, frame, identity, pose = odometry[robot], measurements[robot], identities[robot], poses[robot]
-        moves.append(None if move is None else _check_move(robot, move))
+        if move is not None:
+            move = _check_move(robot, move)
         if frame is not None:
             if not isinstance(frame, Measurements):
                 raise bad_argument(f"measurements[{robot}]", "Measurements or None", frame, "Wrap the arrays.")
@@ -62,9 +62,10 @@ def check_step(
             else:
                 cure = "Name each measurement."
                 identity = check_array(f"identities[{robot}]", identity, wanted, cure, dtype=np.int64)
-        names.append(identity)
-        exact.append(None if pose is None else _check_pose(robot, pose))
-    return moves, list(measurements), names, exact
+        if pose is not None:
+            pose = _check_pose(robot, pose)
+        inputs.append(RobotInput(move, frame, identity, pose))
+    return inputs
 
 
 def _check_move(robot: int, move: Any) -> FloatArray:

@@ -135,19 +135,20 @@ def take_in(branch: Branch, step: int, robots: Sequence[int], inputs: Sequence[R
         robots: Whose readings.
         inputs: One for each, checked by `check_step`.
     """
-    branch.known.update(dict.fromkeys(robots, step))
+    for robot in robots:
+        branch.known[robot] = step
     for watch in branch.watches:
         watch.steps += watch.together(robots)
     if all(reading.is_silent for reading in inputs):
         branch.report = _silent_report(branch)
         return branch.report
-    given = dict(zip(robots, inputs, strict=True))
-    told = [given.get(robot, NOTHING) for robot in branch.robots]
+    if len(robots) < len(branch.robots):
+        given = dict(zip(robots, inputs, strict=True))
+        inputs = [given.get(robot, NOTHING) for robot in branch.robots]
     smoothing = branch.robots if branch.split_from is None else branch.live
-    branch.filter.may_smooth = step % TURNS in {robot % TURNS for robot in smoothing}
+    branch.filter.may_smooth = step % TURNS in [robot % TURNS for robot in smoothing]
     branch.filter._steps = step
-    odometry, frames, identities, poses = zip(*told, strict=True)
-    branch.report = report = branch.filter._step_checked(odometry, frames, identities, poses)
+    branch.report = report = branch.filter._step_checked(inputs)
     for watch in branch.watches:
         watch.note(branch.robots, report)
     return report

@@ -18,11 +18,12 @@ from slam_backend._step_input import check_step
 from slam_backend._turns import RobotParticles, conclude, take_turn
 from slam_backend.adaptation import AdaptiveParticles, next_num_particles
 from slam_backend.camera import StereoCamera
-from slam_backend.errors import FloatArray, IntArray, check_array
+from slam_backend.errors import check_array
 from slam_backend.existence import ExistenceModel
 from slam_backend.filter_knowledge import FilterKnowledge
 from slam_backend.filter_options import FilterOptions
 from slam_backend.geometry import wrap_angle
+from slam_backend.input_log import RobotInput
 from slam_backend.measurements import Measurements
 from slam_backend.motion import OdometryModel
 from slam_backend.reports import RejuvenationReport, StepReport
@@ -155,25 +156,19 @@ class FastSlam(FilterKnowledge):
             ValueError: If an argument is ill-formed; the filter is then as before.
         """
         return self._step_checked(
-            *check_step(
+            check_step(
                 self.num_robots, self.descriptor_size, self.options.camera, odometry, measurements, identities, poses
             )
         )
 
-    def _step_checked(
-        self,
-        moves: Sequence[FloatArray | None],
-        frames: Sequence[Measurements | None],
-        names: Sequence[IntArray | None],
-        exact: Sequence[FloatArray | None],
-    ) -> StepReport:
+    def _step_checked(self, inputs: Sequence[RobotInput]) -> StepReport:
         """Do what `step` does with readings that `check_step` returned; none of them is written to."""
         buffers = self._buffers
-        buffers.start(sum(0 if frame is None else len(frame) for frame in frames))
+        buffers.start(sum([0 if reading.frame is None else len(reading.frame.points) for reading in inputs]))
         turns, deserted = [], []
-        for robot in range(len(frames)):
-            turns.append(self._take_turn(robot, moves[robot], frames[robot], names[robot], exact[robot]))
-            if self._existence is not None and frames[robot] is not None:
+        for robot, reading in enumerate(inputs):
+            turns.append(self._take_turn(robot, reading))
+            if self._existence is not None and reading.frame is not None:
                 where, best = self._poses[robot], self.best_particle
                 deserted.append(self._existence.weigh(self._maps, where, best, turns[robot]))
         self._steps += 1
@@ -182,7 +177,7 @@ class FastSlam(FilterKnowledge):
         report, self._estimates = conclude(
             turns, buffers, self._maps.ids, weights, (self._means, self._covariances), threshold
         )  # fmt: skip
-        self._write_down(turns, moves, exact, report)
+        self._write_down(turns, inputs, report)
         self._widen()
         for slots in deserted:
             self._maps.release(slots)
@@ -237,15 +232,9 @@ class FastSlam(FilterKnowledge):
             self._renew(result.particles)
         return RejuvenationReport(result.reason, result.ess, result.iterations, result.graph.num_keys)
 
-    def _take_turn(
-        self,
-        robot: int,
-        move: FloatArray | None,
-        frame: Measurements | None,
-        names: IntArray | None,
-        exact: FloatArray | None,
-    ) -> Turn:
+    def _take_turn(self, robot: int, reading: RobotInput) -> Turn:
         """Take one robot's turn in the step; where it did and saw nothing no random number is drawn."""
+        move, frame, names, exact = reading
         turn = self._buffers.take(frame, names)
         if len(turn.points) or move is not None or exact is not None:
             own = RobotParticles(

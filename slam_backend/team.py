@@ -125,8 +125,7 @@ class TeamSlam(TeamKnowledge):
         networks = reach(check_contacts(contacts, self._num_robots), self._num_robots)
         camera = self._groups[0].trunk.filter.options.camera
         size = self._descriptor_size()
-        checked = check_step(self._num_robots, size, camera, odometry, measurements, identities, poses)
-        inputs = [RobotInput(*reading) for reading in zip(*checked, strict=True)]
+        inputs = check_step(self._num_robots, size, camera, odometry, measurements, identities, poses)
         records, before = self._records, len(self._events)
         records.log.record(self._step, inputs)
         for group in self._groups:

@@ -76,7 +76,8 @@ class TeamKnowledge:
     @property
     def maps(self) -> tuple[int, ...]:
         """Per robot the number of the map that it goes by; see `TeamReport`."""
-        return tuple(self._branch(robot).number for robot in range(self._num_robots))
+        self._place(0)
+        return tuple([branch.number for _, branch, _ in self._places])
 
     @property
     def diagnostics(self) -> tuple[dict[str, float], ...]:
@@ -205,10 +206,6 @@ class TeamKnowledge:
     def _group_of(self, robot: int) -> Group:
         """Return the robot's group."""
         return self._place(robot)[0]
-
-    def _branch(self, robot: int) -> Branch:
-        """Return the branch that the robot goes by."""
-        return self._place(robot)[1]
 
     def _find(self, robot: int) -> tuple[Branch, int]:
         """Return the branch that the robot goes by, and its place in it."""

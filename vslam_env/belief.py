@@ -161,9 +161,10 @@ class TeamBelief:
             self._outlines[number] = self._team.outline(robot, self._confirm_after)
         return self._outlines[number]
 
-    def start_from_group(self, robot: int) -> FloatArray:
-        """Return (3,) the motion from the group's map frame to the robot's own start frame. A copy."""
-        return np.array(self._starts[robot])
+    @property
+    def starts_from_group(self) -> FloatArray:
+        """(K, 3) float64 [m, m, rad]. The motion from its group's map frame to each robot's own start frame. A copy."""
+        return self._starts.copy()
 
     @property
     def grids(self) -> list[SeenGrid]:

@@ -14,7 +14,7 @@ from vslam_env.belief import Body, TeamBelief
 from vslam_env.communication import contacts
 from vslam_env.config import TICK, EnvConfig
 from vslam_env.coverage import Coverage
-from vslam_env.errors_of_maps import MapScores, world_from_group
+from vslam_env.errors_of_maps import MapScores
 from vslam_env.oracle import true_alignment
 from vslam_env.pose_errors import pose_errors
 from vslam_env.readings import Readings
@@ -119,9 +119,9 @@ class Episode:
     def map_scores(self) -> list[MapScores]:
         """Score each robot's map as it stands."""
         scores = []
-        for robot, start in enumerate(self.true_starts):
-            placed = world_from_group(start, self.belief.start_from_group(robot))
-            scores.append(self.ledger.score(robot, self.belief.outline(robot), placed))
+        placed = compose(self.true_starts, self.belief.starts_from_group)  # where its own estimates put each map
+        for robot in range(len(placed)):
+            scores.append(self.ledger.score(robot, self.belief.outline(robot), placed[robot]))
         return scores
 
     def believed_poses(self) -> FloatArray:

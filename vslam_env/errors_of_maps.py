@@ -9,7 +9,6 @@ import numpy as np
 
 from slam_backend._jit import jit
 from slam_backend.errors import FloatArray, IntArray, check_float
-from slam_backend.geometry import compose
 from slam_backend.landmark_map import LandmarkMap, MapOutline
 from slam_backend.reports import LandmarksCreated, MapCopied, MapDropped, Renaming, TeamReport
 
@@ -167,8 +166,3 @@ class ClaimLedger:
             book = np.concatenate([book, np.full(max(needed, 2 * len(book)) - len(book), UNUSED)])
             self._claims[number] = book
         book[ids] = claims
-
-
-def world_from_group(true_start: FloatArray, start_from_group: FloatArray) -> FloatArray:
-    """Return where a robot's own estimates put the group's map frame in the world, (3,) [m, m, rad]."""
-    return compose(true_start, start_from_group)

@@ -1,5 +1,6 @@
 """Rewards as named, weighted terms of what a step changed."""
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
@@ -172,7 +173,7 @@ def evaluate(
     rewards = {}
     for term in terms:
         value = np.asarray(term(before, after), dtype=np.float64)
-        if value.shape != (robots,) or not np.isfinite(value).all():
+        if value.shape != (robots,) or not all(map(math.isfinite, value.tolist())):
             raise bad_argument(
                 f"reward term {term.name!r}", f"{robots} finite numbers", value, "Return one number for each robot."
             )

@@ -127,11 +127,11 @@ class PlainFastSlam:
             ValueError: If an argument is ill-formed; the filter is then as before.
         """
         k = len(self.is_blind)
-        arguments = check_step(k, self._descriptor_size, self.options.camera, odometry, measurements, identities, poses)
+        inputs = check_step(k, self._descriptor_size, self.options.camera, odometry, measurements, identities, poses)
         records = []
-        for robot, reading in enumerate(zip(*arguments, strict=True)):
+        for robot, reading in enumerate(inputs):
             records.append(self._step_robot(robot, *reading))
-            if self.options.existence is not None and reading[1] is not None:
+            if self.options.existence is not None and reading.frame is not None:
                 best = self.particles[self.best_particle]  # weights change once all robots have had their turns
                 model, camera = self.options.existence, self.options.camera
                 weigh_existence(self.particles, best, robot, records[robot], model, camera)
