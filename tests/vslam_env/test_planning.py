@@ -22,7 +22,18 @@ from vslam_env.navigation import (
     follow_path,
     plan_path,
 )
-from vslam_env.navigation._wavefront import CLOSE, NEAR, OPEN, UNREACHED, wavefront, weigh
+from vslam_env.navigation._wavefront import (
+    CLOSE,
+    NEAR,
+    OPEN,
+    OUTSIDE,
+    PAD,
+    UNREACHED,
+    known_bounds,
+    known_box,
+    wavefront,
+    weigh,
+)
 
 
 def floor(low: tuple[float, float], high: tuple[float, float], walls: list[tuple[float, ...]]) -> np.ndarray:
@@ -267,3 +278,18 @@ def test_bad_input_is_refused(call, message) -> None:
     """Each wrong argument raises one error that names it."""
     with pytest.raises(ValueError, match=message):
         call()
+
+
+@pytest.mark.parametrize("places", [[], [(0, 0)], [(299, 299)], [(3, 250), (200, 7)], [(0, 120), (299, 120)]])
+def test_the_known_box_holds_all_known_cells_and_no_more(places: list[tuple[int, int]]) -> None:
+    """Its bounds are the least and largest row and column of what is known, and it is padded with what lies outside."""
+    cells = np.full((GRID_SIZE, GRID_SIZE), UNKNOWN, np.uint8)
+    for row, col in places:
+        cells[row, col] = OCCUPIED
+    row, col, height, width = known_bounds(cells)
+    rows, cols = np.nonzero(cells)
+    expected = (rows.min(), cols.min(), np.ptp(rows) + 1, np.ptp(cols) + 1) if places else (0, 0, 0, 0)
+    assert (row, col, height, width) == expected
+    padded = np.pad(cells, PAD, constant_values=OUTSIDE)
+    box = known_box(cells, row, col, height, width)
+    np.testing.assert_array_equal(box, padded[row : row + height + 2 * PAD, col : col + width + 2 * PAD])
