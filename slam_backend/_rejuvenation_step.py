@@ -1,6 +1,6 @@
 """What a filter does to be rejuvenated: when it is due, what the smoother is told, what is kept until the next time."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -74,8 +74,9 @@ class RejuvenationStep:
 
     def note_refused(self, robot: int, step: int, ids: IntArray, descriptors: NDArray[np.float32]) -> None:
         """Remember what was neither matched nor new of all that a robot measured without names: ids (n,), looks."""
-        rows = np.flatnonzero(ids < 0)
-        if len(rows) and not self._exact:
+        refused = [row for row, name in enumerate(ids.tolist()) if name < 0]
+        if refused and not self._exact:
+            rows = np.array(refused)
             self._refused[robot][step] = Refused(rows, descriptors[rows])
 
     def count(self, associations: Sequence[IntArray]) -> None:
@@ -130,7 +131,7 @@ class RejuvenationStep:
         """
         due, options = self.due, self._options
         whole = options.smoothing.slice_steps is None
-        if not due and (whole or self._held or self._exact):
+        if not due and (whole or self._held or self._exact or self._rests(logs)):
             return None
         graph = PathGraph.at_uncertain_starts(starts) if self._graph is None else self._graph
         if self._exact or (self._graph is None and any(log.has_exact_poses for log in logs)):
@@ -142,15 +143,15 @@ class RejuvenationStep:
             return self._whole(graph, self._new(logs, graph, maps, best), smoother, maps, best)
         self._graph, self._held = graph, False
         if (draft := self._draft) is not None:
-            return self._after(draft.graph, smoother.descend(draft), _since(logs, graph, draft.graph), smoother)
-        share = max(LEAST_ROWS, (options.smoothing.slice_steps or 0) // len(logs))
-        waiting = max(log.num_since(int(step) + 1) for log, step in zip(logs, graph.latest, strict=True))
+            outcome = smoother.descend(draft)
+            return self._after(draft.graph, outcome, lambda: _since(logs, graph, draft.graph), smoother)
+        share, waiting = self._share(logs), _most_waiting(logs, graph)
         if waiting > 2 * share or not due:
             if waiting < share:
                 return None
             taken = [first_rows(log, share) for log in self._new(logs, graph, maps, best)]
             outcome = smoother.take_in(graph, taken, self._guesses, _places(maps, best))
-            return self._after(graph, outcome, taken, smoother)
+            return self._after(graph, outcome, lambda: taken, smoother)
         last = self._new(logs, graph, maps, best)
         places, looks = _places(maps, best), self._looks(maps)
         drawn = smoother.draw(graph, last, self._guesses, places, maps.num_particles, looks)
@@ -158,7 +159,17 @@ class RejuvenationStep:
             self._rest()
             self._keep(drawn.graph)
             return drawn
-        return self._after(graph, drawn, last, smoother)
+        return self._after(graph, drawn, lambda: last, smoother)
+
+    def _share(self, logs: Sequence[RobotLog]) -> int:
+        """Return how many steps of each log a slice takes in."""
+        return max(LEAST_ROWS, (self._options.smoothing.slice_steps or 0) // len(logs))
+
+    def _rests(self, logs: Sequence[RobotLog]) -> bool:
+        """Return whether no slice is under way, and too little is new for another one: the rule."""
+        if self._graph is None or self._draft is not None:
+            return False
+        return _most_waiting(logs, self._graph) < self._share(logs)
 
     def _new(
         self, logs: Sequence[RobotLog], graph: PathGraph, maps: ParticleMaps, best: int
@@ -239,9 +250,10 @@ class RejuvenationStep:
         return result
 
     def _after(
-        self, tried: PathGraph, outcome: PathGraph | Draft | str, logs: Sequence[LogArrays], smoother: Smoother
-    ) -> Rejuvenation | None:
-        """Take note of what a slice came to."""
+        self, tried: PathGraph, outcome: PathGraph | Draft | str, logs: Callable[[], Sequence[LogArrays]],
+        smoother: Smoother,
+    ) -> Rejuvenation | None:  # fmt: skip
+        """Take note of what a slice came to; `logs` tells what it took in, if that matters."""
         assert self._graph is not None
         self._draft = None
         if isinstance(outcome, PathGraph):
@@ -249,7 +261,7 @@ class RejuvenationStep:
         elif isinstance(outcome, Draft):
             self._draft = outcome
         elif outcome not in NOTHING_TO_DO:
-            return self._lost(self._graph, tried, logs, smoother, outcome)
+            return self._lost(self._graph, tried, logs(), smoother, outcome)
         elif self.due:
             self._rest()
             return _told(self._graph, outcome)
@@ -331,6 +343,11 @@ def _since(logs: Sequence[RobotLog], graph: PathGraph, until: PathGraph | None =
         return new
     ends = [np.searchsorted(log.steps, last, side="right") for log, last in zip(new, until.latest, strict=True)]
     return [first_rows(log, int(end)) for log, end in zip(new, ends, strict=True)]
+
+
+def _most_waiting(logs: Sequence[RobotLog], graph: PathGraph) -> int:
+    """Return how many steps after the last ones of a graph the log has that holds most of them."""
+    return max(log.num_since(step + 1) for log, step in zip(logs, graph.latest.tolist(), strict=True))
 
 
 def _told(graph: PathGraph, reason: str) -> Rejuvenation:

@@ -1,5 +1,6 @@
 """`RobotLog`: all that one robot did and measured in a run, kept compactly for a smoother."""
 
+from bisect import bisect_left
 from collections.abc import Iterator, Mapping
 from typing import Any, Literal
 
@@ -195,11 +196,11 @@ class RobotLog:
 
     def num_since(self, since: int) -> int:
         """Return how many steps there are with an index of at least `since`; cost O(number of chunks with such)."""
-        count = self._num_rows - int(np.searchsorted(self._steps[: self._num_rows], since))
+        count = self._num_rows - bisect_left(self._steps, since, 0, self._num_rows)
         for chunk in reversed(self._chunks):
             if chunk.steps[-1] < since:
                 break
-            count += len(chunk) - int(np.searchsorted(chunk.steps, since))
+            count += len(chunk) - bisect_left(chunk.steps, since)
         return count
 
     def __iter__(self) -> Iterator[LogStep]:

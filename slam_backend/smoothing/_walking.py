@@ -1,4 +1,4 @@
-"""A compiled walk along a robot's new steps: which of them become keys, and where the others stand to these."""
+"""A robot's new steps, compiled: which of them become keys, where the others stand to these, what was measured."""
 
 import math
 
@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from slam_backend._jit import inlined, jit
 from slam_backend.errors import BoolArray, FloatArray, IntArray
-from slam_backend.log_arrays import ODOMETRY
+from slam_backend.log_arrays import ODOMETRY, REJECTED
 
 
 @inlined
@@ -105,3 +105,75 @@ def walk(
             offsets[frames] = chain
             frames += 1
     return keys, frames
+
+
+@jit
+def choose(ids: IntArray, starts: IntArray, counts: IntArray, rows: IntArray, frames: IntArray) -> int:
+    """Say which measurements of a log of T steps are taken: those that bear a name.
+
+    Args:
+        ids: (n,) int64. Names of the measurements, `REJECTED` for none.
+        starts: (T + 1,) int64. Those of step t are starts[t] to starts[t + 1].
+        counts: (T,) int64, result: how many of each step are taken.
+        rows, frames: (n,) int64, results, of which the first rows are written: those measurements, and their frames; a
+            step of which any is taken makes one.
+
+    Returns:
+        How many there are.
+    """
+    num, frame = 0, 0
+    for t in range(len(counts)):
+        first = num
+        for row in range(starts[t], starts[t + 1]):
+            if ids[row] != REJECTED:
+                rows[num], frames[num] = row, frame
+                num += 1
+        counts[t] = num - first
+        frame += num > first
+    return num
+
+
+@jit
+def place(
+    poses: FloatArray, frame_keys: IntArray, offsets: FloatArray, frames: IntArray, points: FloatArray,
+    mount: FloatArray, places: FloatArray,
+) -> None:  # fmt: skip
+    """Write where measured points lie in the map.
+
+    Args:
+        poses: (k, 3) float64 [m, m, rad]. Of the keys, map frame.
+        frame_keys, offsets: (f,), (f, 3) key of each frame, and the frame seen from it.
+        frames, points: (n,), (n, 3) [m] frame of each point, and the point, robot axes, from the camera centre.
+        mount: (3,) [m] of the camera on the robot.
+        places: (n, 3) [m], map frame, result.
+    """
+    for n in range(len(points)):
+        pose, offset = poses[frame_keys[frames[n]]], offsets[frames[n]]
+        c, s = math.cos(pose[2]), math.sin(pose[2])
+        x, y = pose[0] + c * offset[0] - s * offset[1], pose[1] + s * offset[0] + c * offset[1]
+        c, s = math.cos(pose[2] + offset[2]), math.sin(pose[2] + offset[2])
+        ahead, left = points[n, 0] + mount[0], points[n, 1] + mount[1]
+        places[n, 0], places[n, 1] = x + c * ahead - s * left, y + s * ahead + c * left
+        places[n, 2] = points[n, 2] + mount[2]
+
+
+@jit
+def mostly_new(
+    frozen_landmarks: IntArray, counts: IntArray, point_landmarks: IntArray, new_landmarks: IntArray, num: int
+) -> BoolArray:
+    """Return (num,) which landmarks have more new measurements than old ones.
+
+    Args:
+        frozen_landmarks, counts: (s,) landmark of each frozen sighting, and the measurements in it.
+        point_landmarks: (n,) of each old raw measurement.
+        new_landmarks: (m,) of each new one.
+        num: Of landmarks.
+    """
+    more = np.zeros(num, dtype=np.int64)
+    for n in range(len(frozen_landmarks)):
+        more[frozen_landmarks[n]] -= counts[n]
+    for landmark in point_landmarks:
+        more[landmark] -= 1
+    for landmark in new_landmarks:
+        more[landmark] += 1
+    return more > 0

@@ -8,9 +8,9 @@ import numpy as np
 
 from slam_backend.errors import BoolArray, FloatArray, IntArray, bad_argument
 from slam_backend.geometry import compose, rotation
-from slam_backend.log_arrays import EXACT, REJECTED, LogArrays
+from slam_backend.log_arrays import EXACT, LogArrays
 from slam_backend.motion import OdometryModel
-from slam_backend.smoothing._walking import walk
+from slam_backend.smoothing._walking import choose, mostly_new, place, walk
 from slam_backend.smoothing.graph import LEVER, PathGraph
 
 
@@ -85,11 +85,10 @@ def extended(
     points = np.concatenate([log.points[part.rows] for log, part in zip(logs, parts, strict=True)])
     ids = graph.known_as(np.concatenate([log.ids[part.rows] for log, part in zip(logs, parts, strict=True)]))
     offsets = np.concatenate([graph.frame_offsets, *(part.offsets for part in parts)])
-    at = compose(poses[frame_keys_now[new_frames]], offsets[new_frames])
+    first_seen = np.empty((len(points), 3))
+    place(poses, frame_keys_now, offsets, new_frames, points, mount, first_seen)
     slack = np.concatenate([graph.slack, *(part.slack[1:] for part in parts)])
     slack[graph.tips] = np.maximum(slack[graph.tips], [part.slack[0] for part in parts])
-    first_seen = np.column_stack([points[:, :2] + mount[:2], points[:, 2] + mount[2]])
-    first_seen[:, :2] = at[:, :2] + np.einsum("nij,nj->ni", rotation(at[:, 2]), first_seen[:, :2])
     landmark_ids, landmarks, rows = _with_new(graph, ids, first_seen)
     if places is not None and len(places.ids) and guesses is not None and all(map(_guided, logs, guesses)):
         landmarks = _started(graph, landmark_ids, landmarks, rows, places)
@@ -132,11 +131,9 @@ def _started(graph: PathGraph, ids: IntArray, landmarks: FloatArray, rows: IntAr
         rows: (n,) int64. Of the new measurements among `ids`.
         places: Of the filter; at least one.
     """
-    before = np.bincount(graph.frozen_landmarks, weights=graph.counts, minlength=len(ids))
-    before += np.bincount(graph.point_landmarks, minlength=len(ids))
-    at = np.minimum(np.searchsorted(places.ids, ids), len(places.ids) - 1)
-    anew = (np.bincount(rows, minlength=len(ids)) > before) & (places.ids[at] == ids)
-    return np.where(anew[:, None], places.means[at], landmarks)
+    at = np.minimum(places.ids.searchsorted(ids), len(places.ids) - 1)
+    anew = mostly_new(graph.frozen_landmarks, graph.counts, graph.point_landmarks, rows, len(ids))
+    return np.where((anew & (places.ids[at] == ids))[:, None], places.means[at], landmarks)
 
 
 def scatter(noises: FloatArray) -> FloatArray:
@@ -146,6 +143,8 @@ def scatter(noises: FloatArray) -> FloatArray:
 
 def _given(log: LogArrays, part: _Part) -> BoolArray:
     """Return (n,) whether the sensor gave the covariances of the measurements taken."""
+    if not log.given.any():
+        return np.zeros(len(part.rows), dtype=np.bool_)
     return np.repeat(log.given, np.diff(log.starts))[part.rows]
 
 
@@ -179,13 +178,13 @@ def _part(
     if (log.kinds == EXACT).any():
         raise bad_argument("logs", "odometry", "a pose that was given as exact", "There is nothing to smooth.")
     n = len(log)
-    known = np.concatenate([[0], np.cumsum(log.ids != REJECTED)])[log.starts]
     where = [guesses.get(step) for step in log.steps.tolist()] if guesses else [None] * n
     guessed = np.array([pose is not None for pose in where], dtype=np.bool_)
     supposed = np.zeros((n, 3))
     if guessed.any():
         supposed[guessed] = [pose for pose in where if pose is not None]
-    counts = np.diff(known)
+    counts, rows, of_rows = np.empty(n, dtype=np.int64), np.empty_like(log.ids), np.empty_like(log.ids)
+    taken = choose(log.ids, log.starts, counts, rows, of_rows)
     poses, motions, offsets = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3))
     noises, slack, frame_keys = np.empty((n, 3, 3)), np.empty(n + 1), np.empty(n, dtype=np.int64)
     keys, frames = walk(
@@ -199,8 +198,8 @@ def _part(
         slack=slack[: keys + 1],
         frame_keys=frame_keys[:frames],
         offsets=offsets[:frames],
-        rows=np.flatnonzero(log.ids != REJECTED),
-        frames=np.repeat(np.arange(frames), counts[counts > 0]),
+        rows=rows[:taken],
+        frames=of_rows[:taken],
     )
 
 

@@ -92,12 +92,10 @@ def lane_rows(poses: FloatArray) -> FloatArray:
         (P / 64, k, 5, 64) float64: x, y, cos, sin, heading.
     """
     k, _, m = poses.shape
-    blocks = -(-m // LANES)
-    padded = np.empty((k, POSE_ROWS, blocks * LANES))
-    padded[:, :2, :m], padded[:, 4, :m] = poses[:, :2], poses[:, 2]
-    padded[:, 2, :m], padded[:, 3, :m] = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-    padded[:, :, m:] = padded[:, :, :1]
-    return np.ascontiguousarray(padded.reshape(k, POSE_ROWS, blocks, LANES).transpose(2, 0, 1, 3))
+    rows = np.empty((-(-m // LANES), k, POSE_ROWS, LANES))
+    headings = np.ascontiguousarray(poses[:, 2])
+    _kernels.to_lanes(poses, np.cos(headings), np.sin(headings), rows)
+    return rows
 
 
 def replay(mode: Mode, rows: FloatArray, num_particles: int) -> tuple[FloatArray, FloatArray]:

@@ -7,11 +7,11 @@ from slam_backend.smoothing._kernels.factoring import factorise, solve
 from slam_backend.smoothing._kernels.forms import condense, invert
 from slam_backend.smoothing._kernels.gathering import gather
 from slam_backend.smoothing._kernels.ordering import lay_out, minimum_degree, neighbours
-from slam_backend.smoothing._kernels.paths import LANES, POSE_ROWS, WORK_ROWS, odometry_of_paths, replay
+from slam_backend.smoothing._kernels.paths import LANES, POSE_ROWS, WORK_ROWS, odometry_of_paths, replay, to_lanes
 from slam_backend.smoothing._kernels.scattering import scatter_of_links
 
 __all__ = [
     "FREE", "LANES", "POSE_ROWS", "WORK_ROWS", "add_sightings", "condense", "draw", "factorise", "form", "gather",
     "invert", "join_keys", "lay_out", "minimum_degree", "neighbours", "odometry_of_paths", "replay",
-    "scatter_of_links", "solve",
+    "scatter_of_links", "solve", "to_lanes",
 ]  # fmt: skip

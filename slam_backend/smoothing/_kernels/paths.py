@@ -2,7 +2,7 @@
 
 import math
 
-from slam_backend._jit import lanes
+from slam_backend._jit import jit, lanes
 from slam_backend.errors import FloatArray, IntArray
 from slam_backend.smoothing._kernels.equations import WEAK
 
@@ -13,6 +13,31 @@ PX, PY, COS, SIN, HEADING = (LANES * k for k in range(5))
 POSE_ROWS = 5
 A00, A01, A02, A11, A12, A22, B0, B1, B2, ENERGY = (LANES * k for k in range(10))
 WORK_ROWS = 10
+
+
+@jit
+def to_lanes(poses: FloatArray, cosines: FloatArray, sines: FloatArray, rows: FloatArray) -> None:
+    """Write paths in blocks of lanes; surplus lanes are copies of the first path.
+
+    Args:
+        poses: (k, 3, M) float64 [m, m, rad].
+        cosines, sines: (k, M) of the headings.
+        rows: (P / 64, k, 5, 64), result: x, y, cos, sin, heading.
+    """
+    num_paths = poses.shape[2]
+    for block in range(len(rows)):
+        first = block * LANES
+        count = min(LANES, num_paths - first)
+        for key in range(len(poses)):
+            row = rows[block, key]
+            for i in range(count):
+                row[0, i], row[1, i], row[4, i] = (
+                    poses[key, 0, first + i], poses[key, 1, first + i], poses[key, 2, first + i],
+                )  # fmt: skip
+                row[2, i], row[3, i] = cosines[key, first + i], sines[key, first + i]
+            for i in range(count, LANES):
+                row[0, i], row[1, i], row[4, i] = poses[key, 0, 0], poses[key, 1, 0], poses[key, 2, 0]
+                row[2, i], row[3, i] = cosines[key, 0], sines[key, 0]
 
 
 @lanes

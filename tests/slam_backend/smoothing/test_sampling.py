@@ -151,3 +151,15 @@ def test_any_number_of_paths_can_be_drawn(m):
     assert draws.landmarks.shape == (3, 9, m)
     assert np.isfinite(draws.landmarks).all()
     assert draws.log_weights.shape == (m,)
+
+
+def test_lanes_are_filled_up_with_the_first_path():
+    """Positions, cosine, sine and heading of each path lie lane by lane; the surplus is a copy."""
+    poses = np.random.default_rng(9).normal(size=(4, 3, 70))
+    rows = lane_rows(poses)
+    assert rows.shape == (2, 4, 5, 64)
+    lanes = rows.transpose(1, 2, 0, 3).reshape(4, 5, 128)
+    np.testing.assert_array_equal(lanes[:, [0, 1, 4], :70], poses)
+    np.testing.assert_allclose(lanes[:, 2, :70], np.cos(poses[:, 2]), rtol=1e-15)
+    np.testing.assert_allclose(lanes[:, 3, :70], np.sin(poses[:, 2]), rtol=1e-15)
+    np.testing.assert_array_equal(lanes[:, :, 70:], np.repeat(lanes[:, :, :1], 58, axis=2))

@@ -6,10 +6,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from small_problems import camera_of, graph_of, logs_of, small_run
 
-from slam_backend.geometry import between, compose, wrap_angle
-from slam_backend.log_arrays import ODOMETRY, STOOD
+from slam_backend.geometry import between, compose, transform_points, wrap_angle
+from slam_backend.log_arrays import ODOMETRY, REJECTED, STOOD
 from slam_backend.motion import OdometryModel
-from slam_backend.smoothing._walking import walk
+from slam_backend.smoothing._walking import choose, mostly_new, place, walk
 from slam_backend.smoothing.extending import chained, extended, scatter
 from slam_backend.smoothing.graph import LEVER, PathGraph
 from slam_backend.smoothing.options import SmoothingOptions
@@ -68,6 +68,34 @@ def test_the_compiled_walk_is_the_plain_one(steps, rigid_within, seed):
     )  # fmt: skip
     for found, expected in zip(walked(*arguments), plainly_walked(*arguments), strict=True):
         np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
+
+
+def test_measurements_with_names_are_taken():
+    """Which rows bear a name, and of which frame they are if each step with such a row makes one."""
+    ids, starts = np.array([4, REJECTED, 9, REJECTED, 4, 2]), np.array([0, 0, 3, 4, 5, 6])
+    counts, rows, frames = np.empty(5, dtype=np.int64), np.empty(6, dtype=np.int64), np.empty(6, dtype=np.int64)
+    taken = choose(ids, starts, counts, rows, frames)
+    assert counts.tolist() == [0, 2, 0, 1, 1]
+    assert rows[:taken].tolist() == [0, 2, 4, 5]
+    assert frames[:taken].tolist() == [0, 0, 1, 2]
+
+
+def test_points_are_placed_by_their_frames():
+    """Compiled as composed: the key, the frame seen from it, the camera on the robot."""
+    rng = np.random.default_rng(6)
+    poses, offsets, mount = rng.normal(size=(3, 3)), rng.normal(size=(5, 3)), rng.normal(size=3)
+    frame_keys, frames, points = rng.integers(0, 3, 5), rng.integers(0, 5, 20), rng.normal(size=(20, 3))
+    found = np.empty((20, 3))
+    place(poses, frame_keys, offsets, frames, points, mount, found)
+    for n, frame in enumerate(frames):
+        at = compose(poses[frame_keys[frame]], offsets[frame])
+        np.testing.assert_allclose(found[n], transform_points(at, points[n] + mount), atol=1e-12)
+
+
+def test_landmarks_are_mostly_new_that_have_more_new_measurements_than_old():
+    """Old ones are those in frozen sightings and raw ones; as many is not more."""
+    frozen, counts, raw, new = np.array([0, 1, 1]), np.array([2, 1, 1]), np.array([0, 2]), np.array([0, 1, 1, 1, 2, 3])
+    assert mostly_new(frozen, counts, raw, new, 5).tolist() == [False, True, False, True, False]
 
 
 def test_variances_are_squared_sigmas():
