@@ -4,11 +4,14 @@ import numpy as np
 import pytest
 from small_problems import small_run
 
+from slam_backend._rejuvenation_step import RejuvenationStep
 from slam_backend.errors import FloatArray
 from slam_backend.filter import FastSlam
+from slam_backend.filter_options import FilterOptions
 from slam_backend.geometry import between, compose, inverse, rotation, transform_points, wrap_angle
 from slam_backend.smoothing import rejuvenation
 from slam_backend.smoothing._kernels import LANES
+from slam_backend.smoothing.graph import RIGID, PathGraph
 from slam_backend.smoothing.holding import add_share, holding, move_tiles, of_points
 from training.stereo_runs import RunSpec, simulate_run
 
@@ -145,6 +148,23 @@ def test_starts_that_are_given_stay_and_an_exact_pose_needs_no_share():
     np.testing.assert_array_equal(starts, np.repeat(starts[:, :1], slam.num_particles, axis=1))
     slam.step([None], [None], poses=[np.array([1.0, 2.0, 0.3])])
     np.testing.assert_allclose(slam.pose().covariance, 0.0, atol=1e-12)
+
+
+def test_groups_that_share_too_little_doubt_both_frames():
+    """Where one group started in the other's map is as uncertain as both frames are, however alike the particles."""
+    options = FilterOptions(rejuvenate_every=10)
+    a, b, joint = (RejuvenationStep(options, robots) for robots in (1, 1, 2))
+    motion = np.array([2.0, -1.0, 0.7])
+    starts = np.repeat([[np.zeros(3)], [motion]], 5, axis=1).transpose(0, 2, 1)
+    no_names = np.zeros((0, 2), dtype=np.int64)
+    joint.join(a, b, (starts[:1], starts[:1], starts), (SCATTER, 0.5 * SCATTER), no_names, np.zeros(7))
+    graph = PathGraph(**joint.get_state()["graph"])
+    slopes, turn = np.eye(3), np.eye(3)
+    slopes[:2, 2] = -motion[1], motion[0]
+    turn[:2, :2] = rotation(motion[2])
+    expected = slopes @ SCATTER @ slopes.T + turn @ (0.5 * SCATTER) @ turn.T + RIGID**2 * np.eye(3)
+    np.testing.assert_allclose(graph.noises[graph.heads[1]], expected, atol=1e-12)
+    np.testing.assert_allclose(graph.poses[graph.heads[1]], motion, atol=1e-12)
 
 
 def test_maps_of_all_particles_claim_their_share():
