@@ -75,8 +75,8 @@ def coarsened(graph: PathGraph, camera: FloatArray, options: SmoothingOptions) -
 
 def at_mode(graph: PathGraph, mode: Mode, spreads: FloatArray | None = None) -> PathGraph:
     """Return the graph with the poses and landmarks of the mode, and the spreads (k,) [m^2] of motions there."""
-    graph = replace(graph, poses=mode.poses, landmarks=mode.landmarks)
-    return graph if spreads is None else replace(graph, spreads=spreads)
+    spreads = graph.spreads if spreads is None else spreads
+    return replace(graph, poses=mode.poses, landmarks=mode.landmarks, spreads=spreads)
 
 
 def compacted(graph: PathGraph) -> PathGraph:

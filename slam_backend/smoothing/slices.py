@@ -1,6 +1,6 @@
 """The work of a smoother in slices, each of them bounded, so that no step of a filter waits for more than one.
 
-A slice either takes in a few new steps and does one step of Gauss and Newton; or does one more such step, until the
+A slice either takes in a few new steps and does two steps of Gauss and Newton; or does two more of these, until the
 descent has ended, and then joins surplus keys; or, when all is at its mode, takes in the very last keys, ends the
 descent and draws. Between slices there is nothing but a graph, and how damped its next step is.
 """
@@ -22,6 +22,7 @@ from slam_backend.smoothing.rejuvenation import Looks, Rejuvenation, drawn, sett
 from slam_backend.smoothing.solving import Mode, find_mode
 
 NEAR = 100.0  # times the tolerance: slices that do not draw need not end a descent that the next one goes on with
+STEPS = 2  # of Gauss and Newton in a slice: the second as a rule tells that the first has ended the descent
 LAST_STEPS = 3  # of Gauss and Newton in the slice that draws: the graph was at its mode but for the last few keys
 
 
@@ -56,11 +57,10 @@ class Smoother:
     options: SmoothingOptions
     rng: np.random.Generator
 
-    @on_one_thread
     def take_in(
         self, graph: PathGraph, logs: Sequence[LogArrays], guesses: Sequence[Mapping[int, FloatArray]], places: Places
     ) -> PathGraph | Draft | str:
-        """Take in all rows of the logs, which are few, and do one step.
+        """Take in all rows of the logs, which are few, and do the first steps.
 
         Args:
             graph: At its mode.
@@ -74,9 +74,8 @@ class Smoother:
         grown = extended(graph, logs, self.motion, self.camera[4:], guesses, self.options.rigid_within, places)
         return self.descend(Draft(graph=grown))
 
-    @on_one_thread
     def descend(self, draft: Draft) -> PathGraph | Draft | str:
-        """Do one step of a descent.
+        """Do the next steps of a descent.
 
         Args:
             draft: How it stands.
@@ -85,7 +84,7 @@ class Smoother:
             The graph if that ended the descent, how it now stands if not, or what is wrong.
         """
         near = replace(self.options, tolerance=NEAR * self.options.tolerance)
-        mode = find_mode(draft.graph, self.camera, near, 1, draft.damping)
+        mode = find_mode(draft.graph, self.camera, near, STEPS, draft.damping)
         return self._after(draft, mode)
 
     @on_one_thread
@@ -115,7 +114,6 @@ class Smoother:
             return drawn(grown, mode, self.camera, num_particles, self.rng, self.options, looks)
         return self._after(draft, mode)
 
-    @on_one_thread
     def without_measurements(self, graph: PathGraph, logs: Sequence[LogArrays]) -> PathGraph:
         """Return the graph after all rows of the logs, of which only the odometry is believed."""
         blind = [replace(log, ids=np.full_like(log.ids, REJECTED)) for log in logs]

@@ -119,7 +119,7 @@ def find_mode(
         change = system.solve()
         if not np.abs(change[:size]).max() < LARGEST_STEP:
             return given_up("a descent that leaves the world", iteration)
-        expected = -0.5 * float(np.vdot(system.vector, change)) - system.eased  # if the cost were a parabola
+        expected = -0.5 * float((system.vector * change).sum()) - system.eased  # if the cost were a parabola
         trial_poses, trial_landmarks = poses.copy(), landmarks + change[size:]
         trial_poses[sought] += change[:size]
         near = creep * options.tolerance if iteration == most else options.tolerance
