@@ -98,7 +98,7 @@ class FilterState:
 
     def _widen(self) -> None:
         """Give the estimates of the poses, as the particles show them, their share of what these do not show."""
-        if self._frame.any():
+        if self._frame.item(0) or self._frame.item(-1):
             for estimate in self._estimates:
                 add_share(self._frame, estimate.mean[None], estimate.covariance[None])
 
@@ -156,7 +156,7 @@ class FilterState:
                 )  # fmt: skip
                 if self._rejuvenation is not None:
                     self._rejuvenation.note(robot, self._steps - 1, self._estimates[robot], exact is not None)
-                    if turn.names is None:
+                    if turn.names is None and report.num_rejected:
                         self._rejuvenation.note_refused(robot, self._steps - 1, ids, turn.descriptors)
 
     # ------------------------------------------------------------------ snapshots

@@ -217,6 +217,8 @@ class TeamKnowledge:
             branches = [(group, branch) for group in self._groups for branch in group.branches]
             places = {r: (group, branch, branch.robots.index(r)) for group, branch in branches for r in branch.live}
             self._places = [places[r] for r in range(self._num_robots)]
+        if type(robot) is int and 0 <= robot < self._num_robots:
+            return self._places[robot]
         if isinstance(robot, (int, np.integer)) and not isinstance(robot, bool) and 0 <= robot < self._num_robots:
             return self._places[robot]
         raise bad_argument("robot", f"an index from 0 to {self.num_robots - 1}", robot, "Count robots from 0.")

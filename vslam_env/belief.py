@@ -234,9 +234,12 @@ class TeamBelief:
         self._groups = self._team.groups
         self._points = points = [self._team.standpoint(robot) for robot in range(self.num_robots)]
         self._mates = [point.mates for point in points]
-        self._starts = np.array([point.start_from_group for point in points])
-        self._means = np.array([point.poses[point.members.index(robot)].mean for robot, point in enumerate(points)])
-        self._poses = np.array([point.own_pose.mean for point in points])
+        rows = len(points), 3
+        self._starts, self._means, self._poses = np.empty(rows), np.empty(rows), np.empty(rows)
+        for robot, point in enumerate(points):
+            self._starts[robot] = point.start_from_group
+            self._means[robot] = point.poses[point.members.index(robot)].mean
+            self._poses[robot] = point.own_pose.mean
         self._beliefs.clear()
         self._maps.clear()
         self._outlines.clear()

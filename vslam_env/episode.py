@@ -134,10 +134,11 @@ class Episode:
 
     def standing(self, scores: Sequence[MapScores], pose_errors: FloatArray) -> Standing:
         """Return how the team stands, from what `map_scores` and `pose_errors` returned."""
+        errors, recalls, placed = np.array([(score.error, score.recall, score.placed) for score in scores]).T.copy()
         return Standing(
-            map_errors=np.array([score.error for score in scores]),
-            map_recalls=np.array([score.recall for score in scores]),
-            placed_recalls=np.array([score.placed for score in scores]),
+            map_errors=errors,
+            map_recalls=recalls,
+            placed_recalls=placed,
             pose_errors=pose_errors[:, 0],
             pose_sigmas=self.belief.position_sigmas,
             coverage=self._coverage.share(self.belief.grids),

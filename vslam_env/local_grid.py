@@ -28,11 +28,11 @@ def _paint(cells: Any, pose: Any, start_from_group: Any, means: Any, local: Any)
     flat = cells.ravel()
     place = np.empty(SIZE, np.int32)
     for row in range(SIZE):
-        ahead = (middle - 0.5 - row) * CELL
+        ahead = middle - 0.5 - row  # [cells], as what follows
+        first_i, first_j = y / CELL + s * ahead + 0.5 * GRID_SIZE, x / CELL + c * ahead + 0.5 * GRID_SIZE
         for col in range(SIZE):
-            left = (middle - 0.5 - col) * CELL
-            i = (y + s * ahead + c * left) / CELL + 0.5 * GRID_SIZE
-            j = (x + c * ahead - s * left) / CELL + 0.5 * GRID_SIZE
+            left = middle - 0.5 - col
+            i, j = first_i + c * left, first_j - s * left
             inside = (i >= 0.0) & (i < GRID_SIZE) & (j >= 0.0) & (j < GRID_SIZE)
             place[col] = np.int32(i) * GRID_SIZE + np.int32(j) if inside else -1
         for col in range(SIZE):
