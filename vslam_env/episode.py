@@ -97,7 +97,7 @@ class Episode:
 
     def begin(self) -> None:
         """Let the robots take their first frame."""
-        self._perceive(None)
+        self._perceive(self._simulator.poses, self._simulator.bumped, None)
 
     @property
     def true_poses(self) -> FloatArray:
@@ -108,13 +108,13 @@ class Episode:
         """Drive all robots with velocity commands (K, 2) [m/s, rad/s] for a tick, and let them perceive and believe."""
         before = self._simulator.poses
         self._simulator.step(commands)
-        after = self._simulator.poses
         self.tick += 1
+        after, bumped = self._simulator.poses, self._simulator.bumped
         way = after - before
         self._distances += np.hypot(way[:, 0], way[:, 1])
-        self._collisions += self._simulator.bumped
+        self._collisions += bumped
         noise, stream = self._config.odometry, self._streams["odometry"]
-        self._perceive(read_odometry(before, after, self.setting.bias, noise, stream))
+        self._perceive(after, bumped, read_odometry(before, after, self.setting.bias, noise, stream))
 
     def map_scores(self) -> list[MapScores]:
         """Score each robot's map as it stands."""
@@ -188,24 +188,27 @@ class Episode:
 
     # ------------------------------------------------------------------ within
 
-    def _perceive(self, odometry: FloatArray | None) -> None:
-        """Read all sensors at the true poses, and let the robots take it in."""
-        config, poses, bumped = self._config, self._simulator.poses, self._simulator.bumped
+    def _perceive(self, poses: FloatArray, bumped: BoolArray, odometry: FloatArray | None) -> None:
+        """Read all sensors at the true poses (K, 3), and let the robots take it in; (K,) `bumped` into something."""
+        config, oracle_pose = self._config, self._config.oracle_pose
         self.frames = self.setting.sensor.measure(poses, self._streams["sensor"])
         scans = self.setting.scan.measure(poses, self._streams["scan"])
         heard = self._contacts(poses)
+        bumps, told, shown = bumped.tolist(), config.oracle_association, config.observe_images
         self.readings = tuple(
-            Readings(
-                odometry=None if odometry is None else odometry[robot],
-                measurements=frame.measurements,
-                scan=scans[robot],
-                bump=bool(bumped[robot]),
-                pose=between(self.true_starts[robot], poses[robot]) if config.oracle_pose else None,
-                identities=frame.true_ids if config.oracle_association else None,
-                heard=None if heard is None else heard[robot],
-                image=frame.left if config.observe_images and isinstance(frame, EyeFrame) else None,
-            )
-            for robot, frame in enumerate(self.frames)
+            [
+                Readings(
+                    odometry=None if odometry is None else odometry[robot],
+                    measurements=frame.measurements,
+                    scan=scans[robot],
+                    bump=bumps[robot],
+                    pose=between(self.true_starts[robot], poses[robot]) if oracle_pose else None,
+                    identities=frame.true_ids if told else None,
+                    heard=None if heard is None else heard[robot],
+                    image=frame.left if shown and isinstance(frame, EyeFrame) else None,
+                )
+                for robot, frame in enumerate(self.frames)
+            ]
         )
         if self._tap.recorder is not None:
             self._tap.recorder(self.readings)

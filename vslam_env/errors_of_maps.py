@@ -38,14 +38,17 @@ class MapScores:
 
 @jit
 def _score(
-    means: FloatArray, claims: IntArray, pose: FloatArray, truths: FloatArray, cutoff: float
+    means: FloatArray, ids: IntArray, book: IntArray, pose: FloatArray, truths: FloatArray, cutoff: float
 ) -> tuple[float, float, float, float, float]:
-    """Compute `MapScores` of means (n, 3) that `pose` (3,) moves to the frame of the truths (N, 3), N >= 1."""
+    """Compute `MapScores` of means (n, 3) that `pose` (3,) moves to the frame of the truths (N, 3), N >= 1.
+
+    What landmark i claims stands at `book[ids[i]]`.
+    """
     least = np.full(len(truths), np.inf)
     c, s = math.cos(pose[2]), math.sin(pose[2])
     estimated = surplus = 0
     for i in range(len(means)):
-        claim = claims[i]
+        claim = book[ids[i]]
         estimated += claim != UNCOUNTED
         if claim == FALSE:
             surplus += 1
@@ -139,8 +142,10 @@ class ClaimLedger:
             group_map: Its map, or the outline of it, in its map frame.
             world_from_group: (3,) [m, m, rad]. Through the robot's own start frame and its true start pose.
         """
-        claims = self.claims(robot, group_map.ids)
-        return MapScores(*_score(group_map.means, claims, world_from_group, self.true_positions, self.cutoff))
+        book = self._claims[self._map_of[robot]]
+        return MapScores(
+            *_score(group_map.means, group_map.ids, book, world_from_group, self.true_positions, self.cutoff)
+        )
 
     def get_state(self) -> dict[str, Any]:
         """Return a copy of the books, for the same world's landmarks."""
