@@ -186,7 +186,7 @@ class FastSlam(FilterKnowledge):
         if self._rejuvenation is not None:
             self._rejuvenation.count(report.associations)
             if self.may_smooth and (told := self._rejuvenate(self._rejuvenation)) is not None:
-                return replace(report, rejuvenation=told)
+                return report._replace(rejuvenation=told)
         return report
 
     def rejuvenate(self) -> RejuvenationReport:

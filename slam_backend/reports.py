@@ -1,7 +1,7 @@
 """What filters and teams hand back: pose estimates, step reports, merge events. All frozen."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from slam_backend.errors import FloatArray, IntArray
 
@@ -9,8 +9,7 @@ if TYPE_CHECKING:
     from slam_backend.alignment import Alignment
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PoseEstimate:
+class PoseEstimate(NamedTuple):
     """A Gaussian summary of a robot's pose.
 
     Attributes:
@@ -22,8 +21,7 @@ class PoseEstimate:
     covariance: FloatArray
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class StepReport:
+class StepReport(NamedTuple):
     """What one step of `FastSlam` did.
 
     Attributes:
@@ -155,8 +153,7 @@ class MergeUndone:
 MapEntry = MapCopied | MapDropped | LandmarksCreated | MergeUndone | Renaming
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class TeamReport:
+class TeamReport(NamedTuple):
     """What one step of `TeamSlam` did.
 
     Attributes:

@@ -2,8 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,8 +16,7 @@ UNUSED = -3  # an id that no landmark has had so far
 PLACED = 0.5  # [m] a landmark held nearer than this is well placed
 
 
-@dataclass(frozen=True, slots=True)
-class MapScores:
+class MapScores(NamedTuple):
     """How wrong one robot's map is, in its own start frame, without fitting.
 
     Attributes:

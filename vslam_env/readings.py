@@ -1,6 +1,6 @@
 """`Readings`: all that one robot perceives in one tick, and so all that its beliefs and observations can depend on."""
 
-from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,8 +9,7 @@ from slam_backend.errors import BoolArray, FloatArray, IntArray
 from slam_backend.measurements import Measurements
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Readings:
+class Readings(NamedTuple):
     """What one robot's own sensors say in one tick.
 
     Attributes:
@@ -29,7 +28,7 @@ class Readings:
     measurements: Measurements
     scan: FloatArray
     bump: bool
-    pose: FloatArray | None = field(default=None)
-    identities: IntArray | None = field(default=None)
-    heard: BoolArray | None = field(default=None)
-    image: NDArray[np.uint8] | None = field(default=None)
+    pose: FloatArray | None = None
+    identities: IntArray | None = None
+    heard: BoolArray | None = None
+    image: NDArray[np.uint8] | None = None
