@@ -1,0 +1,68 @@
+"""Tables of merges from what soaks have written."""
+
+import importlib.util
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+PATH = Path(__file__).parents[2] / "benchmarks" / "merge_tables.py"
+KEPT = sorted((PATH.parent / "merge_soak").glob("*.json"))
+
+
+@pytest.fixture(scope="module")
+def tables() -> Any:
+    """The script as a module."""
+    spec = importlib.util.spec_from_file_location("merge_tables", PATH)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["merge_tables"] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def merge(seed: int, metres: float, bent: float | None) -> dict[str, Any]:
+    """A merge that is so far off, and would have been so far off."""
+    return {
+        "seed": seed, "world": "office", "step": 49, "robots_a": [0, 2], "robots_b": [1], "error_m": metres,
+        "error_deg": 1.0, "bent_m": bent, "bent_deg": None if bent is None else 2.0, "wrong_pairs": 0.0,
+        "later_m": 0.1, "later_deg": 0.5,
+    }  # fmt: skip
+
+
+def test_merges_are_told_straight_and_bent(tables: Any) -> None:
+    """Of merges that say both: root mean square, 95 %, worst, far ones and false ones; the farthest come first."""
+    merges = [merge(1, 0.3, 0.6), merge(2, 0.4, 0.4), merge(3, 0.2, None)]
+    lines = tables.straight_table(merges).splitlines()
+    assert lines[0].startswith("| maps of 2 merges |")
+    assert lines[2] == "| as the filters bent them | 0.510 | 0.59 | 0.60 | 2 | 1 |"
+    assert lines[3] == "| straightened | 0.354 | 0.40 | 0.40 | 1 | 0 |"
+    worst = tables.worst_table(merges, 2).splitlines()[2:]
+    assert worst[0] == "| 2 | office | 0+2 with 1 | 49: 0.40 m, 1.0° | 0.10 m, 0.5° | 0% |"
+    assert [line.split()[1] for line in worst] == ["2", "1"]
+
+
+def test_forced_merges_say_nothing_of_the_others(tables: Any) -> None:
+    """Only merges that robots made by themselves are held against the truth."""
+    soaks = [
+        {"setting": {"forced": forced}, "merges": [merge(seed, 0.1, None)]} for seed, forced in ((1, True), (2, 0))
+    ]
+    assert [found["seed"] for found in tables.own_merges(soaks)] == [2]
+
+
+def test_all_soaks_that_are_kept_can_be_read(tables: Any) -> None:
+    """Each has a row."""
+    lines = tables.fates_table(tables.read_soaks(KEPT)).splitlines()
+    assert [line.split()[1] for line in lines[2:]] == [file.stem for file in KEPT]
+
+
+@pytest.mark.parametrize("content", ["", "[]", json.dumps({"setting": {}})])
+def test_what_is_no_soak_is_refused(tables: Any, tmp_path: Path, content: str) -> None:
+    """The error names the file."""
+    file = tmp_path / "other.json"
+    file.write_text(content)
+    with pytest.raises(ValueError, match=r"files: expected soaks of merge_soak\.py --json, got '.*other\.json'"):
+        tables.read_soaks([file])
