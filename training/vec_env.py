@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
+from slam_backend import warm_up
 from slam_backend.errors import BoolArray, FloatArray, bad_argument, check_int
 from training.vec_slots import MASK, WHOLE, MakeEnv, SlotBatch, Stepped
 from training.vec_workers import SlotWorkers
@@ -33,10 +34,19 @@ def make_vec_env(
     """
     check_int("num_envs", num_envs, 1, "Use at least one environment.")
     make = partial(vslam_v0.parallel_env, config=config, render_mode=render_mode)
-    env = ExplorationVecEnv([make] * num_envs, workers)
+    env = ExplorationVecEnv([make] * num_envs, workers, partial(load_kernels, config))
     if seed is not None:
         env.seed(seed)
     return env
+
+
+def load_kernels(config: EnvConfig) -> None:
+    """Load all kernels of the backend, and those that the first steps of an environment need, or compile them."""
+    warm_up()
+    env = vslam_v0.parallel_env(config=config)
+    env.reset(seed=0)
+    for _ in range(min(2, config.max_cycles)):
+        env.step({agent: env.action_space(agent).sample() for agent in env.agents})
 
 
 def env_seeds(seed: int, num_envs: int) -> list[int]:
@@ -60,6 +70,7 @@ class ExplorationVecEnv(VecEnv):  # type: ignore[misc]   # its types are not loo
     Args:
         makers: Each makes a parallel environment. With workers they must be picklable.
         workers: Processes among which they are divided; 0: this one.
+        prepare: Called once in each worker before its environments are made; what it loads keeps no step waiting.
 
     Attributes:
         first_slots: The first slot of each environment.
@@ -70,9 +81,11 @@ class ExplorationVecEnv(VecEnv):  # type: ignore[misc]   # its types are not loo
         ValueError: If there is no environment, spaces differ, or there are more workers than environments.
     """
 
-    def __init__(self, makers: Sequence[MakeEnv], workers: int = 0) -> None:
+    def __init__(
+        self, makers: Sequence[MakeEnv], workers: int = 0, prepare: Callable[[], object] = lambda: None
+    ) -> None:
         check_int("workers", workers, 0, "Use 0 for none, or a number of processes.")
-        self._slots: SlotBatch | SlotWorkers = SlotWorkers(makers, workers) if workers else SlotBatch(makers)
+        self._slots: SlotBatch | SlotWorkers = SlotWorkers(makers, workers, prepare) if workers else SlotBatch(makers)
         self._masks: BoolArray | None = None
         ends = np.cumsum(self._slots.counts)
         self.first_slots: list[int] = [0, *ends[:-1].tolist()]

@@ -3,7 +3,7 @@
 import os
 import signal
 import traceback
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
@@ -32,6 +32,8 @@ class SlotWorkers:
     Args:
         makers: Each makes an environment; what cloudpickle can pickle. This process makes each once, to see its spaces.
         workers: How many processes, at least 1.
+        prepare: Called once in each of them, in all at a time, before environments are made: what it loads keeps no
+            step waiting later. Picklable likewise.
 
     Attributes:
         observation_space: Of a slot.
@@ -43,7 +45,7 @@ class SlotWorkers:
         ValueError: If there are more workers than environments, or their spaces differ.
     """
 
-    def __init__(self, makers: Sequence[MakeEnv], workers: int) -> None:
+    def __init__(self, makers: Sequence[MakeEnv], workers: int, prepare: Callable[[], object] = lambda: None) -> None:
         sample = SlotBatch(makers)
         if workers > len(makers):
             cure = "Use fewer workers, or more environments."
@@ -69,7 +71,7 @@ class SlotWorkers:
                 envs = slice(int(share[0]), int(share[-1]) + 1)
                 slots = slice(ends[envs.start], ends[envs.stop])
                 ours, theirs = context.Pipe()
-                packed = cloudpickle.dumps(list(makers[envs]))
+                packed = cloudpickle.dumps((prepare, list(makers[envs])))
                 process = context.Process(target=_serve, args=(theirs, packed, memory, slots, ends[-1]), daemon=True)
                 process.start()
                 theirs.close()
@@ -216,7 +218,14 @@ def _serve(pipe: Connection, packed: bytes, memory: Mapping[str, Any], part: sli
     """Run a worker: answer commands until told to close, or until the other process is gone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     batch: SlotBatch | None = None
-    rows: dict[str, NDArray[Any]] = {}
+    failure: Exception | None = None
+    try:
+        prepare, makers = cloudpickle.loads(packed)
+        prepare()
+        batch = SlotBatch(makers)
+        rows = {name: view[part] for name, view in _views(memory, batch.layout, slots).items()}
+    except Exception as error:  # told when something is asked for
+        failure = _noted(error)
     while True:
         try:
             command, *rest = pipe.recv()
@@ -226,15 +235,19 @@ def _serve(pipe: Connection, packed: bytes, memory: Mapping[str, Any], part: sli
             if batch is not None:
                 batch.close()
             return
+        if batch is None or failure is not None:
+            pipe.send((True, failure))
+            continue
         try:
-            if batch is None:
-                batch = SlotBatch(cloudpickle.loads(packed))
-                rows = {name: view[part] for name, view in _views(memory, batch.layout, slots).items()}
-            answer = _obey(batch, rows, command, rest)
-            pipe.send((False, answer))
+            pipe.send((False, _obey(batch, rows, command, rest)))
         except Exception as error:
-            error.add_note(f"In a worker:\n{traceback.format_exc()}")
-            pipe.send((True, error))
+            pipe.send((True, _noted(error)))
+
+
+def _noted(error: Exception) -> Exception:
+    """Return an error that is being handled, with its traceback as a note, which other processes get to see."""
+    error.add_note(f"In a worker:\n{traceback.format_exc()}")
+    return error
 
 
 def _obey(batch: SlotBatch, rows: Mapping[str, NDArray[Any]], command: str, rest: Sequence[Any]) -> Any:

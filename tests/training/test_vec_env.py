@@ -1,8 +1,10 @@
 """`ExplorationVecEnv`: what Stable-Baselines3 gets is what each environment gives by itself."""
 
+import os
 import time
 from collections.abc import Iterator
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -301,6 +303,28 @@ def test_bad_numbers_are_refused() -> None:
         env.step(np.zeros(3, np.int64))
     with pytest.raises(RuntimeError, match=r"step_wait: .* Call step_async\(\) first"):
         env.step_wait()
+
+
+@pytest.mark.slow
+def test_workers_prepare_before_anything_else(tmp_path: Path) -> None:
+    """Each worker calls `prepare` once before its environments are made; what fails there is raised here."""
+
+    def prepare() -> None:
+        (tmp_path / str(os.getpid())).touch(exist_ok=False)
+
+    env = ExplorationVecEnv([_toy(fails_at=9)] * 3, 2, prepare)
+    env.reset()
+    env.step(np.zeros(3, np.int64))
+    env.close()
+    called = [int(file.name) for file in tmp_path.iterdir()]
+    assert len(called) == 2
+    assert os.getpid() not in called
+
+    def fail() -> None:
+        raise ArithmeticError("nothing is ready")
+
+    with pytest.raises(ArithmeticError, match="nothing is ready"):
+        ExplorationVecEnv([_toy(fails_at=9)], 1, fail)
 
 
 @pytest.mark.slow
