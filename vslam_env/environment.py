@@ -8,31 +8,27 @@ from typing import Any, ClassVar
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
-from pettingzoo import ParallelEnv
 
 from slam_backend.errors import FloatArray, bad_argument, check_choice, check_int
-from slam_backend.reports import MergeEvent
 from vslam_env.actions import GoalDriver, action_space, checked_actions, command_of
-from vslam_env.belief import Belief
 from vslam_env.config import EnvConfig
-from vslam_env.episode import Episode, Recorder, Tap
+from vslam_env.env_knowledge import STATE_PER_ROBOT, AgentID, EnvKnowledge
+from vslam_env.episode import Episode, Tap
 from vslam_env.errors_of_maps import MapScores
+from vslam_env.infos import infos_of
 from vslam_env.observation import flatten, observation_space, observe_glimpse
-from vslam_env.readings import Readings
-from vslam_env.rendering import Scene, draw_frame
+from vslam_env.rendering import draw_frame
 from vslam_env.reward import RewardSpec, Standing, evaluate, make_terms
 from vslam_env.scenes import scene_of
 from vslam_env.setting import draw_setting
 from vslam_env.snapshots import EnvState, check_state, restored_sequence, sequence_state, state_version
 from vslam_env.window import Window
-from vslam_env.world import World, WorldSource, check_source, is_one_building
+from vslam_env.world import WorldSource, check_source, is_one_building
 
-AgentID = str
 RENDER_MODES = ("human", "rgb_array")
-STATE_PER_ROBOT = 12
 
 
-class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # PettingZoo has no type information
+class ExplorationEnv(EnvKnowledge):
     """Robots that do not know where they start explore a building, build maps, and merge these when they fit.
 
     `vslam_v0.parallel_env` describes the arguments; what is observed is described in `vslam_env.observation`.
@@ -90,16 +86,6 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         self._window = Window(self.metadata["name"])
 
     # ------------------------------------------------------------------ PettingZoo
-
-    def observation_space(self, agent: AgentID) -> spaces.Space[Any]:
-        """Return the space of an agent's observations; always the same object."""
-        self._index(agent)
-        return self.observation_spaces[agent]
-
-    def action_space(self, agent: AgentID) -> spaces.Space[Any]:
-        """Return the space of an agent's actions; always the same object."""
-        self._index(agent)
-        return self.action_spaces[agent]
 
     def reset(
         self, seed: int | None = None, options: Mapping[str, Any] | None = None
@@ -207,76 +193,6 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         """Close the window, if there is one."""
         self._window.close()
 
-    def state(self) -> NDArray[np.float32]:
-        """Return the truth for centralised critics, as one float32 vector.
-
-        Per robot: true pose (x, y, cos, sin, world frame), pose as estimated (x, y, cos, sin, laid at the true start),
-        map error, map recall, heading error, first robot of its group; then coverage and merges of the team.
-        """
-        episode = self._running_episode("state")
-        true, believed = episode.true_path[-1], episode.believed_poses()
-        rows = [np.column_stack([poses[:, :2], np.cos(poses[:, 2]), np.sin(poses[:, 2])]) for poses in (true, believed)]
-        standing = self._standing
-        frames = [episode.belief.group(robot)[0] for robot in range(len(true))]
-        scored = np.column_stack([standing.map_errors, standing.map_recalls, self._pose_errors[:, 1], frames])
-        return np.concatenate([np.hstack([*rows, scored]).ravel(), [standing.coverage, standing.merges]]).astype(
-            np.float32
-        )
-
-    # ------------------------------------------------------------------ beyond PettingZoo
-
-    def belief(self, agent: AgentID) -> Belief:
-        """Return what an agent's robot believes; it holds nothing of the truth."""
-        return self._running_episode("belief").belief.belief(self._index(agent))
-
-    @property
-    def events(self) -> tuple[MergeEvent, ...]:
-        """All attempts and merges since the reset, in order."""
-        return self._running_episode("events").belief.events
-
-    @property
-    def readings(self) -> tuple[Readings, ...]:
-        """What each robot perceived in the last tick."""
-        return self._running_episode("readings").readings
-
-    @property
-    def world(self) -> World:
-        """The true world of this episode, its landmarks included."""
-        return self._running_episode("world").world
-
-    @property
-    def true_landmarks(self) -> FloatArray:
-        """(N, 3) float64 [m], world frame. The landmarks that count: those that some robot could ever see."""
-        return self._running_episode("true_landmarks").ledger.true_positions
-
-    @property
-    def true_poses(self) -> FloatArray:
-        """(K, 3) float64 [m, m, rad], world frame."""
-        return self._running_episode("true_poses").true_poses
-
-    @property
-    def true_start_poses(self) -> FloatArray:
-        """(K, 3) float64 [m, m, rad], world frame."""
-        return self._running_episode("true_start_poses").true_starts.copy()
-
-    @property
-    def episode(self) -> Episode:
-        """The running episode, for diagnosis: the simulator's books, paths, seeds."""
-        return self._running_episode("episode")
-
-    @property
-    def recorder(self) -> Recorder | None:
-        """A function to be called with the readings of every tick, those of the reset included; may be assigned."""
-        return self._tap.recorder
-
-    @recorder.setter
-    def recorder(self, recorder: Recorder | None) -> None:
-        self._tap.recorder = recorder
-
-    def scene(self) -> Scene:
-        """Return what a picture shows now."""
-        return scene_of(self._running_episode("scene"), self._standing)
-
     # ------------------------------------------------------------------ snapshots
 
     def get_state(self) -> EnvState:
@@ -339,16 +255,6 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
 
     # ------------------------------------------------------------------ within
 
-    def _running_episode(self, name: str) -> Episode:
-        if self._episode is None:
-            raise RuntimeError(f"{name}: expected a running episode, got none. Call reset() first.")
-        return self._episode
-
-    def _index(self, agent: AgentID) -> int:
-        if agent not in self.possible_agents:
-            raise bad_argument("agent", f"one of {self.possible_agents}", agent, "Use a name of possible_agents.")
-        return self.possible_agents.index(agent)
-
     def _drive(self, episode: Episode, chosen: list[Any]) -> list[int]:
         """Carry out one action per robot; return which were masked (K,)."""
         config = self.config
@@ -397,35 +303,10 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         return observations
 
     def _infos(self, terms: Mapping[str, FloatArray], invalid: list[int]) -> dict[AgentID, dict[str, Any]]:
-        """Return each agent's figures; `map_rmse` is the cutoff of the map error while nothing is matched.
-
-        `collisions` (ticks), `distance` [m], `bytes_sent` and `merges` count since the reset.
-        """
-        standing, belief = self._standing, self._running_episode("step").belief
-        pose_errors, collisions = self._pose_errors.tolist(), standing.collisions.tolist()
-        distances, bytes_sent = standing.distances.tolist(), standing.bytes_sent.tolist()
-        paid = {f"reward/{name}": values.tolist() for name, values in terms.items()}
-        infos: dict[AgentID, dict[str, Any]] = {}
-        for robot, agent in enumerate(self.agents):
-            scores, group = self._scores[robot], belief.group(robot)
-            infos[agent] = {
-                "map_error": scores.error,
-                "map_rmse": scores.rmse,
-                "map_recall": scores.recall,
-                "map_precision": scores.precision,
-                "pose_error": pose_errors[robot][0],
-                "heading_error": pose_errors[robot][1],
-                "coverage": standing.coverage,
-                "group": group[0],
-                "group_size": len(group),
-                "merges": standing.merges,
-                "collisions": collisions[robot],
-                "distance": distances[robot],
-                "bytes_sent": bytes_sent[robot],
-                "invalid_action": invalid[robot],
-                **{name: values[robot] for name, values in paid.items()},
-            }
-        return infos
+        """Return each agent's figures after a step that paid `terms`."""
+        belief = self._running_episode("step").belief
+        groups = [belief.group(robot) for robot in range(len(self.agents))]
+        return infos_of(self.agents, groups, self._scores, self._pose_errors, self._standing, terms, invalid)
 
 
 def _unpickled(made_from: tuple[Any, ...], max_cycles: int, state: EnvState) -> ExplorationEnv:
