@@ -48,12 +48,13 @@ def train(
     the same weights as a training that never stopped, even if it was killed.
     """
     from slam_backend.errors import bad_argument, check_int
-    from training.learn_config import TrainConfig
+    from training.learn_config import SPLIT_TRAIN, TrainConfig
     from training.learn_extra import need_learner
     from training.run_folder import RunFolder, installed_versions, read_config
 
     need_learner()
     from training.learn import Training, check_device, kept_of
+    from training.vec_env import load_kernels
 
     given = {"preset": preset, "world": world, "robots": robots, "steps": steps, "envs": envs, "seed": seed}
     if workers is not None:
@@ -72,7 +73,7 @@ def train(
     crew = default_workers(chosen) if workers is None else workers
     if resume is None:
         # A bad world shows before there is a folder.
-        console, folder = begin(COMMAND, chosen, out, lambda: _first_steps(chosen))
+        console, folder = begin(COMMAND, chosen, out, lambda: load_kernels(chosen.make_env_config(SPLIT_TRAIN)))
     else:
         prepare()
         folder = RunFolder(resume, COMMAND, chosen.to_mapping(), chosen.seed, installed_versions())
@@ -96,17 +97,6 @@ def default_workers(config: "TrainConfig") -> int:
 
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return 0 if cores == 1 else min(cores, config.envs)
-
-
-def _first_steps(config: "TrainConfig") -> None:
-    """Take two steps in the environment, which need all kernels but those of a merge."""
-    from training.learn_config import SPLIT_TRAIN
-    from vslam_env import vslam_v0
-
-    env = vslam_v0.parallel_env(config=config.make_env_config(SPLIT_TRAIN))
-    env.reset(seed=config.seed)
-    for _ in range(min(2, config.max_cycles)):
-        env.step(dict.fromkeys(env.agents, 0))
 
 
 def _run_live(console: Console, training: "Training") -> tuple[bool, float]:

@@ -41,12 +41,12 @@ def make_vec_env(
 
 
 def load_kernels(config: EnvConfig) -> None:
-    """Load all kernels of the backend, and those that the first steps of an environment need, or compile them."""
-    warm_up()
+    """Load or compile the kernels that the first steps of an environment need, then all of the backend."""
     env = vslam_v0.parallel_env(config=config)
     env.reset(seed=0)
     for _ in range(min(2, config.max_cycles)):
         env.step({agent: env.action_space(agent).sample() for agent in env.agents})
+    warm_up()
 
 
 def env_seeds(seed: int, num_envs: int) -> list[int]:
