@@ -40,8 +40,9 @@ def evaluate(
 ) -> None:
     """Compare a model with random valid goals and the nearest frontier on the same unseen worlds, with intervals.
 
-    All see the same worlds, starts and noise, and decide equally often. Ctrl-C finishes the episode under way; the
-    same command with --out FOLDER goes on from there.
+    All see the same worlds, starts and noise, and decide equally often.
+    Ctrl-C finishes the episode under way; the same command with --out FOLDER
+    goes on from there.
     """
     from functools import partial
 
