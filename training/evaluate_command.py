@@ -46,7 +46,7 @@ def evaluate(
     """
     from functools import partial
 
-    from slam_backend.errors import check_int
+    from slam_backend.errors import bad_argument, check_int
     from training.evaluation import COMMAND, EvaluateConfig, EvaluateTrial, play
     from training.evaluation_summary import leads, print_evaluation, summarise
     from training.run_folder import plain
@@ -66,6 +66,9 @@ def evaluate(
     }
     chosen = choose(EvaluateConfig, COMMAND, given, config=config, json=json, out=out)
     env = vslam_v0.parallel_env(config=chosen.environment())  # what cannot be built shows before there is a folder
+    if split is not None and env.config.world_split is None:
+        cure = "Leave --split out: starts and noise differ from those of the training all the same."
+        raise bad_argument("split", "worlds of which there are many", env.config.world, cure)
     console, folder = begin(COMMAND, chosen, out, lambda: _one_step(env, chosen), goes_on=True)
     part = KeptPart(
         file=TRIALS_FILE, kind=EvaluateTrial, play=partial(play, chosen), trials=chosen.trials(), processes=processes,
@@ -73,7 +76,7 @@ def evaluate(
     )  # fmt: skip
     (rows,) = play_kept(console, folder, part)
     lines, ahead = plain(summarise(rows)), plain(leads(rows))
-    print_evaluation(console, lines, ahead)
+    print_evaluation(console, lines, ahead, env.config.world_split)
     finish(console, folder, folder.write_metrics({"policies": lines, "leads": ahead, "trials": rows}), json)
 
 

@@ -55,8 +55,15 @@ def leads(rows: Rows) -> list[dict[str, Any]]:
     return found
 
 
-def print_evaluation(console: Console, lines: Rows, ahead: Rows) -> None:
-    """Print a table, which 80 columns hold, and a line for each lead."""
+def print_evaluation(console: Console, lines: Rows, ahead: Rows, split: str | None) -> None:
+    """Print a table, which 80 columns hold, and a line for each lead.
+
+    Args:
+        console: Where to.
+        lines: As `summarise` returns them.
+        ahead: As `leads` returns them.
+        split: Of the worlds; None where all episodes are in the same building.
+    """
     played = sorted({line["seeds"] for line in lines})
     episodes = "-".join(str(n) for n in (played if len(played) < 2 else (played[0], played[-1])))
     rows = [
@@ -66,7 +73,8 @@ def print_evaluation(console: Console, lines: Rows, ahead: Rows) -> None:
         ]
         for line in lines
     ]
-    title = f"Worlds that were not trained on, {episodes} episodes of each policy"
+    worlds = "One building" if split is None else f"Worlds of the {split} split"
+    title = f"{worlds}, {episodes} episodes of each policy"
     console.print(console_table(title, ["policy", *SHOWN.values()], rows))
     for lead in ahead:
         console.print(

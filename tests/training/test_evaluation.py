@@ -47,16 +47,17 @@ def test_equal_differences_have_an_interval_of_no_width() -> None:
     assert model["return_low"] < 2.25 < model["return_high"]
 
 
-def test_the_table_fits_into_80_columns() -> None:
+@pytest.mark.parametrize(("split", "worlds"), [("test", "Worlds of the test split"), (None, "One building")])
+def test_the_table_fits_into_80_columns(split: str | None, worlds: str) -> None:
     """No figure is folded or cut on a terminal of 80 columns, long names of policies, signs and hundreds among them."""
     rows = [_row(name, seed, 0.01 * (seed - 9)) | {"distance": 123.45} for seed in range(20) for name in POLICIES]
     rows += [_row("model", seed, -0.25) for seed in range(20)]
     console = Console(file=io.StringIO(), width=80)
-    print_evaluation(console, summarise(rows), [])
+    print_evaluation(console, summarise(rows), [], split)
     text = console.file.getvalue()  # type: ignore[attr-defined]
     assert "…" not in text
     assert all(line.count("..") in (0, 2) for line in text.splitlines())  # both intervals of a policy side by side
-    for told in ("random_goals", "-0.250..-0.250", "123.45", "20 episodes of each policy"):
+    for told in ("random_goals", "-0.250..-0.250", "123.45", f"{worlds}, 20 episodes of each policy"):
         assert told in text
 
 

@@ -7,6 +7,7 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from gymnasium import spaces
@@ -290,6 +291,11 @@ def test_the_commands_train_go_on_evaluate_and_play(tmp_path: Path, monkeypatch:
         gaps = [returns["model", seed] - returns[lead["over"], seed] for seed in (100, 101)]
         assert lead["lead"] == pytest.approx(np.mean(gaps))
         assert lead["lead_low"] <= lead["lead"] <= lead["lead_high"]
+
+    plan = tmp_path / "plan.png"
+    cv2.imwrite(str(plan), np.pad(np.full((200, 300), 255, np.uint8), 5))
+    result = runner.invoke(app, ["evaluate", str(out), "--world", str(plan), "--split", "test"])
+    assert "split: expected worlds of which there are many" in str(result.exception)
 
     played = tmp_path / "played"
     arguments = ["run", "--policy", str(out), "--world", "fig5", "--robots", "2", "--particles", "5", "--max-cycles"]
