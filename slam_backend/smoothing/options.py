@@ -11,7 +11,7 @@ class SmoothingOptions:
 
     Attributes:
         max_keys: Most key poses of one robot; where there are more, the most rigid neighbours become one. Effort grows
-            with its cube at worst, memory with its product with the landmarks in view.
+            hardly faster, for few keys see the same; memory with its product with the landmarks in view.
         further_keys: So many more for each further robot of the filter.
         fresh_keys: Newest keys, of all robots together, that keep their raw measurements, which are linearised anew
             each time.
