@@ -10,6 +10,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from slam_backend import warm_up
 from slam_backend.errors import BoolArray, FloatArray, bad_argument, check_int
+from training.compiling import prepare
 from training.vec_slots import MASK, WHOLE, MakeEnv, SlotBatch, Stepped
 from training.vec_workers import SlotWorkers
 from vslam_env import vslam_v0
@@ -34,7 +35,10 @@ def make_vec_env(
     """
     check_int("num_envs", num_envs, 1, "Use at least one environment.")
     make = partial(vslam_v0.parallel_env, config=config, render_mode=render_mode)
-    env = ExplorationVecEnv([make] * num_envs, workers, partial(load_kernels, config))
+    load = partial(load_kernels, config)
+    if workers > 0:
+        prepare(load)  # what has to be compiled is compiled once, and told; workers then take it from the cache
+    env = ExplorationVecEnv([make] * num_envs, workers, load)
     if seed is not None:
         env.seed(seed)
     return env
