@@ -8,9 +8,10 @@ import numpy as np
 
 from slam_backend.alignment import RIVAL_ANGLE, RIVAL_DISTANCE, Alignment, AlignmentOptions
 from slam_backend.branches import Branch, fork
-from slam_backend.errors import IntArray
+from slam_backend.errors import FloatArray, IntArray
 from slam_backend.filter import FastSlam
 from slam_backend.fusion import check_inliers
+from slam_backend.geometry import rotate_covariances
 from slam_backend.groups import Group
 from slam_backend.landmark_map import LandmarkMap
 from slam_backend.merge_options import MergeOptions
@@ -18,6 +19,7 @@ from slam_backend.merging import merge_filters, motion_covariance
 from slam_backend.mixture_merging import merge_mixtures
 from slam_backend.records import Records
 from slam_backend.reports import MergeUndone, Renaming
+from slam_backend.smoothing.holding import add_share
 from slam_backend.undoing import Undoing
 from slam_backend.watching import Side, Watch, begin_watch
 
@@ -39,7 +41,7 @@ def doubt_about(group_a: Group, group_b: Group, alignment: Alignment, rng: np.ra
     """Return how uncertain the motion between two maps is, as the particles of a merge would have it.
 
     Landmarks of one map err together where its paths are uncertain. Their covariances, and the alignment's, do not say
-    so; that particles differ in the motion does.
+    so; that particles differ in the motion does, with what these do not show where the frames of the maps are held.
 
     Args:
         group_a, group_b, alignment: As of `merge_groups`.
@@ -51,6 +53,7 @@ def doubt_about(group_a: Group, group_b: Group, alignment: Alignment, rng: np.ra
     """
     a, b = group_a.trunk.filter, group_b.trunk.filter
     covariance = motion_covariance(a, b, alignment, _named(alignment, a, b), deepcopy(rng))
+    covariance += _of_frames(a._frame, b._frame, alignment)
     position, heading = math.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1]), math.sqrt(covariance[2, 2])
     return max(position / RIVAL_DISTANCE, heading / RIVAL_ANGLE)
 
@@ -157,3 +160,10 @@ def _hand_over(branch: Branch, restored: list[Group], records: Records) -> None:
         group.branches.append(copied)
     branch.live = tuple(robot for robot in branch.live if robot in homes[0].robots)
     homes[0].branches.append(branch)
+
+
+def _of_frames(frame_a: FloatArray, frame_b: FloatArray, alignment: Alignment) -> FloatArray:
+    """Return what two frames that are held, (3, 3) each, leave open of the motion between where the groups began."""
+    covariance = rotate_covariances(alignment.theta, frame_b)
+    add_share(frame_a, alignment.transform[None], covariance[None])
+    return covariance
