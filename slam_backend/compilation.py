@@ -10,7 +10,7 @@ from numba.core import event as numba_event
 
 LOGGER = logging.getLogger("slam_backend")
 PACKAGES = ("slam_backend", "vslam_env", "agents", "training")  # whose kernels are meant
-MESSAGE = "Compiling the kernels (once, about a minute) ..."
+MESSAGE = "Compiling the kernels (once, one to two minutes) ..."
 
 
 class CompilationWatch(numba_event.Listener):
