@@ -188,10 +188,6 @@ class TeamKnowledge:
         """Return the outline of `map(robot, min_count=min_count)`, much faster."""
         return self._find(robot)[0].filter.outline(min_count)
 
-    def num_particles(self, robot: int) -> int:
-        """Return how many particles the robot's filter has."""
-        return self._find(robot)[0].filter.num_particles
-
     def standpoint(self, robot: int) -> Standpoint:
         """Return where a robot stands, all at once."""
         branch, index = self._find(robot)

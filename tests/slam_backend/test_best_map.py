@@ -1,6 +1,7 @@
 """The compiled gather of the most probable particle's map agrees with the plain one."""
 
 import numpy as np
+from gappy_filter import filter_after_some_steps
 
 from slam_backend import FastSlam, Measurements
 from slam_backend._best_map import best_map
@@ -10,14 +11,7 @@ UNPACK = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 
 def _filter_after_some_steps() -> FastSlam:
     """Return a filter that has resampled, and in which landmarks came and went."""
-    rng = np.random.default_rng(3)
-    slam = FastSlam(num_particles=70, seed=4, resample_threshold=1.0)
-    points = np.column_stack([rng.uniform(-2.0, 2.0, 14), rng.uniform(-1.0, 1.0, 14), rng.uniform(2.0, 6.0, 14)])
-    looks = np.linalg.qr(rng.standard_normal((14, 14)))[0].astype(np.float32)
-    for step in range(12):
-        seen = rng.choice(14 if step > 4 else 8, 5, replace=False)
-        noisy = points[seen] + rng.normal(0.0, 0.02, (5, 3))
-        slam.step([np.array([0.0, 0.0, 0.001])], [Measurements(noisy, looks[seen])])
+    slam, points, looks = filter_after_some_steps(70, seed=3)
     slam._maps.release(slam._maps.used_slots()[[2, 5]])
     extra = Measurements(points[:2] + np.array([0.0, 0.0, 3.0]), -looks[:2])
     slam.step([None], [extra])
