@@ -1,6 +1,5 @@
 """`TeamBelief` owns the team's filters and the seen grids, and hands out what each robot believes."""
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from typing import Any
@@ -11,19 +10,19 @@ from numpy.typing import NDArray
 from slam_backend.alignment import Alignment
 from slam_backend.errors import FloatArray, IntArray, bad_argument
 from slam_backend.filter_options import FilterOptions
-from slam_backend.geometry import compose, rotate_covariances
+from slam_backend.geometry import rotate_covariances
 from slam_backend.landmark_map import LandmarkMap, MapOutline
-from slam_backend.reports import MergeEvent, PoseEstimate, Renaming, TeamReport
+from slam_backend.reports import MergeEvent, Renaming, TeamReport
 from slam_backend.team import TeamSlam
 from vslam_env.navigation import CandidateSlots, SeenGrid
 from vslam_env.readings import Readings
 from vslam_env.robot_belief import Belief, BeliefConfig, Body, Candidates, Glimpse, Teammate
 from vslam_env.shared_grids import SharedGrids
+from vslam_env.team_poses import TeamPoses, position_sigmas
 
 __all__ = ["Belief", "BeliefConfig", "Body", "Candidates", "TeamBelief", "Teammate"]
 
 CANDIDATE_TICKS = 10  # once a second
-NOBODY, NO_POSES, NO_SIGMAS = np.empty(0, np.int64), np.empty((0, 3)), np.empty(0)
 
 
 class TeamBelief:
@@ -88,12 +87,12 @@ class TeamBelief:
     @property
     def poses(self) -> FloatArray:
         """(K, 3) float64 [m, m, rad]. Where each robot believes to be, in its own start frame. A copy."""
-        return np.array(self._poses)
+        return self._poses.own.copy()
 
     @property
     def position_sigmas(self) -> FloatArray:
         """(K,) float64 [m]. One sigma of each robot's position in its own start frame, averaged over directions."""
-        return np.array([_position_sigma(point.own_pose) for point in self._points])
+        return position_sigmas(self._poses.covariances)
 
     def step(self, readings: Sequence[Readings]) -> TeamReport:
         """Take in one tick's readings of all K robots; the first ones are those of the reset.
@@ -113,18 +112,13 @@ class TeamBelief:
         self._tick += 1
         self._look_up_poses()
         self._grids.follow(self._tick, report.entries, report.renamings)
-        self._grids.meet(self._mates, self._starts)
-        for robot, mates in enumerate(self._mates):
-            poses = self._poses[robot : robot + 1]
-            if len(mates) > 1:
-                means = self._means if len(mates) == len(self._means) else self._means[list(mates)]
-                poses = compose(self._starts[robot], means)
-                poses[mates.index(robot)] = self._poses[robot]
-            self._grids.paint(self._tick, robot, mates, poses, readings)
+        poses = self._poses
+        self._grids.meet(poses.mates, poses.starts)
+        for robot, mates in enumerate(poses.mates):
+            self._grids.paint(self._tick, robot, mates, poses.mate_poses[robot], readings)
         for robot in range(self.num_robots):
             if self._candidates_are_due(robot):
-                positions = np.array([mate.pose[:2] for mate in self._teammates(robot)]).reshape(-1, 2)
-                self._slots[robot].update(self._grids[robot].cells, self._poses[robot], positions)
+                self._slots[robot].update(self._grids[robot].cells, poses.own[robot], poses.others[robot].poses[:, :2])
         return report
 
     def merge(self, robot_a: int, robot_b: int, alignment: Alignment, known: bool = False) -> Renaming:
@@ -132,12 +126,12 @@ class TeamBelief:
         renaming = self._team.merge(robot_a, robot_b, alignment, known)
         self._look_up_poses()
         self._grids.keep(self._tick + 1, renaming)
-        self._grids.meet(self._mates, self._starts)
+        self._grids.meet(self._poses.mates, self._poses.starts)
         return renaming
 
     def group(self, robot: int) -> tuple[int, ...]:
         """Return the robots that share a map with this one, as far as it knows, itself included."""
-        return self._points[robot].members
+        return self._poses.points[robot].members
 
     def speaker(self, group: tuple[int, ...]) -> int:
         """Return the first robot of a group that goes by its joint filter, and so can merge it with another."""
@@ -149,14 +143,14 @@ class TeamBelief:
 
     def group_map(self, robot: int) -> LandmarkMap:
         """Return the confirmed landmarks of a robot's group, in the group's map frame."""
-        number = self._points[robot].number
+        number = self._poses.points[robot].number
         if number not in self._maps:
             self._maps[number] = self._team.map(robot, min_count=self._confirm_after)
         return self._maps[number]
 
     def outline(self, robot: int) -> MapOutline:
         """Return the outline of `group_map`, much faster."""
-        number = self._points[robot].number
+        number = self._poses.points[robot].number
         if number not in self._outlines:
             self._outlines[number] = self._team.outline(robot, self._confirm_after)
         return self._outlines[number]
@@ -164,7 +158,7 @@ class TeamBelief:
     @property
     def starts_from_group(self) -> FloatArray:
         """(K, 3) float64 [m, m, rad]. The motion from its group's map frame to each robot's own start frame. A copy."""
-        return self._starts.copy()
+        return self._poses.starts.copy()
 
     @property
     def grids(self) -> list[SeenGrid]:
@@ -183,28 +177,23 @@ class TeamBelief:
 
     def glimpse(self, robot: int) -> Glimpse:
         """Return the part of a robot's belief that its observation shows; it shares memory with the filters."""
-        point, start, mates, poses, sigmas = self._points[robot], self._starts[robot], NOBODY, NO_POSES, NO_SIGMAS
-        own, members = point.own_pose, point.members
-        if len(members) > 1:
-            mates = np.array([mate for mate in members if mate != robot])
-            seen = [estimate for mate, estimate in zip(members, point.poses, strict=True) if mate != robot]
-            poses = compose(start, np.array([estimate.mean for estimate in seen]))
-            sigmas = np.array([_position_sigma(estimate) for estimate in seen])
-        features, valid = self._slots[robot].described(own.mean, poses)
+        point, others = self._poses.points[robot], self._poses.others[robot]
+        own = point.own_pose
+        features, valid = self._slots[robot].described(own.mean, others.poses)
         return Glimpse(
             robot=robot,
-            group_size=len(members),
+            group_size=len(point.members),
             pose=own.mean,
             covariance=own.covariance,
             ess=point.ess,
-            start_from_group=start,
+            start_from_group=point.start_from_group,
             outline=self.outline(robot),
             cells=self._grids[robot].cells,
             features=features,
             valid=valid,
-            mates=mates,
-            mate_poses=poses,
-            mate_sigmas=sigmas,
+            mates=others.robots,
+            mate_poses=others.poses,
+            mate_sigmas=others.sigmas,
         )
 
     def get_state(self) -> dict[str, Any]:
@@ -232,32 +221,25 @@ class TeamBelief:
     def _look_up_poses(self) -> None:
         """Take note of the groups and poses after a step or a merge, and forget what was derived from those before."""
         self._groups = self._team.groups
-        self._points = points = [self._team.standpoint(robot) for robot in range(self.num_robots)]
-        self._mates = [point.mates for point in points]
-        rows = len(points), 3
-        self._starts, self._means, self._poses = np.empty(rows), np.empty(rows), np.empty(rows)
-        for robot, point in enumerate(points):
-            self._starts[robot] = point.start_from_group
-            self._means[robot] = point.poses[point.members.index(robot)].mean
-            self._poses[robot] = point.own_pose.mean
+        self._poses = TeamPoses([self._team.standpoint(robot) for robot in range(self.num_robots)])
         self._beliefs.clear()
         self._maps.clear()
         self._outlines.clear()
 
-    def _teammates(self, robot: int) -> list[Teammate]:
+    def _teammates(self, robot: int) -> tuple[Teammate, ...]:
         """Return the other robots that a robot knows of; one out of contact is where it was when contact was lost."""
-        start, point, mates = self._starts[robot], self._points[robot], []
-        for mate, estimate in zip(point.members, point.poses, strict=True):
-            if mate != robot:
-                covariance = rotate_covariances(start[2], estimate.covariance)
-                mates.append(Teammate(mate, compose(start, estimate.mean), covariance))
-        return mates
+        point, others = self._poses.points[robot], self._poses.others[robot]
+        covariances = [
+            rotate_covariances(point.start_from_group[2], estimate.covariance)
+            for mate, estimate in zip(point.members, point.poses, strict=True)
+            if mate != robot
+        ]
+        return tuple(map(Teammate, others.robots.tolist(), others.poses, covariances))
 
     def _make_belief(self, robot: int) -> Belief:
-        group, start, mates = self.group(robot), self._starts[robot], self._teammates(robot)
-        own = self._points[robot].own_pose
-        log_weights = self._team.particles(robot)[1]
-        slots = self._slots[robot]
+        """Put together what `belief` returns."""
+        point, slots = self._poses.points[robot], self._slots[robot]
+        own, group = point.own_pose, point.members
         return Belief(
             robot=robot,
             tick=self._tick,
@@ -266,30 +248,25 @@ class TeamBelief:
             pose=own.mean,
             covariance=own.covariance,
             particles=self._team.particles_from_start(robot),
-            log_weights=log_weights,
-            ess=self._points[robot].ess,
+            log_weights=self._team.particles(robot)[1],
+            ess=point.ess,
             grid=self._grids[robot].frozen(),
             candidates=Candidates(
                 goals=slots.goals,
                 headings=slots.headings,
                 lengths=slots.lengths,
                 valid=slots.valid,
-                features=slots.features(own.mean, [mate.pose[:2] for mate in mates]),
+                features=slots.features(own.mean, self._poses.others[robot].poses[:, :2]),
             ),
-            teammates=tuple(mates),
-            start_from_group=start,
+            teammates=self._teammates(robot),
+            start_from_group=point.start_from_group,
             group_map=self.group_map(robot),
         )
 
     def _candidates_are_due(self, robot: int) -> bool:
+        """Tell whether a robot's candidates are to be renewed in this tick."""
         if self._tick == 0:
             return True
         if self._decision_ticks is not None:
             return self._tick % self._decision_ticks == 0
         return (self._tick - robot * CANDIDATE_TICKS // self.num_robots) % CANDIDATE_TICKS == 0
-
-
-def _position_sigma(estimate: PoseEstimate) -> float:
-    """Return one sigma of a robot's position [m], averaged over directions."""
-    covariance = estimate.covariance
-    return math.sqrt(0.5 * (covariance[0, 0] + covariance[1, 1]))
