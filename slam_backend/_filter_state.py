@@ -37,6 +37,7 @@ class FilterState:
         may_smooth: Whether it may in the next step; filters of a team take turns.
         _poses: (K, 3, P) float64 [m, m, rad]. Of each robot (x_t^[m]).
         _starts: (K, 3, P) likewise. Where each robot started; spreads at a merge.
+        _from_origin: Whether all of that is zero, as in a filter that was never merged.
         _means, _covariances: (K, 3, P), (K, 6, P). N(x^, P^) of each particle before sampling.
         _frame: (3, 3) float64 [m, m, rad]. Covariance of a motion of the whole map that the particles do not show, as
             their frame was held when they were drawn anew; estimates have their share of it.
@@ -65,6 +66,7 @@ class FilterState:
         padded = self._maps.padded
         self._poses = aligned((k, 3, padded), np.float64)
         self._starts = aligned((k, 3, padded), np.float64)
+        self._from_origin = True
         self._means = aligned((k, 3, padded), np.float64)
         self._covariances = aligned((k, 6, padded), np.float64)
         self._frame = np.zeros((3, 3))
@@ -102,6 +104,10 @@ class FilterState:
             for estimate in self._estimates:
                 add_share(self._frame, estimate.mean[None], estimate.covariance[None])
 
+    def _look_at_starts(self) -> None:
+        """Take note of whether all robots start at the origin of the map frame; asked for when that was written."""
+        self._from_origin = not self._starts[:, :, : self.num_particles].any()
+
     # ------------------------------------------------------------------ other particles, other robots
 
     def _become(self, ancestors: IntArray) -> None:
@@ -122,6 +128,7 @@ class FilterState:
         m = self.num_particles
         write_maps(self._maps, self.best_particle, new, self.options.landmark_walk)
         self._poses[:, :, :m], self._starts[:, :, :m] = new.poses, new.starts
+        self._look_at_starts()
         self._means[:] = self._poses
         self._covariances.fill(0.0)
         self._frame[:] = new.frame
@@ -185,6 +192,7 @@ class FilterState:
             self._set_up(len(state["_poses"]), state["options"], 0, len(state["_weights"]))
         for name in KEPT:
             getattr(self, name)[:] = state[name]
+        self._look_at_starts()
         self._maps.set_state(state["maps"])
         for log, logged in zip(self._logs, state["logs"], strict=True):
             log.set_state(logged)

@@ -56,6 +56,7 @@ class FrameBuffers:
     def __init__(self, padded: int) -> None:
         self.padded = padded
         self.used = 0  # measurements of this step so far
+        self._all = True  # that the caller gave
         self.log_likelihood: FloatArray = np.zeros(padded)
         self.work: FloatArray = aligned((_kernels.WORK_ROWS * LANES,), np.float64)
         self.records: FloatArray = aligned((CANDIDATES, _kernels.CANDIDATE_ROWS * LANES), np.float64)
@@ -66,7 +67,7 @@ class FrameBuffers:
 
     def start(self, most: int) -> None:
         """Begin a step with at most `most` measurements."""
-        self.used = 0
+        self.used, self._all = 0, True
         self.log_likelihood.fill(0.0)
         if most > len(self._found):
             self._found = np.zeros((2 * most, self.padded), dtype=np.int32)
@@ -82,7 +83,7 @@ class FrameBuffers:
             are (n,).
         """
         used, rows = self.used, self._rows[: self.used]
-        if any(turn.keep is not None for turn in turns):
+        if not self._all:
             firsts = np.cumsum([0] + [turn.size for turn in turns])
             kept = (np.arange(turn.size) if turn.keep is None else turn.keep for turn in turns)
             rows = np.concatenate([first + own for first, own in zip(firsts[:-1], kept, strict=True)])
@@ -101,7 +102,7 @@ class FrameBuffers:
         size = len(points)
         keep: IntArray | None = None
         if names is not None and size and names.min() < 0:
-            keep = np.flatnonzero(names >= 0)
+            self._all, keep = False, np.flatnonzero(names >= 0)
             points, descriptors, names = points[keep], descriptors[keep], names[keep]
             covariances = None if covariances is None else covariances[keep]
             for array in (points, descriptors, covariances):

@@ -41,6 +41,7 @@ def _join_poses(
         target, of_a, of_b = getattr(joint, name), getattr(a, name), getattr(b, name)
         target[:k, :, :count] = of_a[:, :, from_a]
         target[k:, :, :count] = compose(motion, of_b[:, :, from_b].transpose(0, 2, 1)).transpose(0, 2, 1)
+    joint._look_at_starts()
     turn = np.zeros((count, 3, 3))
     turn[:, :2, :2], turn[:, 2, 2] = rotation(motion[:, 2]), 1.0
     spread_b = b._covariances[:, :, from_b].transpose(0, 2, 1)[..., UNPACK]

@@ -1,6 +1,8 @@
 """The turns of a step: what each robot did and saw goes into all particles, and what became of it into a report."""
 
+import math
 from collections.abc import Sequence
+from itertools import accumulate
 from typing import NamedTuple
 
 import numpy as np
@@ -155,8 +157,8 @@ def conclude(
         believed: (K, 3, P), (K, 6, P). N(x^, P^) of each robot and particle.
         threshold: Particles are to be resampled where the effective sample size is not above it.
     """
-    sizes = [turn.size for turn in turns]
-    given, robots = sum(sizes), len(turns)
+    robots = len(turns)
+    given = turns[0].size if robots == 1 else sum([turn.size for turn in turns])
     associations, created = np.empty(given, np.int64), np.empty(given, np.int64)
     means, covariances = np.empty((robots, 3)), np.empty((robots, 3, 3))
     found, distances, new_slots, rows = buffers.outcome(turns)
@@ -164,25 +166,15 @@ def conclude(
         buffers.log_likelihood, *weights, *believed, means, covariances, found, distances, new_slots, rows, ids,
         associations, created,
     )  # fmt: skip
-    report = StepReport(
-        associations=_split(associations, sizes),
-        created=_split(created, sizes),
-        num_new=num_new,
-        num_matched=num_matched,
-        num_rejected=given - num_new - num_matched,
-        ess=ess,
-        nis=squares / judged if judged else float("nan"),
-        resampled=buffers.used > 0 and ess <= threshold,
-    )
-    return report, [PoseEstimate(means[robot], covariances[robot]) for robot in range(robots)]
+    nis = squares / judged if judged else math.nan
+    rest = (num_new, num_matched, given - num_new - num_matched, ess, nis, buffers.used > 0 and ess <= threshold)
+    if robots == 1:
+        return StepReport((associations,), (created,), *rest), [PoseEstimate(means[0], covariances[0])]
+    ends = list(accumulate([turn.size for turn in turns[:-1]]))
+    report = StepReport(tuple(_split(associations, ends)), tuple(_split(created, ends)), *rest)
+    return report, list(map(PoseEstimate, means, covariances))
 
 
-def _split(values: IntArray, sizes: Sequence[int]) -> tuple[IntArray, ...]:
-    """Return each robot's part of what stands one after the other."""
-    if len(sizes) == 1:
-        return (values,)
-    parts, first = [], 0
-    for size in sizes:
-        parts.append(values[first : first + size])
-        first += size
-    return tuple(parts)
+def _split(values: IntArray, ends: Sequence[int]) -> list[IntArray]:
+    """Return the parts of an array that end before these places, and what is left."""
+    return [values[first:end] for first, end in zip([0, *ends], [*ends, len(values)], strict=True)]

@@ -145,10 +145,10 @@ def take_in(branch: Branch, step: int, robots: Sequence[int], inputs: Sequence[R
     if len(robots) < len(branch.robots):
         given = dict(zip(robots, inputs, strict=True))
         inputs = [given.get(robot, NOTHING) for robot in branch.robots]
-    smoothing = branch.robots if branch.split_from is None else branch.live
-    branch.filter.may_smooth = step % TURNS in [robot % TURNS for robot in smoothing]
-    branch.filter._steps = step
-    branch.report = report = branch.filter._step_checked(inputs)
+    slam, smoothing = branch.filter, branch.robots if branch.split_from is None else branch.live
+    slam.may_smooth = step % TURNS in [robot % TURNS for robot in smoothing]
+    slam._steps = step
+    branch.report = report = slam._step_checked(inputs)
     for watch in branch.watches:
         watch.note(branch.robots, report)
     return report

@@ -55,10 +55,10 @@ class ExchangeLedger:
         live = robots if live is None else live
         if len(live) < 2:
             return
-        for index, robot in enumerate(robots):
+        for robot, associations, created_ids in zip(robots, report.associations, report.created, strict=True):
             if robot in live:
-                touched = int(np.count_nonzero(report.associations[index] >= 0))
-                created = int(np.count_nonzero(report.created[index] >= 0))
+                touched = sum([name >= 0 for name in associations.tolist()])
+                created = sum([name >= 0 for name in created_ids.tolist()])
                 self.bytes_sent[robot] += POSE_BYTES + touched * LANDMARK_BYTES + created * 4 * descriptor_size
 
     def record_replay(self, replayed: Sequence[ReplayedStep]) -> None:

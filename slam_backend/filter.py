@@ -111,6 +111,7 @@ class FastSlam(FilterKnowledge):
             self._poses[:] = check_array("initial_poses", initial_poses, (num_robots, 3), cure)[:, :, None]
             self._poses[:, 2] = wrap_angle(self._poses[:, 2])
             self._starts[:] = self._means[:] = self._poses
+            self._look_at_starts()
             self._estimates = [self._mixture(robot) for robot in range(num_robots)]
 
     @classmethod
@@ -173,7 +174,7 @@ class FastSlam(FilterKnowledge):
                 deserted.append(self._existence.weigh(self._maps, where, best, turns[robot]))
         self._steps += 1
         weights = self._log_weights, self._path_log_weights, self._weights
-        threshold = self.options.resample_threshold * self.num_particles * (1.0 + 1e-9)
+        threshold = self.options.resample_threshold * self._maps.num_particles * (1.0 + 1e-9)
         report, self._estimates = conclude(
             turns, buffers, self._maps.ids, weights, (self._means, self._covariances), threshold
         )  # fmt: skip
@@ -241,7 +242,7 @@ class FastSlam(FilterKnowledge):
                 self._starts[robot], self._poses[robot], self._means[robot], self._covariances[robot],
                 bool(self._blind[robot]),
             )  # fmt: skip
-            normals = self._rng.standard_normal((self.num_particles, 3))
+            normals = self._rng.standard_normal((self._maps.num_particles, 3))
             self._blind[robot] = take_turn(self._assumed, own, self._maps, self._buffers, turn, move, exact, normals)
         return turn
 

@@ -75,9 +75,12 @@ class FilterKnowledge(FilterState):
 
     def _seen_from_start(self, robot: int) -> tuple[PoseEstimate, FloatArray]:
         """Return what `pose_from_start` and `start_pose` return."""
-        start, estimate = np.empty(3), self._estimates[robot]
+        estimate = self._estimates[robot]
+        if self._from_origin:  # the map frame is its own start frame
+            return estimate, np.zeros(3)
+        start = np.empty(3)
         kind = start_kind(self._starts[robot], self.num_particles, self.best_particle, start)
-        if kind == AT_ORIGIN:  # the map frame is its own start frame
+        if kind == AT_ORIGIN:
             return estimate, start
         if kind == KNOWN:
             turned = rotate_covariances(-start[2], estimate.covariance)

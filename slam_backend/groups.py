@@ -103,7 +103,7 @@ class Group:
 
     def oldest_unknown(self, now: int) -> int:
         """Return the first step that some filter may have to take in yet, `now` + 1 if there is none."""
-        return min(_oldest_unknown(branch, now) for branch in self.branches)
+        return min([_oldest_unknown(branch, now) for branch in self.branches])
 
     def numbers(self) -> set[int]:
         """Return the numbers of all maps that the group uses or may take up again."""

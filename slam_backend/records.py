@@ -44,9 +44,8 @@ class Records:
 
     def note_created(self, branch: Branch, robots: Sequence[int], step: int, report: StepReport) -> None:
         """Write down which landmarks a step of a filter created."""
-        for robot in robots:
-            ids = report.created[branch.robots.index(robot)]
-            if len(ids) and max(ids.tolist()) >= 0:
+        for robot, ids in zip(branch.robots, report.created, strict=True):
+            if robot in robots and max(ids.tolist(), default=-1) >= 0:
                 self.entries.append(LandmarksCreated(branch.number, robot, step, ids))
 
     def note_replay(self, branch: Branch, replayed: Sequence[ReplayedStep]) -> None:

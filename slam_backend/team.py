@@ -146,7 +146,8 @@ class TeamSlam(TeamKnowledge):
                             created[robot] = branch.report.created[index]
         self._doubt()
         renamings = self._attempt(networks)
-        records.log.forget_before(oldest := min(group.oldest_unknown(self._step) for group in self._groups))
+        oldest = min([group.oldest_unknown(self._step) for group in self._groups])
+        records.log.forget_before(oldest)
         report = TeamReport(
             step=self._step,
             associations=tuple(associations),
@@ -271,7 +272,7 @@ class TeamSlam(TeamKnowledge):
 
     def _descriptor_size(self) -> int:
         """Return the length of the descriptors in use, 0 before the first one."""
-        return max(branch.filter.descriptor_size for group in self._groups for branch in group.branches)
+        return max([branch.filter.descriptor_size for group in self._groups for branch in group.branches])
 
     # ------------------------------------------------------------------ snapshots
 

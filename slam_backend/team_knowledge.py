@@ -61,7 +61,7 @@ class TeamKnowledge:
     @property
     def groups(self) -> tuple[tuple[int, ...], ...]:
         """The groups, each in ascending order of robots, by ascending first robot."""
-        return tuple(group.robots for group in self._groups)
+        return tuple([group.robots for group in self._groups])
 
     @property
     def events(self) -> tuple[MergeEvent, ...]:
@@ -190,14 +190,13 @@ class TeamKnowledge:
 
     def standpoint(self, robot: int) -> Standpoint:
         """Return where a robot stands, all at once."""
-        branch, index = self._find(robot)
-        own_pose, start = branch.filter._seen_from_start(index)
-        # Most often the robot's start frame is the map frame.
-        start_from_group = inverse(start) if any(start.tolist()) else FROM_ORIGIN.copy()
-        report, particles = branch.report, branch.filter.num_particles
-        ess = 1.0 if report is None else report.ess / particles
-        poses = branch.filter._estimates
-        return Standpoint(branch.robots, branch.live, branch.number, poses, own_pose, start_from_group, ess)
+        _, branch, index = self._place(robot)
+        slam, report = branch.filter, branch.report
+        own_pose, start = slam._seen_from_start(index)
+        at_origin = slam._from_origin or not any(start.tolist())  # its start frame is the map frame
+        start_from_group = FROM_ORIGIN.copy() if at_origin else inverse(start)
+        ess = 1.0 if report is None else report.ess / slam.num_particles
+        return Standpoint(branch.robots, branch.live, branch.number, slam._estimates, own_pose, start_from_group, ess)
 
     def _group_of(self, robot: int) -> Group:
         """Return the robot's group."""
