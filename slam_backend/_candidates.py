@@ -3,7 +3,7 @@
 import numpy as np
 
 from slam_backend import _alignment_kernels as kernels
-from slam_backend._matching import look_alikes, mutual_nearest, unlike_other_places
+from slam_backend._matching import Float32Array, look_alikes, mutual_nearest, num_alike, unlike_other_places
 from slam_backend._packed import UPPER
 from slam_backend.alignment_types import AlignmentOptions
 from slam_backend.errors import BoolArray, FloatArray, IntArray, bad_argument
@@ -46,6 +46,16 @@ def candidates(map_a: LandmarkMap, map_b: LandmarkMap, options: AlignmentOptions
     variance = map_a.covariances[rows_a, 2, 2] + map_b.covariances[rows_b, 2, 2] + options.position_floor**2
     level = climb**2 <= options.position_gate * variance
     return matches[level], stands_out[level]
+
+
+def may_suffice(descriptors_a: Float32Array, descriptors_b: Float32Array, options: AlignmentOptions) -> bool:
+    """Tell by descriptors (n, d), (m, d) alone whether two maps may have candidates enough for an alignment.
+
+    By appearance every candidate is a pair within the gate: so few of them are not worth making maps for.
+    """
+    if not options.appearance or descriptors_a.shape[1] != descriptors_b.shape[1]:
+        return True
+    return num_alike(descriptors_a, descriptors_b, options.descriptor_gate) >= options.min_inliers
 
 
 def match_table(map_a: LandmarkMap, map_b: LandmarkMap, matches: IntArray) -> FloatArray:

@@ -148,6 +148,11 @@ def look_alikes(a: Float32Array, b: Float32Array, gate: float, most: int) -> Int
     return np.asarray(pairs[of_b[partners] <= most])
 
 
+def num_alike(a: Float32Array, b: Float32Array, gate: float) -> int:
+    """Return how many pairs of descriptors (n, d) and (m, d) are no farther apart than `gate`."""
+    return int(_alike(_fresh(a), _fresh(b.T), gate * gate, 0)[1].sum()) if len(a) and len(b) else 0
+
+
 def mutual_nearest(a: Float32Array, b: Float32Array, gate: float) -> IntArray:
     """Pair descriptors that are each other's nearest and no farther apart than `gate`.
 

@@ -3,8 +3,9 @@
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
-from slam_backend._best_map import best_map, best_outline
+from slam_backend._best_map import best_map, best_outline, slots_held
 from slam_backend._filter_state import FilterState
 from slam_backend._mixtures import map_mixture, pose_mixture
 from slam_backend._start_frames import AT_ORIGIN, KNOWN, seen_from_starts, start_kind
@@ -118,6 +119,10 @@ class FilterKnowledge(FilterState):
         if self._frame.any():
             covariances += of_points(self._frame, means)
         return LandmarkMap._trusted(means, covariances, *rest)
+
+    def looks(self) -> NDArray[np.float32]:
+        """Return the descriptors (n, d) of the landmarks of `map()`. A copy."""
+        return np.asarray(self._maps.descriptors[slots_held(self._maps, self.best_particle, 1)])
 
     def outline(self, min_count: int = 1) -> MapOutline:
         """Return the outline of `map(min_count=min_count)`, much faster."""

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from slam_backend._candidates import may_suffice
 from slam_backend.alignment import Alignment, AlignmentOptions, align_maps
 from slam_backend.attempts import AttemptSchedule, PairKey, Straightening
 from slam_backend.errors import IntArray
@@ -73,6 +74,8 @@ def _begun(
         return None
     able = (pair for pair in _pairs(groups) if _in_touch(pair, networks))
     pairs = {_key(pair): pair for pair in able if schedule.may_try(_key(pair), step)}
+    looks = {group.robots: group.trunk.filter.looks() for group in _unique(pairs)}
+    pairs = {key: pair for key, pair in pairs.items() if may_suffice(looks[key[0]], looks[key[1]], options)}
     maps = {group.robots: group.trunk.filter.map("mixture") for group in _unique(pairs)}
     chosen = schedule.choose({key: (maps[key[0]], maps[key[1]]) for key in pairs}, step)
     if chosen is None:

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from slam_backend._candidates import may_suffice
 from slam_backend._matching import mutual_nearest
 from slam_backend.alignment import (
     METHODS,
@@ -333,6 +334,23 @@ def test_duplicates_do_not_kill_a_match_but_look_alikes_elsewhere_do() -> None:
     assert 0 in candidate_matches(near, blurry, options)[:, 1]
     assert 0 not in candidate_matches(blurry, far, options)[:, 0]
     assert 0 not in candidate_matches(far, blurry, options)[:, 1]
+
+
+@given(st.integers(0, 2**32), st.integers(0, 12), st.integers(0, 12), st.integers(0, 4), st.booleans())
+def test_maps_that_cannot_have_enough_candidates_are_told_by_their_looks(
+    seed: int, common: int, others: int, look_alikes: int, appearance: bool
+) -> None:
+    """Where looks alone say no, the maps have too few candidates; where enough landmarks are common they say yes."""
+    rng = np.random.default_rng(seed)
+    shared, own = unit(rng, common), [unit(rng, others) for _ in range(2)]
+    a, b = (
+        LandmarkMap(rng.normal(size=(common + others, 3)), covariances(rng, common + others, 0.01, 0.1), looks)
+        for looks in (np.vstack([shared, own[0]]), np.vstack([blurred(rng, shared), own[1]]))
+    )
+    options = AlignmentOptions(look_alikes=look_alikes, appearance=appearance)
+    enough = may_suffice(a.descriptors, b.descriptors, options)
+    assert enough or len(candidate_matches(a, b, options)) < options.min_inliers
+    assert enough or common < options.min_inliers
 
 
 @pytest.mark.slow
