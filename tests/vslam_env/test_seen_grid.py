@@ -3,6 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from navigation_rooms import ANGLES, MAX_RANGE, scan
+from painted_plainly import painted_plainly
 
 from slam_backend.geometry import transform_points
 from vslam_env.navigation import CELL, FREE, GRID_SIZE, OCCUPIED, UNKNOWN, SeenGrid, cell_of, centre_of
@@ -69,6 +70,27 @@ def test_turning_the_robot_turns_what_it_saw() -> None:
     turned = np.rot90(ahead.cells, k=-1)  # rows grow upwards, so left is clockwise for numpy
     assert (turned == left.cells).all()
     assert (ahead.cells != left.cells).any()
+
+
+@pytest.mark.parametrize(("seed", "fan"), [(1, ANGLES), (2, np.linspace(-1.5, 1.5, 40)), (3, np.array([-0.3, 0.4]))])
+def test_a_scan_is_painted_as_it_is_defined(seed: int, fan: np.ndarray) -> None:
+    """Scans of walls, gaps and nothing, wherever the robot stands and looks, change the evidence as the plain form."""
+    rng = np.random.default_rng(seed)
+    grid, plain = SeenGrid(), np.zeros((GRID_SIZE, GRID_SIZE), np.int8)
+    for k in range(40):
+        pose = np.append(
+            rng.uniform(-29.0, 29.0, 2) if k % 4 == 0 else rng.uniform(-2.0, 2.0, 2), rng.uniform(-7.0, 7.0)
+        )
+        ranges = rng.uniform(0.5, 7.0) / np.cos(fan - rng.uniform(-0.2, 0.2)) + rng.normal(0.0, 0.02, len(fan))
+        ranges = np.abs(
+            np.where(rng.random(len(fan)) < rng.choice([0.0, 0.2]), rng.uniform(0.0, 9.0, len(fan)), ranges)
+        )
+        ranges[rng.random(len(fan)) < rng.choice([0.0, 0.5])] = MAX_RANGE
+        grid.paint_scan(pose, ranges, fan)
+        plain = painted_plainly(plain, pose, ranges, fan, MAX_RANGE)
+        assert (grid.get_state()["evidence"] == plain).all()
+        verdicts = np.where(plain == 0, UNKNOWN, np.where(plain > 0, OCCUPIED, FREE))
+        assert (grid.cells == verdicts).all()
 
 
 def test_a_reading_is_its_parts() -> None:

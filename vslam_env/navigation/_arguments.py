@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from slam_backend.errors import FloatArray, bad_argument
-from vslam_env.navigation._painting import GRID_SIZE
+from vslam_env.navigation._painting_kernels import GRID_SIZE
 
 
 def pose_floats(pose: ArrayLike, name: str = "pose") -> tuple[float, float, float]:

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from slam_backend._jit import jit
-from vslam_env.navigation._painting import CELL, FREE, HALF_WIDTH, UNKNOWN
+from vslam_env.navigation._painting_kernels import CELL, FREE, HALF_WIDTH, UNKNOWN
 from vslam_env.navigation._wavefront import UNREACHED
 
 MIN_CELLS = 3  # a robot needs 0.4 m; what is smaller is a speck or the corner of a wall

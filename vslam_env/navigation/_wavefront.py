@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from slam_backend._jit import jit
-from vslam_env.navigation._painting import FREE, GRID_SIZE, OCCUPIED, UNKNOWN
+from vslam_env.navigation._painting_kernels import FREE, GRID_SIZE, OCCUPIED, UNKNOWN
 
 PAD = 2  # cells around the known box, so that loops over frontiers and neighbours need no bounds
 OUTSIDE = 3  # beyond the 60 x 60 m: neither known nor worth exploring

@@ -12,7 +12,7 @@ from slam_backend._jit import jit
 from slam_backend.errors import BoolArray, FloatArray, check_array
 from vslam_env.navigation._arguments import check_cells, pose_floats, positions_array
 from vslam_env.navigation._frontier_search import HEADING, LENGTH, NUM_COLUMNS, SIZE, XY, frontier_rows
-from vslam_env.navigation._painting import CELL, GRID_SIZE, HALF_WIDTH
+from vslam_env.navigation._painting_kernels import CELL, GRID_SIZE, HALF_WIDTH
 from vslam_env.navigation.planning import DistanceMap, distance_map, ways_from
 
 NUM_SLOTS = 16

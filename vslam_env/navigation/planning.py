@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from slam_backend._jit import jit
 from slam_backend.errors import FloatArray, bad_argument, check_float
 from vslam_env.navigation._arguments import check_cells, point_floats, pose_floats
-from vslam_env.navigation._painting import CELL, HALF_WIDTH
+from vslam_env.navigation._painting_kernels import CELL, HALF_WIDTH
 from vslam_env.navigation._wavefront import (
     PAD,
     UNREACHED,

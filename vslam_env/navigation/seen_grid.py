@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from slam_backend.errors import FloatArray, IntArray, bad_argument, check_array, check_float
-from vslam_env.navigation import _painting
+from vslam_env.navigation import _painting_kernels as _painting
 from vslam_env.navigation._arguments import pose_floats
-from vslam_env.navigation._painting import CELL, FREE, GRID_SIZE, HALF_WIDTH, OCCUPIED, UNKNOWN
+from vslam_env.navigation._painting_kernels import CELL, FREE, GRID_SIZE, HALF_WIDTH, OCCUPIED, UNKNOWN
 
 # What each evidence, as an unsigned byte, says of a cell.
 _VERDICTS = np.where(np.arange(256) == 0, UNKNOWN, np.where(np.arange(256) < 128, OCCUPIED, FREE)).astype(np.uint8)
@@ -95,9 +95,10 @@ class SeenGrid:
                 "Give one range per ray.",
             )
         grid = self._evidence, self._cells, self._changes
-        fault = _painting.paint_scan(*grid, x, y, theta, ranges, angles, float(max_range))
+        fault = _painting.fault_of_scan(ranges, angles)
         if fault != _painting.READINGS_FINE:
             raise _refusal(fault, x, ranges, angles)
+        _painting.paint_scan(*grid, x, y, theta, ranges, angles, float(max_range))
 
     def paint_reading(
         self, pose: FloatArray, ranges: FloatArray, angles: FloatArray, max_range: float, radius: float, bump: bool
