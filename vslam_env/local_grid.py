@@ -13,33 +13,50 @@ from vslam_env.robot_belief import Glimpse
 SIZE = 48
 CHANNELS = ("free", "occupied", "landmarks")
 MARK = 255
+REACH = 0.75 * SIZE  # [cells] more than from the robot to a corner of its picture
 
 
 @jit
 def _paint(cells: Any, pose: Any, start_from_group: Any, means: Any, local: Any) -> None:
     """Sample the seen grid at the centres of the local cells, and mark the cells that hold landmarks.
 
-    Each row of `local` (3, 48, 48) is written in two loops without branches: what a cell holds cannot be foreseen, and
-    a wrong guess costs more than the arithmetic.
+    Each row of `local` (3, 48, 48) is written in short loops without branches, which become vector instructions but for
+    the look-up itself.
+
+    Args:
+        cells: (300, 300) uint8. Of the seen grid.
+        pose: (3,) [m, m, rad], start frame. Of the robot.
+        start_from_group: (3,) [m, m, rad]. Moves the landmarks to the start frame.
+        means: (n, 3) [m]. Of the landmarks.
+        local: Written to.
     """
     x, y = pose[0], pose[1]
     c, s = math.cos(pose[2]), math.sin(pose[2])
     middle = 0.5 * SIZE
     flat = cells.ravel()
-    place = np.empty(SIZE, np.int32)
+    low, high = REACH - 0.5 * GRID_SIZE, 0.5 * GRID_SIZE - REACH
+    surely_inside = low < x / CELL < high and low < y / CELL < high
+    place, seen = np.empty(SIZE, np.int32), np.empty(SIZE, np.uint8)
     for row in range(SIZE):
         ahead = middle - 0.5 - row  # [cells], as what follows
         first_i, first_j = y / CELL + s * ahead + 0.5 * GRID_SIZE, x / CELL + c * ahead + 0.5 * GRID_SIZE
+        if surely_inside:
+            for col in range(SIZE):
+                left = middle - 0.5 - col
+                place[col] = np.int32(first_i + c * left) * GRID_SIZE + np.int32(first_j - s * left)
+            for col in range(SIZE):
+                seen[col] = flat[np.uint32(place[col])]
+        else:
+            for col in range(SIZE):
+                left = middle - 0.5 - col
+                i, j = first_i + c * left, first_j - s * left
+                inside = 0.0 <= i < GRID_SIZE and 0.0 <= j < GRID_SIZE
+                seen[col] = cells[int(i), int(j)] if inside else UNKNOWN
+        free, occupied, landmarks = local[0, row], local[1, row], local[2, row]
         for col in range(SIZE):
-            left = middle - 0.5 - col
-            i, j = first_i + c * left, first_j - s * left
-            inside = (i >= 0.0) & (i < GRID_SIZE) & (j >= 0.0) & (j < GRID_SIZE)
-            place[col] = np.int32(i) * GRID_SIZE + np.int32(j) if inside else -1
-        for col in range(SIZE):
-            verdict = flat[max(place[col], 0)] if place[col] >= 0 else UNKNOWN
-            local[0, row, col] = MARK * (verdict == FREE)
-            local[1, row, col] = MARK * (verdict == OCCUPIED)
-            local[2, row, col] = 0
+            free[col] = MARK if seen[col] == FREE else 0
+            occupied[col] = MARK if seen[col] == OCCUPIED else 0
+            landmarks[col] = 0
     start_c, start_s = math.cos(start_from_group[2]), math.sin(start_from_group[2])
     for k in range(len(means)):
         dx = start_from_group[0] + start_c * means[k, 0] - start_s * means[k, 1] - x
