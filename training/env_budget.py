@@ -46,7 +46,7 @@ PHASES = (
     Phase("grid painting", 20, ((SharedGrids, "paint"), (SharedGrids, "follow"), (SharedGrids, "meet"))),
     Phase("filters", 135, ((FastSlam, "_step_checked"),)),
     Phase("team, alignment", 40, ((TeamSlam, "step"),)),
-    Phase("errors", 15, ((Episode, "map_scores"), (Episode, "pose_errors"), (Episode, "standing"))),
+    Phase("errors", 15, ((Episode, "standing"),)),
     Phase("local grids", 20, ((observation, "local_grid"),)),
     Phase("candidates", 40, ((CandidateSlots, "update"),)),
     Phase(

@@ -18,7 +18,7 @@ def _recount(changes: Any, cells: Any, places: Any, floor: Any, seen: Any, seers
 
     Args:
         changes: (1 + k,) int32, as `SeenGrid.take_changes` returns them.
-        cells: (300 * 300,) uint8. Of the robot's grid.
+        cells: (300, 300) uint8. Of the robot's grid.
         places: (n,) int32, ascending. Places of floor cells in the grid.
         floor: (n,) int32. These floor cells.
         seen: (n,) bool. Whether the robot saw them; changed.
@@ -29,7 +29,7 @@ def _recount(changes: Any, cells: Any, places: Any, floor: Any, seen: Any, seers
     Returns:
         How many more floor cells are seen by some robot than before.
     """
-    more = 0
+    more, flat = 0, cells.ravel()
     for k in range(max(changes[0], 1)):
         if changes[0] < 0:
             first, last = 0, len(places)
@@ -38,7 +38,7 @@ def _recount(changes: Any, cells: Any, places: Any, floor: Any, seen: Any, seers
         else:
             first, last = np.searchsorted(places, changes[1 + k]), np.searchsorted(places, changes[1 + k], "right")
         for i in range(first, last):
-            now = cells[places[i]] == FREE
+            now = flat[places[i]] == FREE
             if now != seen[i]:
                 seen[i] = now
                 seers[floor[i]] += 1 if now else -1
@@ -119,9 +119,7 @@ class Coverage:
             changes = grid.take_changes()
             if not self._began:
                 changes[0] = -1
-            self._covered += _recount(
-                changes, grid.cells.ravel(), places, floor, seen, self._seers, self._ever, self._fresh
-            )
+            self._covered += _recount(changes, grid.cells, places, floor, seen, self._seers, self._ever, self._fresh)
         self._began = True
         return self._covered / max(self._meter.count, 1)
 

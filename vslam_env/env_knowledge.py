@@ -31,7 +31,6 @@ class EnvKnowledge(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # Pe
         _tap: Where readings can be listened to.
         _episode: The running one; None before the first reset.
         _standing: How the team stood after the last step or reset.
-        _pose_errors: (K, 2) likewise: distance [m] and difference of the headings [rad].
     """
 
     possible_agents: list[AgentID]
@@ -40,7 +39,6 @@ class EnvKnowledge(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # Pe
     _tap: Tap
     _episode: Episode | None
     _standing: Standing
-    _pose_errors: FloatArray
 
     def observation_space(self, agent: AgentID) -> spaces.Space[Any]:
         """Return the space of an agent's observations; always the same object."""
@@ -63,7 +61,7 @@ class EnvKnowledge(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # Pe
         rows = [np.column_stack([poses[:, :2], np.cos(poses[:, 2]), np.sin(poses[:, 2])]) for poses in (true, believed)]
         standing = self._standing
         frames = [episode.belief.group(robot)[0] for robot in range(len(true))]
-        scored = np.column_stack([standing.map_errors, standing.map_recalls, self._pose_errors[:, 1], frames])
+        scored = np.column_stack([standing.map_errors, standing.map_recalls, standing.heading_errors, frames])
         return np.concatenate([np.hstack([*rows, scored]).ravel(), [standing.coverage, standing.merges]]).astype(
             np.float32
         )

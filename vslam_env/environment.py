@@ -14,7 +14,6 @@ from vslam_env.actions import GoalDriver, action_space, checked_actions, command
 from vslam_env.config import EnvConfig
 from vslam_env.env_knowledge import STATE_PER_ROBOT, AgentID, EnvKnowledge
 from vslam_env.episode import Episode, Tap
-from vslam_env.errors_of_maps import MapScores
 from vslam_env.infos import infos_of
 from vslam_env.observation import flatten, observation_space, observe_glimpse
 from vslam_env.rendering import draw_frame
@@ -80,9 +79,7 @@ class ExplorationEnv(EnvKnowledge):
         self._root: np.random.SeedSequence | None = None
         self._episode: Episode | None = None
         self._cycle = 0
-        self._scores: list[MapScores]  # set at a reset, as the two below
-        self._pose_errors: FloatArray
-        self._standing: Standing
+        self._standing: Standing  # set at a reset
         self._window = Window(self.metadata["name"])
 
     # ------------------------------------------------------------------ PettingZoo
@@ -122,7 +119,7 @@ class ExplorationEnv(EnvKnowledge):
         self.agents = self.possible_agents[:]
         self._cycle = 0
         self._drivers = [GoalDriver() for _ in self.agents]
-        self._take_stock()
+        self._standing = self._episode.standing()
         nothing = dict.fromkeys((term.name for term in self._terms), self._nothing)
         return self._observations(), self._infos(nothing, [0] * len(self.agents))
 
@@ -154,7 +151,7 @@ class ExplorationEnv(EnvKnowledge):
         chosen = checked_actions(actions, agents, self.config.action_type)
         invalid = self._drive(episode, chosen)
         before = self._standing
-        self._take_stock()
+        self._standing = episode.standing()
         self._cycle += 1
 
         terms = evaluate(self._terms, before, self._standing, self.config.shared_reward)
@@ -211,7 +208,7 @@ class ExplorationEnv(EnvKnowledge):
             "cycle": 0 if episode is None else self._cycle,
             "episode": None if episode is None else episode.get_state(),
             "drivers": [] if episode is None else [driver.get_state() for driver in self._drivers],
-            "stock": None if episode is None else (self._scores, self._pose_errors, self._standing),
+            "standing": None if episode is None else self._standing,
         }
 
     def set_state(self, state: Mapping[str, Any]) -> None:
@@ -235,8 +232,7 @@ class ExplorationEnv(EnvKnowledge):
         self._drivers = [GoalDriver() for _ in state["drivers"]]
         for driver, kept in zip(self._drivers, state["drivers"], strict=True):
             driver.set_state(kept)
-        self._scores, self._pose_errors, self._standing = state["stock"]
-        self._cycle, self.agents = state["cycle"], list(state["agents"])
+        self._standing, self._cycle, self.agents = state["standing"], state["cycle"], list(state["agents"])
 
     def clone(self) -> "ExplorationEnv":
         """Return an independent environment in the same state, for looking ahead; without window and recorder."""
@@ -278,13 +274,6 @@ class ExplorationEnv(EnvKnowledge):
             )
         return [int(not ok) for ok in valid]
 
-    def _take_stock(self) -> None:
-        """Score maps and poses as they stand now."""
-        episode = self._running_episode("step")
-        self._scores = episode.map_scores()
-        self._pose_errors = episode.pose_errors()
-        self._standing = episode.standing(self._scores, self._pose_errors)
-
     def _observations(self) -> dict[AgentID, Any]:
         episode, config = self._running_episode("step"), self.config
         goal = config.action_type == "goal"
@@ -306,7 +295,7 @@ class ExplorationEnv(EnvKnowledge):
         """Return each agent's figures after a step that paid `terms`."""
         belief = self._running_episode("step").belief
         groups = [belief.group(robot) for robot in range(len(self.agents))]
-        return infos_of(self.agents, groups, self._scores, self._pose_errors, self._standing, terms, invalid)
+        return infos_of(self.agents, groups, self._standing, terms, invalid)
 
 
 def _unpickled(made_from: tuple[Any, ...], max_cycles: int, state: EnvState) -> ExplorationEnv:

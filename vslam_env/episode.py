@@ -1,6 +1,6 @@
 """`Episode`: one world with robots in it, what they perceive and believe, and the simulator's books; tick by tick."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Any
@@ -14,7 +14,6 @@ from vslam_env.belief import Body, TeamBelief
 from vslam_env.communication import contacts
 from vslam_env.config import TICK, EnvConfig
 from vslam_env.coverage import Coverage
-from vslam_env.errors_of_maps import MapScores
 from vslam_env.oracle import true_alignment
 from vslam_env.pose_errors import pose_errors
 from vslam_env.readings import Readings
@@ -116,36 +115,31 @@ class Episode:
         noise, stream = self._config.odometry, self._streams["odometry"]
         self._perceive(after, bumped, read_odometry(before, after, self.setting.bias, noise, stream))
 
-    def map_scores(self) -> list[MapScores]:
-        """Score each robot's map as it stands."""
-        scores = []
-        placed = compose(self.true_starts, self.belief.starts_from_group)  # where its own estimates put each map
-        for robot in range(len(placed)):
-            scores.append(self.ledger.score(robot, self.belief.outline(robot), placed[robot]))
-        return scores
-
     def believed_poses(self) -> FloatArray:
         """Return where the robots believe to be (K, 3) [m, m, rad], laid at their true starts, world frame."""
         return compose(self.true_starts, self.estimated_path[-1])
 
-    def pose_errors(self) -> FloatArray:
-        """Return (K, 2): how far each robot is from where it believes to be [m], and its heading likewise [rad]."""
-        return pose_errors(self.true_starts, self.estimated_path[-1], self._simulator.poses)
-
-    def standing(self, scores: Sequence[MapScores], pose_errors: FloatArray) -> Standing:
-        """Return how the team stands, from what `map_scores` and `pose_errors` returned."""
-        errors, recalls, placed = np.array([(score.error, score.recall, score.placed) for score in scores]).T.copy()
+    def standing(self) -> Standing:
+        """Return how the team stands now: its maps and poses are scored."""
+        belief, poses = self.belief, self._simulator.poses
+        outlines = [belief.outline(robot) for robot in range(len(poses))]
+        placed = compose(self.true_starts, belief.starts_from_group)  # where its own estimates put each map
+        maps = self.ledger.scores(outlines, placed)
+        distances, turns = pose_errors(self.true_starts, self.estimated_path[-1], poses)
         return Standing(
-            map_errors=errors,
-            map_recalls=recalls,
-            placed_recalls=placed,
-            pose_errors=pose_errors[:, 0],
-            pose_sigmas=self.belief.position_sigmas,
-            coverage=self._coverage.share(self.belief.grids),
-            found=self._coverage.found(self._simulator.poses),
+            map_errors=maps.errors,
+            map_rmses=maps.rmses,
+            map_recalls=maps.recalls,
+            map_precisions=maps.precisions,
+            placed_recalls=maps.placed,
+            pose_errors=distances,
+            heading_errors=turns,
+            pose_sigmas=belief.position_sigmas,
+            coverage=self._coverage.share(belief.grids),
+            found=self._coverage.found(poses),
             collisions=self._collisions.copy(),
             distances=self._distances.copy(),
-            bytes_sent=self.belief.bytes_sent,
+            bytes_sent=belief.bytes_sent,
             merges=len(self.merge_ticks),
             time=self.tick * TICK,
         )

@@ -17,32 +17,48 @@ PLACED = 0.5  # [m] a landmark held nearer than this is well placed
 
 
 class MapScores(NamedTuple):
-    """How wrong one robot's map is, in its own start frame, without fitting.
+    """How wrong each robot's map is, in its own start frame, without fitting.
 
     Attributes:
-        error: E of the contract [m].
-        rmse: Of the matched landmarks [m]; the cutoff where nothing is matched.
-        recall: Matched landmarks over the true ones.
-        precision: Matched landmarks over the estimated ones.
-        placed: Matched landmarks closer than 0.5 m over the true ones.
+        errors: (K,) float64 [m]. E of the contract.
+        rmses: (K,) float64 [m]. Of the matched landmarks; the cutoff where nothing is matched.
+        recalls: (K,) float64. Matched landmarks over the true ones.
+        precisions: (K,) float64. Matched landmarks over the estimated ones.
+        placed: (K,) float64. Matched landmarks closer than 0.5 m over the true ones.
     """
 
-    error: float
-    rmse: float
-    recall: float
-    precision: float
-    placed: float
+    errors: FloatArray
+    rmses: FloatArray
+    recalls: FloatArray
+    precisions: FloatArray
+    placed: FloatArray
 
 
 @jit
 def _score(
-    means: FloatArray, ids: IntArray, book: IntArray, pose: FloatArray, truths: FloatArray, cutoff: float
-) -> tuple[float, float, float, float, float]:
-    """Compute `MapScores` of means (n, 3) that `pose` (3,) moves to the frame of the truths (N, 3), N >= 1.
+    robot: int,
+    means: FloatArray,
+    ids: IntArray,
+    book: IntArray,
+    poses: FloatArray,
+    truths: FloatArray,
+    cutoff: float,
+    scores: FloatArray,
+) -> None:
+    """Write a robot's column of scores (5, K), the rows of which are `MapScores`.
 
-    What landmark i claims stands at `book[ids[i]]`.
+    Args:
+        robot: Its index.
+        means: (n, 3) [m]. Of the landmarks of its map.
+        ids: (n,) int64. Theirs.
+        book: What landmark i claims stands at `book[ids[i]]`.
+        poses: (K, 3) [m, m, rad]. Robot by robot, what moves its means to the frame of the truths.
+        truths: (N, 3) [m], N >= 1.
+        cutoff: c of the map error [m].
+        scores: Written to.
     """
     least = np.full(len(truths), np.inf)
+    pose = poses[robot]
     c, s = math.cos(pose[2]), math.sin(pose[2])
     estimated = surplus = 0
     for i in range(len(means)):
@@ -67,9 +83,12 @@ def _score(
             total += min(square, cutoff * cutoff)
         else:
             total += 0.5 * cutoff * cutoff
-    rmse = math.sqrt(squares / matched) if matched else cutoff
     count = len(truths)
-    return math.sqrt(total / count), rmse, matched / count, matched / max(estimated, 1), placed / count
+    scores[0, robot] = math.sqrt(total / count)
+    scores[1, robot] = math.sqrt(squares / matched) if matched else cutoff
+    scores[2, robot] = matched / count
+    scores[3, robot] = matched / max(estimated, 1)
+    scores[4, robot] = placed / count
 
 
 class ClaimLedger:
@@ -132,18 +151,18 @@ class ClaimLedger:
         """Return the claims (n,) int64 of landmarks of a robot's map: index of the true one, -1 false, -2 no matter."""
         return self._claims[self._map_of[robot]][ids]
 
-    def score(self, robot: int, group_map: LandmarkMap | MapOutline, world_from_group: FloatArray) -> MapScores:
-        """Score a robot's map.
+    def scores(self, maps: Sequence[LandmarkMap | MapOutline], world_from_group: FloatArray) -> MapScores:
+        """Score the robots' maps.
 
         Args:
-            robot: Its index.
-            group_map: Its map, or the outline of it, in its map frame.
-            world_from_group: (3,) [m, m, rad]. Through the robot's own start frame and its true start pose.
+            maps: Of each of the K robots, or the outline of it, in its map frame.
+            world_from_group: (K, 3) [m, m, rad]. Through the robot's own start frame and its true start pose.
         """
-        book = self._claims[self._map_of[robot]]
-        return MapScores(
-            *_score(group_map.means, group_map.ids, book, world_from_group, self.true_positions, self.cutoff)
-        )
+        scores = np.empty((len(MapScores._fields), len(maps)))
+        for robot, (held, number) in enumerate(zip(maps, self._map_of, strict=True)):
+            book = self._claims[number]
+            _score(robot, held.means, held.ids, book, world_from_group, self.true_positions, self.cutoff, scores)
+        return MapScores(*scores)
 
     def get_state(self) -> dict[str, Any]:
         """Return a copy of the books, for the same world's landmarks."""

@@ -4,15 +4,12 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from slam_backend.errors import FloatArray
-from vslam_env.errors_of_maps import MapScores
 from vslam_env.reward import Standing
 
 
 def infos_of(
     agents: Sequence[str],
     groups: Sequence[tuple[int, ...]],
-    scores: Sequence[MapScores],
-    pose_errors: FloatArray,
     standing: Standing,
     terms: Mapping[str, FloatArray],
     invalid: Sequence[int],
@@ -24,32 +21,40 @@ def infos_of(
     Args:
         agents: Names of the K robots.
         groups: Per robot who shares its map, as far as it knows.
-        scores: Per robot those of its map.
-        pose_errors: (K, 2): distance [m] and difference of the headings [rad].
         standing: Of the team.
         terms: (K,) by name: what each term of the reward has paid for the step.
         invalid: Per robot 1 if its action was masked.
     """
-    errors, collisions = pose_errors.tolist(), standing.collisions.tolist()
-    distances, bytes_sent = standing.distances.tolist(), standing.bytes_sent.tolist()
+    figures = zip(
+        standing.map_errors.tolist(),
+        standing.map_rmses.tolist(),
+        standing.map_recalls.tolist(),
+        standing.map_precisions.tolist(),
+        standing.pose_errors.tolist(),
+        standing.heading_errors.tolist(),
+        standing.collisions.tolist(),
+        standing.distances.tolist(),
+        standing.bytes_sent.tolist(),
+        strict=True,
+    )
     paid = {f"reward/{name}": values.tolist() for name, values in terms.items()}
     infos: dict[str, dict[str, Any]] = {}
-    for robot, agent in enumerate(agents):
-        score, group = scores[robot], groups[robot]
+    for robot, (agent, group, own) in enumerate(zip(agents, groups, figures, strict=True)):
+        error, rmse, recall, precision, pose_error, heading_error, collisions, distance, bytes_sent = own
         infos[agent] = {
-            "map_error": score.error,
-            "map_rmse": score.rmse,
-            "map_recall": score.recall,
-            "map_precision": score.precision,
-            "pose_error": errors[robot][0],
-            "heading_error": errors[robot][1],
+            "map_error": error,
+            "map_rmse": rmse,
+            "map_recall": recall,
+            "map_precision": precision,
+            "pose_error": pose_error,
+            "heading_error": heading_error,
             "coverage": standing.coverage,
             "group": group[0],
             "group_size": len(group),
             "merges": standing.merges,
-            "collisions": collisions[robot],
-            "distance": distances[robot],
-            "bytes_sent": bytes_sent[robot],
+            "collisions": collisions,
+            "distance": distance,
+            "bytes_sent": bytes_sent,
             "invalid_action": invalid[robot],
             **{name: values[robot] for name, values in paid.items()},
         }

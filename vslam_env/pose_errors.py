@@ -9,7 +9,7 @@ from slam_backend.errors import FloatArray
 
 
 @jit
-def pose_errors(starts: FloatArray, estimated: FloatArray, true: FloatArray) -> FloatArray:
+def pose_errors(starts: FloatArray, estimated: FloatArray, true: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return how far estimated poses, laid at the true starts, are from the true ones.
 
     Args:
@@ -18,13 +18,13 @@ def pose_errors(starts: FloatArray, estimated: FloatArray, true: FloatArray) -> 
         true: (K, 3) float64 [m, m, rad], world frame.
 
     Returns:
-        (K, 2) float64: distance [m], and difference of the headings in [0, pi] [rad].
+        (K,) float64 [m]: distances; (K,) float64 [rad]: differences of the headings in [0, pi].
     """
-    errors = np.empty((len(true), 2))
+    distances, turns = np.empty(len(true)), np.empty(len(true))
     for k in range(len(true)):
         c, s = math.cos(starts[k, 2]), math.sin(starts[k, 2])
         dx = starts[k, 0] + c * estimated[k, 0] - s * estimated[k, 1] - true[k, 0]
         dy = starts[k, 1] + s * estimated[k, 0] + c * estimated[k, 1] - true[k, 1]
         turn = starts[k, 2] + estimated[k, 2] - true[k, 2]
-        errors[k, 0], errors[k, 1] = math.hypot(dx, dy), abs((turn + math.pi) % (2.0 * math.pi) - math.pi)
-    return errors
+        distances[k], turns[k] = math.hypot(dx, dy), abs((turn + math.pi) % (2.0 * math.pi) - math.pi)
+    return distances, turns

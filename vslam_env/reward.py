@@ -15,9 +15,12 @@ class Standing(NamedTuple):
 
     Attributes:
         map_errors: (K,) float64 [m]. E of each robot's map.
+        map_rmses: (K,) float64 [m]. Of the landmarks that each holds; the cutoff of the map error where it holds none.
         map_recalls: (K,) float64. Share of the landmarks that each holds, wherever it has them.
+        map_precisions: (K,) float64. Share of the landmarks in each map that are matched; of duplicates one is.
         placed_recalls: (K,) float64. Share of the landmarks that each holds closer than 0.5 m to where they are.
         pose_errors: (K,) float64 [m].
+        heading_errors: (K,) float64 [rad], at least 0.
         pose_sigmas: (K,) float64 [m]. One sigma of the position in its own start frame, as each believes.
         coverage: Share of the free floor that the team has seen.
         found: (K,) float64. Share of it that each was nearest to when the team first saw it.
@@ -29,9 +32,12 @@ class Standing(NamedTuple):
     """
 
     map_errors: FloatArray
+    map_rmses: FloatArray
     map_recalls: FloatArray
+    map_precisions: FloatArray
     placed_recalls: FloatArray
     pose_errors: FloatArray
+    heading_errors: FloatArray
     pose_sigmas: FloatArray
     coverage: float
     found: FloatArray

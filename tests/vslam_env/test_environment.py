@@ -394,9 +394,9 @@ def test_pose_errors_are_differences_of_placed_poses() -> None:
     rng = np.random.default_rng(4)
     starts, estimated, true = rng.uniform(-4.0, 4.0, (3, 20, 3))
     placed = compose(starts, estimated)
-    errors = pose_errors(starts, estimated, true)
-    np.testing.assert_allclose(errors[:, 0], np.linalg.norm(placed[:, :2] - true[:, :2], axis=1))
-    np.testing.assert_allclose(errors[:, 1], np.abs(wrap_angle(placed[:, 2] - true[:, 2])))
+    distances, turns = pose_errors(starts, estimated, true)
+    np.testing.assert_allclose(distances, np.linalg.norm(placed[:, :2] - true[:, :2], axis=1))
+    np.testing.assert_allclose(turns, np.abs(wrap_angle(placed[:, 2] - true[:, 2])))
 
 
 def test_an_environment_goes_with_its_last_name() -> None:

@@ -17,9 +17,12 @@ from vslam_env.reward import POTENTIALS, TERMS, Standing, evaluate, make_terms
 def _standing(**changes: Any) -> Standing:
     values: dict[str, Any] = {
         "map_errors": np.array([0.7, 0.6]),
+        "map_rmses": np.array([0.3, 0.2]),
         "map_recalls": np.array([0.1, 0.2]),
+        "map_precisions": np.ones(2),
         "placed_recalls": np.array([0.1, 0.15]),
         "pose_errors": np.zeros(2),
+        "heading_errors": np.zeros(2),
         "pose_sigmas": np.array([0.02, 0.05]),
         "coverage": 0.25,
         "found": np.array([0.2, 0.05]),
@@ -110,7 +113,7 @@ def test_potentials_telescope() -> None:
     """What each potential pays in an episode is where it ends minus where it began, a merge included."""
     env = small_env(max_cycles=120, reward=dict.fromkeys(POTENTIALS, 1.0))
     first_infos = env.reset(seed=5, options={"start_poses": MEETING})[1]
-    first = env.episode.standing(env.episode.map_scores(), env.episode.pose_errors())
+    first = env.episode.standing()
     totals = {agent: dict.fromkeys(POTENTIALS, 0.0) for agent in env.agents}
     while env.agents:
         _, rewards, _, _, infos = env.step(turning(env.agents))
@@ -118,7 +121,7 @@ def test_potentials_telescope() -> None:
             assert np.isclose(reward, sum(infos[agent][f"reward/{name}"] for name in POTENTIALS))
             for name in POTENTIALS:
                 totals[agent][name] += infos[agent][f"reward/{name}"]
-    last = env.episode.standing(env.episode.map_scores(), env.episode.pose_errors())
+    last = env.episode.standing()
     assert any(event.kind == "merge" for event in env.events)
     for robot, agent in enumerate(env.possible_agents):
         for name, term in POTENTIALS.items():
@@ -136,8 +139,8 @@ def test_a_map_that_is_placed_wrong_has_no_recall() -> None:
     books.record(TeamReport(0, (ids,), (ids,), ((0,),), (), (), (0,), entries, 1), [ids])
     held = LandmarkMap(truths[:2], np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 2)), ids=ids)
     for shift, placed in ((0.0, 2 / 3), (0.4, 2 / 3), (0.6, 0.0)):
-        scores = books.score(0, held, np.array([shift, 0.0, 0.0]))
-        assert (scores.recall, scores.placed) == (2 / 3, placed)
+        scores = books.scores([held], np.array([[shift, 0.0, 0.0]]))
+        assert (scores.recalls[0], scores.placed[0]) == (2 / 3, placed)
 
 
 def test_a_wrong_merge_costs() -> None:
@@ -157,7 +160,8 @@ def test_a_wrong_merge_costs() -> None:
         inliers = true.inliers if shift[0] == 0.0 else np.empty((0, 2), np.int64)
         used = Alignment(True, "", *pose.tolist(), true.covariance, inliers, 0.0)
         episode.ledger.rename(episode.belief.merge(0, 1, used))
-        changes.append([score.error - infos[f"robot_{r}"]["map_error"] for r, score in enumerate(episode.map_scores())])
+        after = episode.standing().map_errors
+        changes.append([error - infos[f"robot_{r}"]["map_error"] for r, error in enumerate(after)])
     assert max(changes[0]) < 0.0
     assert min(changes[1]) > 0.01
 

@@ -74,7 +74,7 @@ def test_a_state_goes_on_bit_by_bit(way: str, tmp_path: Path) -> None:
     reference = _go_on(env, FURTHER)
     assert any(event.kind == "merge" for event in env.events)
     assert env.state()[-1] == 1.0
-    assert env.episode.standing(env.episode.map_scores(), env.episode.pose_errors()).collisions.sum() > 20
+    assert env.episode.standing().collisions.sum() > 20
     assert _go_on(other, FURTHER) == reference
     digests = []
     for one in (env, other):  # resets to come are part of the state as well
