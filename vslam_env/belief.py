@@ -114,8 +114,7 @@ class TeamBelief:
         self._grids.follow(self._tick, report.entries, report.renamings)
         poses = self._poses
         self._grids.meet(poses.mates, poses.starts)
-        for robot, mates in enumerate(poses.mates):
-            self._grids.paint(self._tick, robot, mates, poses.mate_poses[robot], readings)
+        self._grids.paint(self._tick, poses.mate_poses, readings)
         for robot in range(self.num_robots):
             if self._candidates_are_due(robot):
                 self._slots[robot].update(self._grids[robot].cells, poses.own[robot], poses.others[robot].poses[:, :2])

@@ -4,31 +4,39 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from slam_backend.errors import FloatArray
+import numpy as np
+
+from slam_backend.errors import BoolArray, FloatArray, IntArray, bad_argument
 from slam_backend.geometry import compose, inverse
 from slam_backend.reports import MapDropped, MapEntry, MergeUndone, Renaming
-from vslam_env.navigation import SeenGrid
+from vslam_env.navigation import SeenGrid, TeamGrids
+from vslam_env.readings import Readings
 from vslam_env.robot_belief import Body
 
 
-class Stroke(NamedTuple):
-    """What one robot's readings of one tick wrote into the grid of another, or its own.
+class Strokes(NamedTuple):
+    """What the readings of one tick wrote into the grids, as `TeamGrids.paint_readings` takes it.
 
     Attributes:
         tick: Of the readings.
-        owner: Whose grid.
-        robot: Who scanned.
-        pose: (3,) [m, m, rad], start frame of the owner. Where it was believed to be.
-        scan: (R,) [m].
-        bump: Whether it bumped into something.
+        owners: (n,) int64. Whose grids.
+        robots: (n,) int64. Who scanned.
+        poses: (n, 3) [m, m, rad], start frame of the owner. Where they were believed to be.
+        scans: (K, R) [m].
+        bumps: (K,) bool. Who bumped into something.
     """
 
     tick: int
-    owner: int
-    robot: int
-    pose: FloatArray
-    scan: FloatArray
-    bump: bool
+    owners: IntArray
+    robots: IntArray
+    poses: FloatArray
+    scans: FloatArray
+    bumps: BoolArray
+
+    def within(self, side: Sequence[int]) -> "Strokes":
+        """Return those of some robots' readings that went into these robots' grids."""
+        own = np.isin(self.owners, side) & np.isin(self.robots, side)
+        return self._replace(owners=self.owners[own], robots=self.robots[own], poses=self.poses[own])
 
 
 class Kept(NamedTuple):
@@ -61,11 +69,12 @@ class SharedGrids:
     """
 
     def __init__(self, num_robots: int, body: Body) -> None:
-        self._grids = [SeenGrid() for _ in range(num_robots)]
+        self._team = TeamGrids(num_robots)
+        self._grids = self._team.grids
         self._body = body
-        self._mates: list[tuple[int, ...]] = [(robot,) for robot in range(num_robots)]
+        self._settle([(robot,) for robot in range(num_robots)])
         self._kept: list[Kept] = []
-        self._strokes: deque[Stroke] = deque()
+        self._strokes: deque[Strokes] = deque()
 
     @property
     def all(self) -> list[SeenGrid]:
@@ -115,13 +124,16 @@ class SharedGrids:
         for side in kept.sides:
             for robot in side:
                 self._grids[robot].set_state(kept.grids[robot])
-                self._mates[robot] = tuple(mate for mate in self._mates[robot] if mate in side)
-            own = [s for s in self._strokes if s.tick >= kept.tick and s.owner in side and s.robot in side]
-            body = self._body
-            for stroke in own:
-                self._grids[stroke.owner].paint_reading(
-                    stroke.pose, stroke.scan, body.ray_angles, body.scan_range, body.radius, stroke.bump
-                )
+            for strokes in self._strokes:
+                if strokes.tick >= kept.tick:
+                    self._draw(strokes.within(side))
+        side_of = {robot: side for side in kept.sides for robot in side}
+        self._settle(
+            [
+                tuple(mate for mate in mates if mate in side_of.get(robot, mates))
+                for robot, mates in enumerate(self._mates)
+            ]
+        )
 
     def meet(self, mates: Sequence[tuple[int, ...]], starts: FloatArray) -> None:
         """Let robots that have come together absorb what the others have seen.
@@ -143,24 +155,42 @@ class SharedGrids:
                             for robot in part:
                                 own_from_other = compose(starts[robot], inverse(starts[other[0]]))
                                 self._grids[robot].absorb(grid, own_from_other)
-        self._mates = list(mates)
+        self._settle(mates)
 
-    def paint(self, tick: int, owner: int, robots: Sequence[int], poses: FloatArray, readings: Any) -> None:
-        """Paint what some robots scan into the grid of one of them.
+    def _settle(self, mates: Sequence[tuple[int, ...]]) -> None:
+        """Take note of who goes by the same filter as whom."""
+        self._mates = list(mates)
+        pairs = [(owner, robot) for owner, group in enumerate(mates) for robot in group]
+        self._owners, self._robots = np.array(pairs).T.copy()
+
+    def paint(self, tick: int, mate_poses: Sequence[FloatArray], readings: Sequence[Readings]) -> None:
+        """Paint what each robot scans into the grids of all that go by its filter.
 
         Args:
             tick: Of the readings.
-            owner: Whose grid.
-            robots: Who scanned, in this order.
-            poses: (n, 3) [m, m, rad], start frame of the owner. Where they are believed to be.
-            readings: (K,) `Readings` of this tick.
+            mate_poses: Per robot (n, 3) [m, m, rad], its start frame. Where its mates, as `meet` was told of them, and
+                itself are believed to be.
+            readings: (K,) of this tick.
+
+        Raises:
+            ValueError: If a scan is not (R,) or is ill-formed.
         """
-        grid, body = self._grids[owner], self._body
-        for robot, pose in zip(robots, poses, strict=True):
-            scan, bump = readings[robot].scan, readings[robot].bump
-            grid.paint_reading(pose, scan, body.ray_angles, body.scan_range, body.radius, bump)
-            if self._kept:
-                self._strokes.append(Stroke(tick, owner, robot, pose, scan, bump))
+        scans = np.array([reading.scan for reading in readings], np.float64)
+        if scans.shape != (len(readings), len(self._body.ray_angles)):
+            cure = "Give a range for each ray of each robot."
+            raise bad_argument(
+                "scans", f"arrays of shape ({len(self._body.ray_angles)},)", f"shape {scans.shape}", cure
+            )
+        bumps = np.array([reading.bump for reading in readings], np.bool_)
+        strokes = Strokes(tick, self._owners, self._robots, np.concatenate(mate_poses), scans, bumps)
+        self._draw(strokes)
+        if self._kept:
+            self._strokes.append(strokes)
+
+    def _draw(self, strokes: Strokes) -> None:
+        """Paint readings into the grids."""
+        body = self._body
+        self._team.paint_readings(*strokes[1:], body.ray_angles, body.scan_range, body.radius)
 
     def get_state(self) -> dict[str, Any]:
         """Return all that decides how the grids go on; what is never written to is shared."""
@@ -175,4 +205,5 @@ class SharedGrids:
         """Go on as the grids that gave `state`, in place: views of them follow."""
         for grid, seen in zip(self._grids, state["grids"], strict=True):
             grid.set_state(seen)
-        self._mates, self._kept, self._strokes = list(state["mates"]), list(state["kept"]), deque(state["strokes"])
+        self._settle(state["mates"])
+        self._kept, self._strokes = list(state["kept"]), deque(state["strokes"])

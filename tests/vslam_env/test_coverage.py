@@ -38,7 +38,7 @@ def test_finds_are_those_of_a_plain_count() -> None:
     for turn in range(60):
         for grid in grids:
             pose = np.append(rng.uniform(-3.0, 3.0, 2), rng.uniform(-3.0, 3.0))
-            grid.paint_reading(pose, rng.uniform(0.5, 3.0, 32), angles, 8.0, 0.2, False)
+            grid.paint_scan(pose, rng.uniform(0.5, 3.0, 32), angles)
         if turn == 30:
             coverage.set_state(coverage.get_state())
         positions = rng.uniform(0.0, 8.0, (3, 2))

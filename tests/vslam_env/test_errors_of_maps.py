@@ -186,7 +186,7 @@ def test_coverage_is_a_union() -> None:
             if turn % 2:
                 grid.clear_disc(pose, 2.0)
             else:
-                grid.paint_reading(pose, rng.uniform(2.0, 9.0, 32), angles, 8.0, 0.2, bool(turn % 4))
+                grid.paint_scan(pose, rng.uniform(2.0, 9.0, 32), angles)
         if turn % 7 == 3:
             grids[0].absorb(grids[2], rng.uniform(-1.0, 1.0, 3))
         if turn in (20, 30):

@@ -12,6 +12,7 @@ from vslam_env.navigation.seen_grid import (
     cell_of,
     centre_of,
 )
+from vslam_env.navigation.team_grids import TeamGrids
 
 __all__ = [
     "CELL",
@@ -23,6 +24,7 @@ __all__ = [
     "DistanceMap",
     "Frontiers",
     "SeenGrid",
+    "TeamGrids",
     "cell_of",
     "centre_of",
     "distance_map",

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from slam_backend.errors import FloatArray, bad_argument
-from vslam_env.navigation._painting_kernels import GRID_SIZE
+from vslam_env.navigation._painting_kernels import BAD_POSE, BAD_RANGES, GRID_SIZE
 
 
 def pose_floats(pose: ArrayLike, name: str = "pose") -> tuple[float, float, float]:
@@ -40,6 +40,23 @@ def positions_array(positions: ArrayLike, name: str) -> FloatArray:
         got = "NaN or infinity" if values.ndim == 2 and values.shape[1] == 2 else f"shape {values.shape}"
         raise bad_argument(name, "finite numbers in an array of shape (k, 2)", got, "Give one (x, y) per robot.")
     return values
+
+
+def bad_reading(fault: int, pose: ArrayLike, ranges: ArrayLike, angles: ArrayLike) -> ValueError:
+    """Return the error that says what is wrong with a reading.
+
+    Args:
+        fault: `BAD_POSE`, `BAD_RANGES` or `BAD_ANGLES`.
+        pose: (3,) [m, m, rad]. Where it was taken.
+        ranges: (n,) [m].
+        angles: (n,) [rad].
+    """
+    if fault == BAD_POSE:
+        return bad_argument("pose", "finite numbers", pose, "Give (x, y, theta) in metres and radians.")
+    if fault == BAD_RANGES:
+        return bad_argument("ranges", "distances >= 0 [m]", ranges, "Use max_range where a ray saw nothing.")
+    expected = "ascending angles spanning less than pi [rad]"
+    return bad_argument("angles", expected, angles, "Order the rays from right to left.")
 
 
 def check_cells(cells: NDArray[np.uint8]) -> None:

@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from slam_backend.errors import FloatArray, IntArray, bad_argument, check_array, check_float
 from vslam_env.navigation import _painting_kernels as _painting
-from vslam_env.navigation._arguments import pose_floats
+from vslam_env.navigation._arguments import bad_reading, pose_floats
 from vslam_env.navigation._painting_kernels import CELL, FREE, GRID_SIZE, HALF_WIDTH, OCCUPIED, UNKNOWN
 
 # What each evidence, as an unsigned byte, says of a cell.
@@ -62,13 +62,26 @@ class SeenGrid:
     __slots__ = ("_cells", "_changes", "_evidence", "_read_only", "cells")
 
     def __init__(self) -> None:
-        self._adopt(np.zeros((GRID_SIZE, GRID_SIZE), np.int8), np.full((GRID_SIZE, GRID_SIZE), UNKNOWN, np.uint8))
+        shape = (GRID_SIZE, GRID_SIZE)
+        self._adopt(np.zeros(shape, np.int8), np.full(shape, UNKNOWN, np.uint8), _no_changes())
 
-    def _adopt(self, evidence: NDArray[np.int8], cells: NDArray[np.uint8], read_only: bool = False) -> None:
-        self._evidence, self._cells, self._read_only = evidence, cells, read_only
-        self._changes = np.full(1 + _painting.MOST_CHANGES, -1, np.int32)
+    def _adopt(
+        self,
+        evidence: NDArray[np.int8],
+        cells: NDArray[np.uint8],
+        changes: NDArray[np.int32],
+        read_only: bool = False,
+    ) -> "SeenGrid":
+        """Make arrays, as the kernels expect them, this grid's own."""
+        self._evidence, self._cells, self._changes, self._read_only = evidence, cells, changes, read_only
         self.cells = cells.view()
         self.cells.flags.writeable = False
+        return self
+
+    @classmethod
+    def _of(cls, evidence: NDArray[np.int8], cells: NDArray[np.uint8], changes: NDArray[np.int32]) -> "SeenGrid":
+        """Return the grid that lies in some arrays."""
+        return cls.__new__(cls)._adopt(evidence, cells, changes)
 
     def paint_scan(self, pose: ArrayLike, ranges: ArrayLike, angles: ArrayLike, max_range: float = 8.0) -> None:
         """Mark what a range scan saw: free before the first surface, occupied on it.
@@ -97,23 +110,8 @@ class SeenGrid:
         grid = self._evidence, self._cells, self._changes
         fault = _painting.fault_of_scan(ranges, angles)
         if fault != _painting.READINGS_FINE:
-            raise _refusal(fault, x, ranges, angles)
+            raise bad_reading(fault, pose, ranges, angles)
         _painting.paint_scan(*grid, x, y, theta, ranges, angles, float(max_range))
-
-    def paint_reading(
-        self, pose: FloatArray, ranges: FloatArray, angles: FloatArray, max_range: float, radius: float, bump: bool
-    ) -> None:
-        """Do what `paint_scan`, `clear_disc` and, if it bumped, `bump` do in turn; of arrays of float64, all at once.
-
-        Raises:
-            ValueError: If the pose is not finite, or ranges or angles are not as `paint_scan` describes them.
-            RuntimeError: If the grid is a read-only view.
-        """
-        self._refuse_if_read_only()
-        grid = self._evidence, self._cells, self._changes
-        fault = _painting.paint_reading(*grid, pose, ranges, angles, max_range, radius, bump)
-        if fault != _painting.READINGS_FINE:
-            raise _refusal(fault, pose, ranges, angles)
 
     def clear_disc(self, pose: ArrayLike, radius: float = 0.2) -> None:
         """Mark as free what the body of a robot covers.
@@ -165,15 +163,11 @@ class SeenGrid:
 
     def copy(self) -> "SeenGrid":
         """Return an independent grid, which can be written to, with the same content."""
-        grid = SeenGrid()
-        grid._adopt(self._evidence.copy(), self._cells.copy())
-        return grid
+        return SeenGrid._of(self._evidence.copy(), self._cells.copy(), _no_changes())
 
     def frozen(self) -> "SeenGrid":
         """Return a view that refuses changes and shares memory with this grid: it follows changes made here."""
-        grid = SeenGrid.__new__(SeenGrid)
-        grid._adopt(self._evidence, self._cells, read_only=True)
-        return grid
+        return SeenGrid.__new__(SeenGrid)._adopt(self._evidence, self._cells, self._changes, read_only=True)
 
     def get_state(self) -> dict[str, Any]:
         """Return a copy of all that `set_state` needs to continue bit by bit."""
@@ -195,11 +189,6 @@ class SeenGrid:
             raise RuntimeError("SeenGrid: this is a read-only view. Make a copy() to write to.")
 
 
-def _refusal(fault: int, pose: Any, ranges: FloatArray, angles: FloatArray) -> ValueError:
-    """Return the error that says what is wrong with readings."""
-    if fault == _painting.BAD_POSE:
-        return bad_argument("pose", "finite numbers", pose, "Give (x, y, theta) in metres and radians.")
-    if fault == _painting.BAD_RANGES:
-        return bad_argument("ranges", "distances >= 0 [m]", ranges, "Use max_range where a ray saw nothing.")
-    expected = "ascending angles spanning less than pi [rad]"
-    return bad_argument("angles", expected, angles, "Order the rays from right to left.")
+def _no_changes() -> NDArray[np.int32]:
+    """Return the changes of a grid of which none are known."""
+    return np.full(1 + _painting.MOST_CHANGES, -1, np.int32)

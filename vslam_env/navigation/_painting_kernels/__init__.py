@@ -1,7 +1,7 @@
 """The compiled loops that write range readings, discs and other grids into the evidence of a `SeenGrid`.
 
-A grid comes as three arrays: `evidence` (300, 300) int8, `cells` (300, 300) uint8, which holds what the evidence says of
-each cell, and `changes`, which `evidence.py` describes. Rows go with y and columns with x, and the start pose is the
+A grid comes as three arrays: `evidence` (300, 300) int8, `cells` (300, 300) uint8, which holds what the evidence says
+of each cell, and `changes`, which `evidence.py` describes. Rows go with y and columns with x, and the start pose is the
 middle.
 """
 
@@ -15,11 +15,11 @@ from vslam_env.navigation._painting_kernels.evidence import (
     OCCUPIED,
     UNKNOWN,
 )
-from vslam_env.navigation._painting_kernels.readings import BAD_POSE, paint_bump, paint_disc, paint_reading
 from vslam_env.navigation._painting_kernels.rays import BAD_RANGES, READINGS_FINE, fault_of_scan
+from vslam_env.navigation._painting_kernels.readings import BAD_POSE, paint_bump, paint_disc, paint_readings
 from vslam_env.navigation._painting_kernels.scans import paint_scan
 
 __all__ = [
     "BAD_POSE", "BAD_RANGES", "CELL", "FREE", "GRID_SIZE", "HALF_WIDTH", "MOST_CHANGES", "OCCUPIED", "READINGS_FINE",
-    "UNKNOWN", "fault_of_scan", "paint_bump", "paint_disc", "paint_grid", "paint_reading", "paint_scan",
+    "UNKNOWN", "fault_of_scan", "paint_bump", "paint_disc", "paint_grid", "paint_readings", "paint_scan",
 ]  # fmt: skip

@@ -1,10 +1,10 @@
-"""What a robot reads in a tick is written into a grid: its scan, the floor that it covers, and a bump."""
+"""What robots read in a tick is written into grids: their scans, the floor that they cover, and their bumps."""
 
 import math
 from typing import Any
 
 from slam_backend._jit import jit
-from slam_backend.errors import FloatArray
+from slam_backend.errors import BoolArray, FloatArray, IntArray
 from vslam_env.navigation._painting_kernels.evidence import (
     CELL,
     FREE,
@@ -49,25 +49,48 @@ def paint_bump(evidence: Any, cells: Any, changes: Any, x: float, y: float, thet
 
 
 @jit
-def paint_reading(
+def paint_readings(
     evidence: Any,
     cells: Any,
     changes: Any,
-    pose: FloatArray,
-    ranges: FloatArray,
+    owners: IntArray,
+    robots: IntArray,
+    poses: FloatArray,
+    scans: FloatArray,
+    bumps: BoolArray,
     angles: FloatArray,
     max_range: float,
     radius: float,
-    bump: bool,
-) -> int:
-    """Write what a robot at `pose` (3,) reads in a tick: its scan, the floor that it covers, and a bump."""
-    x, y, theta = pose[0], pose[1], pose[2]
-    if not math.isfinite(x + y + theta):
-        return BAD_POSE
-    fault = fault_of_scan(ranges, angles)
-    if fault == READINGS_FINE:
-        paint_scan(evidence, cells, changes, x, y, theta, ranges, angles, max_range)
-        paint_disc(evidence, cells, changes, x, y, radius)
-        if bump:
-            paint_bump(evidence, cells, changes, x, y, theta, radius)
-    return fault
+) -> tuple[int, int]:
+    """Write what robots read in a tick: their scans, the floor that they cover, and their bumps.
+
+    Args:
+        evidence: (K, 300, 300) int8, as what follows: the grids, one after the other.
+        cells: (K, 300, 300) uint8.
+        changes: (K, 1 + n) int32.
+        owners: See `TeamGrids.paint_readings`, also for the rest.
+        robots: (n,) int64.
+        poses: (n, 3) float64 [m, m, rad].
+        scans: (K, R) float64 [m].
+        bumps: (K,) bool.
+        angles: (R,) float64 [rad].
+        max_range: [m].
+        radius: [m].
+
+    Returns:
+        `READINGS_FINE`, or what is wrong, and with which of the n; nothing was written then.
+    """
+    for i in range(len(owners)):
+        if not math.isfinite(poses[i, 0] + poses[i, 1] + poses[i, 2]):
+            return BAD_POSE, i
+        fault = fault_of_scan(scans[robots[i]], angles)
+        if fault != READINGS_FINE:
+            return fault, i
+    for i in range(len(owners)):
+        owner, robot = owners[i], robots[i]
+        x, y, theta = poses[i, 0], poses[i, 1], poses[i, 2]
+        paint_scan(evidence[owner], cells[owner], changes[owner], x, y, theta, scans[robot], angles, max_range)
+        paint_disc(evidence[owner], cells[owner], changes[owner], x, y, radius)
+        if bumps[robot]:
+            paint_bump(evidence[owner], cells[owner], changes[owner], x, y, theta, radius)
+    return READINGS_FINE, -1

@@ -1,0 +1,47 @@
+"""Readings of a tick are painted into all grids of a team at once, as one after the other."""
+
+import numpy as np
+import pytest
+from navigation_rooms import ANGLES, MAX_RANGE
+
+from vslam_env.navigation import UNKNOWN, SeenGrid, TeamGrids
+
+RADIUS = 0.2
+
+
+def test_readings_are_painted_as_their_parts() -> None:
+    """Each grid holds, and tells as changed, what scan, disc and bump leave one after the other, in the order given."""
+    rng = np.random.default_rng(4)
+    team, parts = TeamGrids(3), [SeenGrid() for _ in range(3)]
+    for _ in range(30):
+        count = int(rng.integers(0, 7))
+        owners, robots = rng.integers(0, 3, count), rng.integers(0, 3, count)
+        poses = np.column_stack([rng.uniform(-9.0, 9.0, (count, 2)), rng.uniform(-3.0, 3.0, count)])
+        scans, bumps = rng.uniform(0.3, 9.0, (3, 32)), rng.random(3) < 0.4
+        team.paint_readings(owners, robots, poses, scans, bumps, ANGLES, MAX_RANGE, RADIUS)
+        for owner, robot, pose in zip(owners, robots, poses, strict=True):
+            parts[owner].paint_scan(pose, scans[robot], ANGLES)
+            parts[owner].clear_disc(pose, RADIUS)
+            if bumps[robot]:
+                parts[owner].bump(pose, RADIUS)
+        for whole, part in zip(team.grids, parts, strict=True):
+            assert (whole.get_state()["evidence"] == part.get_state()["evidence"]).all()
+            assert (whole.cells == part.cells).all()
+            assert whole.take_changes().tolist() == part.take_changes().tolist()
+
+
+@pytest.mark.parametrize(
+    ("name", "pose", "ranges", "angles"),
+    [
+        ("pose", [0.0, np.nan, 0.0], np.ones(3), np.array([-0.1, 0.0, 0.1])),
+        ("ranges", [0.0, 0.0, 0.0], np.array([1.0, -1.0, 1.0]), np.array([-0.1, 0.0, 0.1])),
+        ("angles", [0.0, 0.0, 0.0], np.ones(3), np.array([0.1, 0.0, -0.1])),
+    ],
+)
+def test_a_bad_reading_is_refused(name: str, pose: list[float], ranges: np.ndarray, angles: np.ndarray) -> None:
+    """Nothing is painted, not even what is good, beside a reading at no place, of negative ranges or a wrong fan."""
+    team, pairs = TeamGrids(2), np.arange(2)
+    poses, scans = np.array([[0.0, 0.0, 0.0], pose]), np.array([np.ones(3), ranges])
+    with pytest.raises(ValueError, match=rf"^{name}: expected"):
+        team.paint_readings(pairs, pairs, poses, scans, np.zeros(2, np.bool_), angles, MAX_RANGE, RADIUS)
+    assert all((grid.cells == UNKNOWN).all() for grid in team.grids)

@@ -1,0 +1,56 @@
+"""`TeamGrids`: the seen grids of a team, into all of which a tick's readings are painted at once."""
+
+import numpy as np
+
+from slam_backend.errors import BoolArray, FloatArray, IntArray
+from vslam_env.navigation import _painting_kernels as _painting
+from vslam_env.navigation._arguments import bad_reading
+from vslam_env.navigation.seen_grid import GRID_SIZE, UNKNOWN, SeenGrid
+
+
+class TeamGrids:
+    """A seen grid for each robot; they lie in arrays of one piece.
+
+    Args:
+        num_robots: K.
+
+    Attributes:
+        grids: Of the robots.
+    """
+
+    def __init__(self, num_robots: int) -> None:
+        shape = (num_robots, GRID_SIZE, GRID_SIZE)
+        self._evidence, self._cells = np.zeros(shape, np.int8), np.full(shape, UNKNOWN, np.uint8)
+        self._changes = np.full((num_robots, 1 + _painting.MOST_CHANGES), -1, np.int32)
+        self.grids = list(map(SeenGrid._of, self._evidence, self._cells, self._changes))
+
+    def paint_readings(
+        self,
+        owners: IntArray,
+        robots: IntArray,
+        poses: FloatArray,
+        scans: FloatArray,
+        bumps: BoolArray,
+        angles: FloatArray,
+        max_range: float,
+        radius: float,
+    ) -> None:
+        """Paint what robots read in a tick: what `paint_scan`, `clear_disc` and, after a bump, `bump` paint in turn.
+
+        Args:
+            owners: (n,) int64. Into whose grid is painted; in this order.
+            robots: (n,) int64. Whose readings.
+            poses: (n, 3) float64 [m, m, rad], start frame of the owner. Where this robot was.
+            scans: (K, R) float64 [m]. As `SeenGrid.paint_scan` expects each.
+            bumps: (K,) bool. Which robots bumped into something.
+            angles: (R,) float64 [rad]. Likewise.
+            max_range: [m].
+            radius: Of the robots [m].
+
+        Raises:
+            ValueError: If a pose is not finite, or ranges or angles are not as described; then nothing is painted.
+        """
+        grids = self._evidence, self._cells, self._changes
+        fault, pair = _painting.paint_readings(*grids, owners, robots, poses, scans, bumps, angles, max_range, radius)
+        if fault != _painting.READINGS_FINE:
+            raise bad_reading(fault, poses[pair], scans[robots[pair]], angles)
