@@ -102,12 +102,13 @@ class TeamBelief:
         """
         if len(readings) != self.num_robots:
             raise bad_argument("readings", f"{self.num_robots} of them", len(readings), "Give one for each robot.")
+        odometry, measurements, _, _, true_poses, identities, heard, _ = zip(*readings, strict=True)
         report = self._team.step(
-            [r.odometry for r in readings],
-            [r.measurements for r in readings],
-            None if readings[0].heard is None else np.array([r.heard for r in readings]),
-            [r.identities for r in readings] if readings[0].identities is not None else None,
-            [r.pose for r in readings] if readings[0].pose is not None else None,
+            odometry,
+            measurements,
+            None if heard[0] is None else np.array(heard),
+            None if identities[0] is None else identities,
+            None if true_poses[0] is None else true_poses,
         )
         self._tick += 1
         self._look_up_poses()

@@ -1,5 +1,6 @@
 """`Episode`: one world with robots in it, what they perceive and believe, and the simulator's books; tick by tick."""
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import combinations
@@ -7,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from slam_backend._jit import jit
 from slam_backend.contacts import reach
 from slam_backend.errors import BoolArray, FloatArray, IntArray
 from slam_backend.geometry import between, compose
@@ -109,9 +111,7 @@ class Episode:
         self._simulator.step(commands)
         self.tick += 1
         after, bumped = self._simulator.poses, self._simulator.bumped
-        way = after - before
-        self._distances += np.hypot(way[:, 0], way[:, 1])
-        self._collisions += bumped
+        _count(before, after, bumped, self._distances, self._collisions)
         noise, stream = self._config.odometry, self._streams["odometry"]
         self._perceive(after, bumped, read_odometry(before, after, self.setting.bias, noise, stream))
 
@@ -184,26 +184,11 @@ class Episode:
 
     def _perceive(self, poses: FloatArray, bumped: BoolArray, odometry: FloatArray | None) -> None:
         """Read all sensors at the true poses (K, 3), and let the robots take it in; (K,) `bumped` into something."""
-        config, oracle_pose = self._config, self._config.oracle_pose
+        config = self._config
         self.frames = self.setting.sensor.measure(poses, self._streams["sensor"])
         scans = self.setting.scan.measure(poses, self._streams["scan"])
         heard = self._contacts(poses)
-        bumps, told, shown = bumped.tolist(), config.oracle_association, config.observe_images
-        self.readings = tuple(
-            [
-                Readings(
-                    odometry=None if odometry is None else odometry[robot],
-                    measurements=frame.measurements,
-                    scan=scans[robot],
-                    bump=bumps[robot],
-                    pose=between(self.true_starts[robot], poses[robot]) if oracle_pose else None,
-                    identities=frame.true_ids if told else None,
-                    heard=None if heard is None else heard[robot],
-                    image=frame.left if shown and isinstance(frame, EyeFrame) else None,
-                )
-                for robot, frame in enumerate(self.frames)
-            ]
-        )
+        self.readings = self._readings(odometry, scans, bumped, heard, poses)
         if self._tap.recorder is not None:
             self._tap.recorder(self.readings)
         report = self.belief.step(self.readings)
@@ -213,6 +198,32 @@ class Episode:
             self._merge_by_oracle(reach(heard, config.num_robots))
         self.true_path.append(poses)
         self.estimated_path.append(self.belief.poses)
+
+    def _readings(
+        self,
+        odometry: FloatArray | None,
+        scans: FloatArray,
+        bumped: BoolArray,
+        heard: BoolArray | None,
+        poses: FloatArray,
+    ) -> tuple[Readings, ...]:
+        """Return what each robot reads in this tick, the truth only where an oracle tells it."""
+        config, frames = self._config, self.frames
+        nothing = [None] * config.num_robots
+        images = [frame.left for frame in frames if isinstance(frame, EyeFrame)]
+        return tuple(
+            map(
+                Readings,
+                nothing if odometry is None else odometry,
+                [frame.measurements for frame in frames],
+                scans,
+                bumped.tolist(),
+                between(self.true_starts, poses) if config.oracle_pose else nothing,
+                [frame.true_ids for frame in frames] if config.oracle_association else nothing,
+                nothing if heard is None else heard,
+                images if config.observe_images else nothing,
+            )
+        )
 
     def _contacts(self, poses: FloatArray) -> BoolArray | None:
         """Return who hears whom (K, K), None if all hear all."""
@@ -244,3 +255,11 @@ class Episode:
         """Return which true landmark each row of a group's filter map claims."""
         speaker = self.belief.speaker(group)
         return self.ledger.claims(speaker, self.belief.filter_map(speaker).ids)
+
+
+@jit
+def _count(before: Any, after: Any, bumped: Any, distances: Any, collisions: Any) -> None:
+    """Add the ways between poses (K, 3) to distances (K,) [m], and to collisions (K,) who bumped (K,)."""
+    for k in range(len(after)):
+        distances[k] += math.hypot(after[k, 0] - before[k, 0], after[k, 1] - before[k, 1])
+        collisions[k] += bumped[k]
