@@ -18,7 +18,7 @@ from slam_backend.smoothing.extending import Places, extended, first_rows
 from slam_backend.smoothing.graph import PathGraph
 from slam_backend.smoothing.holding import holding, move_poses, move_tiles
 from slam_backend.smoothing.options import SmoothingOptions
-from slam_backend.smoothing.sampling import Draws, draw_paths
+from slam_backend.smoothing.sampling import Draws, draw_paths, drawn_spreads
 from slam_backend.smoothing.solving import Mode, find_mode
 
 NEAR = 10.0  # times the tolerance: a descent that is not followed by draws may end so much sooner
@@ -134,21 +134,25 @@ def rejuvenate(
             return Rejuvenation(graph, mode.reason, float("nan"), mode.iterations, None)
         if last:
             return drawn(grown, mode, camera, num_particles, rng, options, looks)
-        graph = settled(grown, mode, camera, options)
+        graph = settled(grown, mode, camera, options, rng)
         rest = [log.since(int(graph.latest[i]) + 1) for i, log in enumerate(rest)]
 
 
-def settled(graph: PathGraph, mode: Mode, camera: FloatArray, options: SmoothingOptions) -> PathGraph:
+def settled(
+    graph: PathGraph, mode: Mode, camera: FloatArray, options: SmoothingOptions, rng: np.random.Generator
+) -> PathGraph:
     """Return the graph at its mode; if it has too many keys some are joined, those whose motions scatter least.
 
     Args:
         graph: Which has the mode.
         mode: Of use, with an empty `reason`.
         camera, options: As of `rejuvenate`.
+        rng: Source of draws, where these are the cheaper way to see what scatters.
     """
     if graph.num_keys <= options.most_keys(len(graph.tips)):
         return at_mode(graph, mode)
-    return coarsened(at_mode(graph, mode, mode.spreads()), camera, options)
+    spreads = drawn_spreads(graph, mode, rng) if mode.crowded else mode.spreads()
+    return coarsened(at_mode(graph, mode, spreads), camera, options)
 
 
 def drawn(

@@ -122,7 +122,7 @@ class Smoother:
     def _after(self, draft: Draft, mode: Mode) -> PathGraph | Draft | str:
         """Return what a step came to, as of `descend`."""
         if not mode.reason:
-            return settled(draft.graph, mode, self.camera, self.options)
+            return settled(draft.graph, mode, self.camera, self.options, self.rng)
         steps = draft.steps + mode.iterations
         if not mode.unfinished:
             return mode.reason

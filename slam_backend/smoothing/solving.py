@@ -14,6 +14,7 @@ from slam_backend.smoothing.sightings import Sightings
 
 FIRST_DAMPING, MOST_DAMPING = 1e-4, 1e8
 LARGEST_STEP = 1e3  # [m, rad]; nothing is sought so far away
+LONG_COLUMNS = 16  # blocks in a mean column, longer ones counting more: then draws are cheaper than the inverse
 CREEP = 10.0  # times the tolerance: so far from its end a descent may be that has used up the options' iterations
 
 
@@ -67,6 +68,16 @@ class Mode:
         """Return the joint covariance (3 r, 3 r) [m, m, rad] of r keys (r,) that are sought, if of use."""
         assert self.system is not None
         return self.system.covariance(self.columns[keys])
+
+    @property
+    def crowded(self) -> bool:
+        """Whether many paths are drawn sooner than `spreads` are found, for the factor's columns are long; if of use.
+
+        The work of either grows with the sum of the columns' lengths, that of `spreads` with the sum of their squares.
+        """
+        assert self.system is not None
+        lengths = np.diff(self.system.pattern.tops)
+        return bool((lengths * lengths).sum() > LONG_COLUMNS * lengths.sum())
 
     def spreads(self) -> FloatArray:
         """Return how far the motions from the keys before scatter (k,) [m^2], headings felt at `LEVER`; if of use."""

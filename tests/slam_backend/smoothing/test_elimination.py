@@ -8,8 +8,11 @@ from small_problems import TIGHT, camera_of, graph_of, small_run
 
 from slam_backend.errors import FloatArray
 from slam_backend.geometry import between
+from slam_backend.motion import OdometryModel
+from slam_backend.run_log import RobotLog
 from slam_backend.smoothing import _kernels
 from slam_backend.smoothing.coarsening import at_mode, coarsened
+from slam_backend.smoothing.extending import extended
 from slam_backend.smoothing.graph import LEVER, PathGraph
 from slam_backend.smoothing.options import SmoothingOptions
 from slam_backend.smoothing.sightings import Sightings
@@ -144,6 +147,20 @@ def test_spreads_are_those_of_the_dense_covariance(posed):
         by = np.array(columns).T
         scatter = np.diag(by @ covariance[np.ix_(rows, rows)] @ by.T)
         assert found[b] == pytest.approx(scatter[0] + scatter[1] + LEVER**2 * scatter[2], rel=1e-5)
+
+
+def test_a_graph_is_crowded_where_all_poses_see_all_landmarks(posed):
+    """Then the columns of the factor are long, other than in a run past landmarks that come and go."""
+    assert not posed.mode.crowded
+    rng, points = np.random.default_rng(5), np.random.default_rng(6).uniform(2.0, 4.0, (40, 3))
+    log = RobotLog()
+    for step in range(40):
+        log.append(
+            step, np.zeros(3) if step else None, points=points + 0.01 * rng.normal(size=(40, 3)), ids=np.arange(40)
+        )
+    graph = extended(PathGraph.at_starts(np.zeros((1, 3))), [log.arrays()], OdometryModel(), np.zeros(3))
+    mode = find_mode(graph, camera_of(small_run()), TIGHT)
+    assert mode.crowded
 
 
 def test_densities_of_paths_are_the_dense_ones(posed):

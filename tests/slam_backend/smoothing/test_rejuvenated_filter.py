@@ -7,7 +7,9 @@ from small_problems import small_run
 
 from slam_backend.filter import FastSlam
 from slam_backend.motion import OdometryModel
+from slam_backend.smoothing import rejuvenation, solving
 from slam_backend.smoothing.options import SmoothingOptions
+from slam_backend.smoothing.sampling import drawn_spreads
 from training.accuracy_trials import follow, score
 from training.stereo_runs import RunSpec, simulate_run
 
@@ -93,6 +95,25 @@ def test_a_snapshot_goes_on_bit_for_bit():
     for reading in readings[11:]:
         again.step(**reading)
     assert_same(slam.get_state(), again.get_state())
+
+
+@pytest.mark.parametrize("least", [0, solving.LONG_COLUMNS])
+def test_keys_that_are_joined_on_the_way_are_no_matter_to_a_snapshot(monkeypatch, least):
+    """What is rigid is seen from draws where the factor's columns are long, and only there; either is restored."""
+    drawn = []
+    monkeypatch.setattr(solving, "LONG_COLUMNS", least)
+    monkeypatch.setattr(rejuvenation, "drawn_spreads", lambda *args: drawn.append(args) or drawn_spreads(*args))
+    readings = list(small_run().readings())
+    slam = rejuvenated(small_run(), smoothing=SmoothingOptions(max_keys=3, fresh_keys=2))
+    for reading in readings[:11]:
+        slam.step(**reading)
+    other = FastSlam(1, num_particles=3, seed=9)
+    other.set_state(slam.get_state())
+    for reading in readings[11:]:
+        slam.step(**reading)
+        other.step(**reading)
+    assert_same(slam.get_state(), other.get_state())
+    assert bool(drawn) == (least == 0)
 
 
 def test_robots_can_be_renumbered():

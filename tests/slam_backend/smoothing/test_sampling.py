@@ -8,7 +8,7 @@ from slam_backend.motion import OdometryModel
 from slam_backend.run_log import RobotLog
 from slam_backend.smoothing.extending import extended
 from slam_backend.smoothing.graph import PathGraph
-from slam_backend.smoothing.sampling import draw_paths, lane_rows, replay, weigh_odometry
+from slam_backend.smoothing.sampling import draw_paths, drawn_spreads, lane_rows, replay, weigh_odometry
 from slam_backend.smoothing.solving import Mode, find_mode
 
 MOUNT = np.array([0.1, -0.05, 0.2])
@@ -140,6 +140,21 @@ def test_odometry_of_paths_has_its_gaussian_density():
     np.testing.assert_allclose(found - found[0], expected - expected[0], atol=1e-7)
     scatter = [((m - m[:, :1])[0] ** 2 + (m - m[:, :1])[1] ** 2 + 9.0 * (m - m[:, :1])[2] ** 2).mean() for m in motions]
     np.testing.assert_allclose(spreads[linked], scatter, rtol=1e-6)
+
+
+def test_drawn_spreads_are_those_of_the_inverse():
+    """What a motion scatters by over paths is, in the mean over draws, what blocks of the inverse say."""
+    run = small_run(2)
+    graph = graph_of(run)
+    mode = find_mode(graph, camera_of(run), TIGHT)
+    rng = np.random.default_rng(8)
+    found = np.array([drawn_spreads(graph, mode, rng) for _ in range(60)])
+    linked = graph.previous >= 0
+    ratios = found[:, linked] / mode.spreads()[linked]
+    assert not found[:, ~linked].any()
+    np.testing.assert_allclose(ratios.mean(axis=0), 1.0, atol=0.12)
+    assert ratios.mean() == pytest.approx(1.0, abs=0.025)
+    assert 0.05 < ratios.std(axis=0).mean() < 0.2
 
 
 @pytest.mark.parametrize("m", [1, 64, 65])
