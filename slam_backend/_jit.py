@@ -48,6 +48,11 @@ def lanes_inlined(function: Callable[P, T]) -> Callable[P, T]:
     return _compiled(function, forceinline=True, **_LANES)
 
 
+def fused(function: Callable[P, T]) -> Callable[P, T]:
+    """Compile a kernel that does little but add products: each is one instruction, rounded once."""
+    return _compiled(function, **_LANES)
+
+
 def any_order(function: Callable[P, T]) -> Callable[P, T]:
     """Compile a sum over an array that may be taken in any order, the same one each time, so that it is vectorised."""
     return _compiled(function, forceinline=True, fastmath={"contract", "reassoc", "nsz"}, error_model="numpy")

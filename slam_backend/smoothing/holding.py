@@ -18,6 +18,7 @@ from slam_backend.geometry import compose, inverse, wrap_angle
 from slam_backend.smoothing._kernels import LANES
 from slam_backend.smoothing.graph import LEVER
 
+PLANE = [0, 1, 3, 6]  # rows of a tile: where a landmark is in the plane, and its variances there
 LEAST_SHARED = 2  # landmarks that say how a particle is turned
 
 
@@ -35,15 +36,16 @@ class Held:
 
 
 def holding(
-    tiles: FloatArray, landmarks: FloatArray, poses: FloatArray, means: FloatArray, weights: FloatArray
+    tiles: FloatArray, seen: IntArray, landmarks: FloatArray, poses: FloatArray, means: FloatArray, weights: FloatArray
 ) -> Held | None:
     """Return the motions that bring each particle's landmarks to those of the most probable path.
 
     The fit of each particle is one of least squares, landmarks weighed by the inverse of how much they scatter.
 
     Args:
-        tiles: (n, P / 64, 9, 64) float64. Means and covariances of the landmarks now seen, by lanes.
-        landmarks: (n, 3) float64 [m]. The same in the most probable path.
+        tiles: (l, P / 64, 9, 64) float64. Means and covariances of landmarks, by lanes.
+        seen: (n,) int64. Which of them are now seen.
+        landmarks: (l, 3) float64 [m]. All of them in the most probable path.
         poses: (K, 3, M) float64 [m, m, rad], map frame. Newest poses of the particles.
         means: (K, 3) Of the most probable path.
         weights: (M,) summing to 1.
@@ -51,13 +53,14 @@ def holding(
     Returns:
         None where it does not help: too few landmarks, or the newest poses would scatter more than they do.
     """
-    if len(tiles) < LEAST_SHARED:
+    if len(seen) < LEAST_SHARED:
         return None
     m = poses.shape[2]
-    rows = tiles.transpose(0, 2, 1, 3).reshape(len(tiles), 9, -1)[:, :, :m]
-    off = rows[:, :2] - landmarks[:, :2, None]
-    spread = ((off * off).sum(axis=1) + rows[:, 3] + rows[:, 6]) @ weights
-    motions = _fitted(rows[:, :2], landmarks[:, :2], 1.0 / np.maximum(spread, 1e-300))
+    rows = tiles[seen[:, None], :, PLANE].reshape(len(seen), len(PLANE), -1)[:, :, :m]
+    targets = landmarks[seen, :2]
+    off = rows[:, :2] - targets[:, :, None]
+    spread = ((off * off).sum(axis=1) + rows[:, 2] + rows[:, 3]) @ weights
+    motions = _fitted(rows[:, :2], targets, 1.0 / np.maximum(spread, 1e-300))
     moved = compose(motions, poses.transpose(0, 2, 1)).transpose(0, 2, 1)
     if not _scatter(moved, means, weights) < _scatter(poses, means, weights):
         return None

@@ -221,7 +221,7 @@ def _particles(graph: PathGraph, mode: Mode, draws: Draws, weights: FloatArray) 
     densities = -0.5 * np.einsum("im,im->m", off, np.linalg.solve(joint, off)) if len(off) else np.zeros(len(weights))
     frame = np.zeros((3, 3))
     rows = np.flatnonzero(np.isin(np.flatnonzero(seen), graph.point_landmarks))
-    if (held := holding(tiles[rows], mode.landmarks[seen][rows], poses, means, weights)) is not None:
+    if (held := holding(tiles, rows, mode.landmarks[seen], poses, means, weights)) is not None:
         move_tiles(tiles, held.motions)
         move_poses(poses, held.motions, np.arange(len(poses)))
         move_poses(starts, held.motions, np.flatnonzero(mode.columns[graph.heads] >= 0))

@@ -123,7 +123,7 @@ def replay(mode: Mode, rows: FloatArray, num_particles: int) -> tuple[FloatArray
     """
     blocks, k = rows.shape[:2]
     seen = mode.sightings
-    tiles = np.zeros((len(mode.landmarks), blocks, 9, LANES))
+    tiles = np.empty((len(mode.landmarks), blocks, 9, LANES))
     log_likelihood = np.zeros(blocks * LANES)
     _kernels.replay(
         rows.reshape(-1), k, blocks, mode.landmarks, seen.keys, seen.starts, seen.centres, seen.infos, seen.slopes,

@@ -237,15 +237,8 @@ class _System:
 
     def covariance(self, columns: IntArray) -> FloatArray:
         """Return the joint covariance (3 r, 3 r) of poses by their columns (r,)."""
-        p, nodes = self.pattern, columns // 3
-        result = np.empty((3 * len(nodes), 3 * len(nodes)))
-        unit = np.zeros(self.vector.shape)
-        for place, node in enumerate(nodes):
-            for axis in range(3):
-                unit[node, axis] = 1.0
-                solved = _kernels.solve(self.pivots, self.values, p.order, p.tops, p.rows, unit)
-                result[:, 3 * place + axis] = solved[nodes].ravel()
-                unit[node, axis] = 0.0
+        p = self.pattern
+        result = _kernels.covariance(self.pivots, self.values, p.ranks, p.tops, p.rows, columns // 3)
         return 0.5 * (result + result.T)
 
     def spreads(self, poses: FloatArray) -> FloatArray:

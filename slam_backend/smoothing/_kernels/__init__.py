@@ -3,7 +3,7 @@
 from slam_backend.smoothing._kernels.coarsening import add_sightings, join_keys
 from slam_backend.smoothing._kernels.drawing import draw
 from slam_backend.smoothing._kernels.equations import FREE, form
-from slam_backend.smoothing._kernels.factoring import factorise, solve
+from slam_backend.smoothing._kernels.factoring import covariance, factorise, solve
 from slam_backend.smoothing._kernels.forms import condense, invert
 from slam_backend.smoothing._kernels.gathering import gather
 from slam_backend.smoothing._kernels.ordering import lay_out, minimum_degree, neighbours
@@ -11,7 +11,7 @@ from slam_backend.smoothing._kernels.paths import LANES, POSE_ROWS, WORK_ROWS, o
 from slam_backend.smoothing._kernels.scattering import scatter_of_links
 
 __all__ = [
-    "FREE", "LANES", "POSE_ROWS", "WORK_ROWS", "add_sightings", "condense", "draw", "factorise", "form", "gather",
-    "invert", "join_keys", "lay_out", "minimum_degree", "neighbours", "odometry_of_paths", "replay",
+    "FREE", "LANES", "POSE_ROWS", "WORK_ROWS", "add_sightings", "condense", "covariance", "draw", "factorise", "form",
+    "gather", "invert", "join_keys", "lay_out", "minimum_degree", "neighbours", "odometry_of_paths", "replay",
     "scatter_of_links", "solve", "to_lanes",
 ]  # fmt: skip

@@ -1,4 +1,4 @@
-"""Cholesky's factor of the normal equations by blocks of 3 x 3, and solutions.
+"""Cholesky's factor of the normal equations by blocks of 3 x 3, solutions, and blocks of the inverse.
 
 Blocks are kept as `ordering.lay_out` says, each as nine numbers row by row. A pivot is a lower triangle, by rows, with
 the reciprocals of its diagonal (6).
@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from slam_backend._jit import inlined, jit
+from slam_backend._jit import fused, inlined
 from slam_backend.errors import FloatArray, IntArray
 
 
@@ -26,7 +26,7 @@ def _added(values: FloatArray, place: int, block: FloatArray) -> None:
                 out[3 * j + i] += block[i, j]
 
 
-@jit
+@fused
 def factorise(
     blocks: FloatArray, links: FloatArray, cross: FloatArray, damping: float, num_poses: int, order: IntArray,
     tops: IntArray, rows: IntArray, link_places: IntArray, cross_places: IntArray, row_tops: IntArray,
@@ -99,7 +99,7 @@ def factorise(
     return True
 
 
-@jit
+@fused
 def solve(
     pivots: FloatArray, values: FloatArray, order: IntArray, tops: IntArray, rows: IntArray, vector: FloatArray
 ) -> FloatArray:
@@ -110,11 +110,56 @@ def solve(
         order, tops, rows: As of `lay_out`.
         vector: (N, 3).
     """
-    num = len(order)
-    x, result = np.empty((num, 3)), np.empty((num, 3))
-    for j in range(num):
+    x, result = np.empty((len(order), 3)), np.empty((len(order), 3))
+    for j in range(len(order)):
         x[j] = vector[order[j]]
-    for j in range(num):
+    _sweep(pivots, values, tops, rows, np.arange(len(order)), x)
+    for j in range(len(order)):
+        result[order[j]] = x[j]
+    return result
+
+
+@fused
+def covariance(
+    pivots: FloatArray, values: FloatArray, ranks: IntArray, tops: IntArray, rows: IntArray, nodes: IntArray
+) -> FloatArray:
+    """Return the blocks (3 r, 3 r) of the inverse that belong to r nodes.
+
+    Only columns to which the first blocks lead from these nodes' own take part: all other elements are zero on the way
+    down, and not asked for on the way up.
+
+    Args:
+        pivots, values: As `factorise` wrote them.
+        ranks, tops, rows: As of `lay_out`.
+        nodes: (r,) int64.
+    """
+    needed = np.zeros(len(ranks), dtype=np.bool_)
+    for node in nodes:
+        j = ranks[node]
+        while not needed[j]:
+            needed[j] = True
+            if tops[j] < tops[j + 1]:
+                j = rows[tops[j]]
+    columns = np.flatnonzero(needed)
+    x, result = np.zeros((len(ranks), 3)), np.empty((3 * len(nodes), 3 * len(nodes)))
+    for n in range(len(nodes)):
+        for axis in range(3):
+            for j in columns:
+                x[j] = 0.0
+            x[ranks[nodes[n]], axis] = 1.0
+            _sweep(pivots, values, tops, rows, columns, x)
+            for m in range(len(nodes)):
+                for i in range(3):
+                    result[3 * m + i, 3 * n + axis] = x[ranks[nodes[m]], i]
+    return result
+
+
+@fused
+def _sweep(
+    pivots: FloatArray, values: FloatArray, tops: IntArray, rows: IntArray, columns: IntArray, x: FloatArray
+) -> None:
+    """Solve for x (N, 3) by rank, in place; all but these columns (n,), ascending, are left out."""
+    for j in columns:
         pivot = pivots[j]
         x0 = x[j, 0] * pivot[0]
         x1 = (x[j, 1] - pivot[1] * x0) * pivot[2]
@@ -125,7 +170,7 @@ def solve(
             out[0] -= v[0] * x0 + v[1] * x1 + v[2] * x2
             out[1] -= v[3] * x0 + v[4] * x1 + v[5] * x2
             out[2] -= v[6] * x0 + v[7] * x1 + v[8] * x2
-    for j in range(num - 1, -1, -1):
+    for j in columns[::-1]:
         x0, x1, x2 = x[j, 0], x[j, 1], x[j, 2]
         for p in range(tops[j], tops[j + 1]):
             v, y = values[p], x[rows[p]]
@@ -137,5 +182,3 @@ def solve(
         x1 = (x1 - pivot[4] * x2) * pivot[2]
         x0 = (x0 - pivot[1] * x1 - pivot[3] * x2) * pivot[0]
         x[j, 0], x[j, 1], x[j, 2] = x0, x1, x2
-        result[order[j], 0], result[order[j], 1], result[order[j], 2] = x0, x1, x2
-    return result

@@ -147,23 +147,23 @@ def lay_out(
             while rest != np.uint64(0):
                 low = rest & (~rest + ONE)
                 rest ^= low
-                row = ranks[w * WORD + _num_bits(low - ONE)]
-                at = top
-                while at > tops[j] and rows[at - 1] > row:
-                    rows[at] = rows[at - 1]
-                    at -= 1
-                rows[at] = row
-                row_tops[row + 1] += 1
+                rows[top] = ranks[w * WORD + _num_bits(low - ONE)]  # not yet ascending
+                row_tops[rows[top] + 1] += 1
                 top += 1
     tops[num] = top
     for j in range(num):
         row_tops[j + 1] += row_tops[j]
     done = row_tops.copy()
-    for j in range(num):
+    for j in range(num):  # each row's columns ascend if columns come one after the other, and the other way round
         for p in range(tops[j], tops[j + 1]):
-            row = rows[p]
-            row_columns[done[row]], row_places[done[row]] = j, p
-            done[row] += 1
+            row_columns[done[rows[p]]] = j
+            done[rows[p]] += 1
+    done[:] = tops
+    for row in range(num):
+        for n in range(row_tops[row], row_tops[row + 1]):
+            p = done[row_columns[n]]
+            rows[p], row_places[n] = row, p
+            done[row_columns[n]] += 1
     first_landmark = num - (len(starts) - 1)
     for b in range(len(columns)):
         a = previous[b]

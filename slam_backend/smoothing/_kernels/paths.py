@@ -54,14 +54,15 @@ def replay(
         landmarks: (l, 3) about which forms are evaluated, map frame.
         keys, starts, centres, infos, slopes: Sightings, those of landmark i are starts[i] to starts[i + 1].
         work: (WORK_ROWS * LANES,) room.
-        tiles: (l * num_blocks * 9 * LANES,), result: mean (3) and covariance (6) per lane. Landmarks without sightings
-            are left alone.
+        tiles: (l * num_blocks * 9 * LANES,), result: mean (3) and covariance (6) per lane; zeros for a landmark without
+            sightings.
         log_likelihood: (num_blocks * LANES,), result.
     """
     log_likelihood[:] = 0.0
     for landmark in range(len(landmarks)):
         first, last = starts[landmark], starts[landmark + 1]
         if first == last:
+            tiles[landmark * num_blocks * 9 * LANES : (landmark + 1) * num_blocks * 9 * LANES] = 0.0
             continue
         x, y, z = landmarks[landmark, 0], landmarks[landmark, 1], landmarks[landmark, 2]
         for block in range(num_blocks):

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from slam_backend._jit import inlined, jit
+from slam_backend._jit import fused, inlined
 from slam_backend.errors import FloatArray, IntArray
 
 
@@ -24,7 +24,7 @@ def _times_turned(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
             out[3 * i + j] += a[i] * b[j] + a[3 + i] * b[3 + j] + a[6 + i] * b[6 + j]
 
 
-@jit
+@fused
 def scatter_of_links(
     poses: FloatArray, columns: IntArray, previous: IntArray, lever: float, pivots: FloatArray, values: FloatArray,
     order: IntArray, ranks: IntArray, tops: IntArray, rows: IntArray, row_tops: IntArray, link_places: IntArray,

@@ -128,6 +128,19 @@ def test_covariances_of_poses_are_the_dense_ones(posed):
     np.testing.assert_allclose(found @ information(posed), np.eye(len(found)), atol=1e-6)
 
 
+def test_blocks_of_the_inverse_are_the_solutions_for_unit_vectors(posed):
+    """Columns that are left out on the way to a few nodes would have added nothing: the same bits."""
+    system = posed.mode.system
+    assert system is not None
+    p, nodes = system.pattern, np.array([system.num_poses - 1, 2])
+    found = _kernels.covariance(system.pivots, system.values, p.ranks, p.tops, p.rows, nodes)
+    for column in range(6):
+        unit = np.zeros(system.vector.shape)
+        unit[nodes[column // 3], column % 3] = 1.0
+        solved = _kernels.solve(system.pivots, system.values, p.order, p.tops, p.rows, unit)
+        np.testing.assert_array_equal(found[:, column], solved[nodes].ravel())
+
+
 def test_spreads_are_those_of_the_dense_covariance(posed):
     """Derivatives of motions by differences, and the dense inverse, give how far each motion scatters."""
     graph, mode = posed.graph, posed.mode

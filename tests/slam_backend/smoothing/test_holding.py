@@ -102,7 +102,9 @@ def test_particles_that_differ_by_a_motion_alone_are_brought_together():
     poses = compose(motions, pose).T[None]
     weights = rng.uniform(0.5, 1.5, count)
     weights /= weights.sum()
-    held = holding(laned(moved_plainly(values, motions)), landmarks, poses, pose[None], weights)
+    moved, seen = moved_plainly(values, motions), np.array([0, 1, 3, 5])
+    moved[[2, 4], :3] += 7.0  # what is not seen has no say
+    held = holding(laned(moved), seen, landmarks, poses, pose[None], weights)
     assert held is not None
     np.testing.assert_allclose(compose(held.motions, motions), 0.0, atol=1e-12)
     np.testing.assert_allclose(held.scatter, (weights * motions.T) @ motions, atol=1e-12)
@@ -118,8 +120,9 @@ def test_what_says_nothing_of_the_turn_holds_nothing(apart: float):
     values[:, :2] += 0.05 * rng.standard_normal((2, 2, 80))
     poses = pose[None, :, None] + 0.05 * rng.standard_normal((1, 3, 80))
     weights = np.full(80, 1.0 / 80)
-    assert holding(laned(values), landmarks, poses, pose[None], weights) is None
-    assert holding(laned(values[:1]), landmarks[:1], poses, pose[None], weights) is None
+    for seen in ([0, 1], [0], []):
+        rows = np.array(seen, dtype=np.int64)
+        assert holding(laned(values), rows, landmarks, poses, pose[None], weights) is None
 
 
 def test_what_particles_no_longer_show_is_claimed_all_the_same():
