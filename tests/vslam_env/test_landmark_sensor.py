@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 from slam_backend.camera import StereoCamera
+from slam_backend.geometry import compose
 from vslam_env.sensors import LandmarkSensor, LandmarkSensorConfig
+from vslam_env.sensors._landmark_kernels import measure
 from vslam_env.world import FreeSpace, Landmarks, World, make_world, place_landmarks
 
 SHARP = StereoCamera(sigma_px=1e-9, sigma_disparity_px=1e-9)
@@ -128,6 +130,35 @@ def test_noise_is_the_cameras() -> None:
     true = camera.project(np.array([-0.7, -0.4, 4.0]))
     np.testing.assert_allclose(pixels.std(axis=0), [0.3, 0.3, 0.15], rtol=0.04)
     np.testing.assert_array_less(np.abs(pixels.mean(axis=0) - true), 5 * np.array([0.3, 0.3, 0.15]) / np.sqrt(8000))
+
+
+def test_a_frame_is_the_plain_definition() -> None:
+    """Points are disturbed in the image and triangulated, descriptors disturbed and normalised, false ones as well."""
+    rng = np.random.default_rng(8)
+    camera = StereoCamera(mount=(0.1, -0.2, 0.3))
+    ids, counts = np.array([2, -1, 4, 0, -2]), np.array([2, 0, 3])
+    robots = np.repeat(np.arange(3), counts)
+    poses = rng.uniform(-1.0, 1.0, (3, 3))
+    seen = rng.uniform([-1.0, -1.0, 2.0], [1.0, 1.0, 6.0], (5, 3))
+    false, (looks, false_looks) = rng.uniform(1.0, 3.0, (2, 3)), rng.standard_normal((2, 5, 4))
+    positions = np.empty((5, 3))
+    for row in np.flatnonzero(ids >= 0):
+        name, robot = ids[row], robots[row]
+        x, y, z = camera.robot_from_camera(seen[row])
+        positions[name, 2] = z
+        positions[name, :2] = compose(poses[robot], [x, y, 0.0])[:2]
+    noise = rng.standard_normal((5, 7))
+    got = np.empty((5, 3)), np.empty((5, 4), np.float32), np.empty(5, np.bool_)
+    stereo = np.array([camera.focal_px, camera.baseline, camera.sigma_px, camera.sigma_disparity_px])
+    world = poses, np.array(camera.mount), positions, looks, false, false_looks
+    assert measure(ids, counts, *world, noise, stereo, 0.3, *got) == 5
+    is_true, made_up = ids[:, None] >= 0, (-1 - ids) % 2
+    true = np.where(is_true, seen, false[made_up])
+    sigmas = camera.sigma_px, camera.sigma_px, camera.sigma_disparity_px
+    np.testing.assert_allclose(got[0], camera.triangulate(camera.project(true) + sigmas * noise[:, :3]), rtol=1e-9)
+    disturbed = np.where(is_true, looks[ids], false_looks[made_up]) + 0.15 * noise[:, 3:]
+    np.testing.assert_allclose(got[1], disturbed / np.linalg.norm(disturbed, axis=1, keepdims=True), rtol=1e-6)
+    assert got[2].all()
 
 
 def test_descriptor_noise_has_the_stated_length() -> None:

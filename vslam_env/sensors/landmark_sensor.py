@@ -3,12 +3,11 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
-from slam_backend._jit import jit
 from slam_backend.camera import StereoCamera
 from slam_backend.errors import BoolArray, FloatArray, IntArray, bad_argument, check_array, check_float, check_int
 from slam_backend.measurements import Measurements
+from vslam_env.sensors import _landmark_kernels as kernels
 from vslam_env.world.spec import Landmarks
 from vslam_env.world.visibility import view_limits, visible_landmarks
 
@@ -82,6 +81,7 @@ class LandmarkSensor:
         self._mount = np.array(config.camera.mount)
         self._stereo = np.array([getattr(config.camera, name) for name in _STEREO])
         self._view = view_limits(config.camera, config.max_incidence)
+        self._no_false_points = np.empty((0, 3)), np.empty((0, self._descriptors.shape[1]))
         # False points look like landmarks of this world: the common part of all descriptors and a part of their own.
         self._common = self._descriptors.mean(axis=0) if len(landmarks) else np.zeros(landmarks.descriptors.shape[1])
         self._own_share = np.sqrt(max(0.0, 1.0 - float(self._common @ self._common)))
@@ -106,47 +106,35 @@ class LandmarkSensor:
         Returns:
             One frame for each robot. Nothing in the order of its points tells anything about them.
         """
-        config = self.config
+        config, marks = self.config, self._landmarks
         poses = np.ascontiguousarray(poses, dtype=np.float64)
         robots, most = len(poses), config.max_measurements
         visible = self.visible(poses)
-        num_false = [min(number, most) for number in rng.poisson(config.false_points, robots).tolist()]
+        num_false = np.minimum(rng.poisson(config.false_points, robots), most)
         keys = rng.random(visible.shape)
-        ids, points = np.empty(robots * most, np.int64), np.empty((robots * most, 3))
-        descriptors = np.empty((robots * most, self._descriptors.shape[1]))
-        counts = np.zeros(robots, np.int64)
-        total = _choose_and_see(
-            visible,
-            keys,
-            config.detection_probability,
-            np.array([most - number for number in num_false]),
-            self._landmarks.positions,
-            self._descriptors,
-            poses,
-            self._mount,
-            ids,
-            counts,
-            points,
-            descriptors,
-        )
-        ids, points, descriptors = ids[:total], points[:total], descriptors[:total]
-        extra = sum(num_false)
+        ids, counts = np.empty(robots * most, np.int64), np.empty(robots, np.int64)
+        total = kernels.choose(visible, keys, config.detection_probability, num_false, most, ids, counts)
+        ids, false_points = ids[:total], self._no_false_points
+        extra = sum(num_false.tolist())
         if extra:
-            ids = np.concatenate([ids, np.full(extra, -1)])
-            points = np.concatenate([points, self._false_points(extra, rng)])
-            descriptors = np.concatenate([descriptors, self._false_descriptors(extra, rng)])
-            order = _mixed(counts.tolist(), num_false, rng.random(len(ids)).tolist())
-            ids, points, descriptors, counts = ids[order], points[order], descriptors[order], counts + num_false
-        noise = rng.standard_normal((len(ids), 3 + descriptors.shape[1]))
-        sharp, looks = np.empty(len(ids), np.bool_), np.empty(descriptors.shape, np.float32)
-        if _add_noise(points, descriptors, noise, self._stereo, config.descriptor_noise, sharp, looks) < len(ids):
+            false_points = self._false_points(extra, rng), self._false_descriptors(extra, rng)
+            ids = np.concatenate([ids, -1 - np.arange(extra)])
+            ids = ids[_mixed(counts.tolist(), num_false.tolist(), rng.random(len(ids)).tolist())]
+            counts += num_false
+        noise = rng.standard_normal((len(ids), 3 + self._descriptors.shape[1]))
+        points, looks = np.empty((len(ids), 3)), np.empty((len(ids), self._descriptors.shape[1]), np.float32)
+        sharp = np.empty(len(ids), np.bool_)
+        truth = ids, counts, poses, self._mount, marks.positions, self._descriptors, *false_points
+        num_sharp = kernels.measure(*truth, noise, self._stereo, config.descriptor_noise, points, looks, sharp)
+        if extra:
+            ids = np.maximum(ids, -1)
+        if num_sharp < len(ids):
             counts = np.bincount(np.repeat(np.arange(robots), counts)[sharp], minlength=robots)
             ids, points, looks = ids[sharp], points[sharp], looks[sharp]
         frames, begin = [], 0
         for count in counts.tolist():
             end = begin + count
-            rows = slice(begin, end)
-            frames.append(Frame(Measurements._trusted(points[rows], looks[rows]), ids[rows].copy()))
+            frames.append(Frame(Measurements._trusted(points[begin:end], looks[begin:end]), ids[begin:end]))
             begin = end
         return frames
 
@@ -186,137 +174,3 @@ def _mixed(num_true: list[int], num_false: list[int], keys: list[float]) -> list
         order += [row for _, row in sorted(zip(own, rows, strict=True))]
         true, false = true + real, false + made_up
     return order
-
-
-@jit
-def _seen_from(
-    positions: FloatArray, ids: IntArray, counts: IntArray, poses: FloatArray, mount: FloatArray, points: FloatArray
-) -> None:
-    """Write landmarks `ids`, `counts` (K,) of each robot in turn, as points in the camera frames (n, 3) [m]."""
-    i = 0
-    for k in range(len(poses)):
-        c, s = np.cos(poses[k, 2]), np.sin(poses[k, 2])
-        for _ in range(counts[k]):
-            dx, dy = positions[ids[i], 0] - poses[k, 0], positions[ids[i], 1] - poses[k, 1]
-            points[i, 0] = mount[1] - (c * dy - s * dx)
-            points[i, 1] = mount[2] - positions[ids[i], 2]
-            points[i, 2] = c * dx + s * dy - mount[0]
-            i += 1
-
-
-@jit
-def _add_noise(
-    points: FloatArray,
-    descriptors: FloatArray,
-    noise: FloatArray,
-    stereo: FloatArray,
-    descriptor_noise: float,
-    sharp: BoolArray,
-    looks: NDArray[np.float32],
-) -> int:
-    """Replace true points, in place, by measured ones, and write measured descriptors.
-
-    Points are projected, their image coordinates and disparities disturbed, and triangulated again.
-
-    Args:
-        points: (n, 3) float64 [m], camera frame.
-        descriptors: (n, d) float64, unit vectors, true; they are disturbed in place.
-        noise: (n, 3 + d) float64, standard normal.
-        stereo: (4,) float64. Focal length [px], baseline [m], sigmas of image coordinates and disparity [px].
-        descriptor_noise: Root mean square length of the noise of a descriptor.
-        sharp: (n,) bool. Written to: false where the disparity vanishes in the noise: no matcher reports such a point.
-        looks: (n, d) float32, unit vectors. Written to: the measured descriptors.
-
-    Returns:
-        How many are sharp.
-    """
-    focal, baseline, sigma, sigma_disparity = stereo
-    size = descriptors.shape[1]
-    each = descriptor_noise / np.sqrt(size)
-    count = 0
-    for i in range(len(points)):
-        scale = focal / points[i, 2]
-        disparity = baseline * scale + sigma_disparity * noise[i, 2]
-        sharp[i] = disparity > 0.0
-        count += sharp[i]
-        if sharp[i]:
-            points[i, 0] = (points[i, 0] * scale + sigma * noise[i, 0]) * baseline / disparity
-            points[i, 1] = (points[i, 1] * scale + sigma * noise[i, 1]) * baseline / disparity
-            points[i, 2] = focal * baseline / disparity
-        square = 0.0
-        for j in range(size):
-            descriptors[i, j] += each * noise[i, 3 + j]
-            square += descriptors[i, j] ** 2
-        length = np.sqrt(square)
-        for j in range(size):
-            looks[i, j] = descriptors[i, j] / length
-    return count
-
-
-@jit
-def _choose(
-    visible: BoolArray,
-    keys: FloatArray,
-    detection_probability: float,
-    places: IntArray,
-    chosen: IntArray,
-    counts: IntArray,
-) -> int:
-    """Detect landmarks and choose among the detected ones.
-
-    A landmark with a uniform key in [0, 1) is detected if the key is below the probability. The detected ones with the
-    smallest keys are then a uniform choice in uniformly random order.
-
-    Args:
-        visible: (K, N) bool.
-        keys: (K, N) float64, uniform.
-        detection_probability: Of a visible landmark.
-        places: (K,) int64. At most so many are chosen for each robot.
-        chosen: (n,) int64. Written to: the chosen landmarks of all robots one after the other.
-        counts: (K,) int64, zeros before. Written to: the number for each robot.
-
-    Returns:
-        How many are chosen.
-    """
-    total = 0
-    for k in range(len(visible)):
-        begin = total
-        for n in range(visible.shape[1]):
-            if not visible[k, n] or keys[k, n] >= detection_probability:
-                continue
-            if counts[k] < places[k]:
-                at = total
-                counts[k] += 1
-                total += 1
-            elif counts[k] > 0 and keys[k, n] < keys[k, chosen[total - 1]]:
-                at = total - 1
-            else:
-                continue
-            while at > begin and keys[k, chosen[at - 1]] > keys[k, n]:
-                chosen[at] = chosen[at - 1]
-                at -= 1
-            chosen[at] = n
-    return total
-
-
-@jit
-def _choose_and_see(
-    visible: BoolArray,
-    keys: FloatArray,
-    detection_probability: float,
-    places: IntArray,
-    positions: FloatArray,
-    descriptors: FloatArray,
-    poses: FloatArray,
-    mount: FloatArray,
-    ids: IntArray,
-    counts: IntArray,
-    points: FloatArray,
-    looks: FloatArray,
-) -> int:
-    """Do what `_choose` and `_seen_from` do, and write true descriptors (n, d) as well; return how many are chosen."""
-    total = _choose(visible, keys, detection_probability, places, ids, counts)
-    for i in range(total):
-        looks[i] = descriptors[ids[i]]
-    _seen_from(positions, ids, counts, poses, mount, points)
-    return total

@@ -64,16 +64,15 @@ class Scan:
         """
         config = self.config
         poses = np.ascontiguousarray(poses, dtype=np.float64)
-        true = cast_scans(poses, self.ray_angles, self._walls, self._robot_radius, config.max_range)
-        return _with_noise(true, rng.standard_normal(true.shape), config.sigma, config.max_range)
+        ranges = cast_scans(poses, self.ray_angles, self._walls, self._robot_radius, config.max_range)
+        _add_noise(ranges, rng.standard_normal(ranges.shape), config.sigma, config.max_range)
+        return ranges
 
 
 @jit
-def _with_noise(true: FloatArray, noise: FloatArray, sigma: float, max_range: float) -> FloatArray:
-    """Return what is read of true ranges (K, R) [m] under standard normal draws (K, R)."""
-    read = np.empty_like(true)
-    for k in range(true.shape[0]):
-        for r in range(true.shape[1]):
-            noisy = true[k, r] * (1.0 + sigma * noise[k, r])
-            read[k, r] = min(max(noisy, 0.0), max_range) if true[k, r] < max_range else max_range
-    return read
+def _add_noise(ranges: FloatArray, noise: FloatArray, sigma: float, max_range: float) -> None:
+    """Replace true ranges (K, R) [m] by what is read of them under standard normal draws (K, R)."""
+    for k in range(ranges.shape[0]):
+        for r in range(ranges.shape[1]):
+            if ranges[k, r] < max_range:
+                ranges[k, r] = min(max(ranges[k, r] * (1.0 + sigma * noise[k, r]), 0.0), max_range)

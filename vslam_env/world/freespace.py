@@ -8,11 +8,10 @@ import numpy as np
 from slam_backend.camera import StereoCamera
 from slam_backend.errors import BoolArray, FloatArray, bad_argument, check_array, check_float, check_int
 from slam_backend.geometry import wrap_angle
+from vslam_env.world.clearance import clearance_raster, distances_to_walls
 from vslam_env.world.spec import Landmarks, World
 from vslam_env.world.visibility import (
     cast_scans,
-    clearance_raster,
-    distances_to_walls,
     seen_from_somewhere,
     view_limits,
     visible_landmarks,

@@ -1,4 +1,4 @@
-"""Compiled geometry of sight: what rays hit, which landmarks a camera sees, and from where they can be seen.
+"""Compiled geometry of sight: what rays hit, which landmarks a camera sees, and whether they can be seen at all.
 
 All kernels live in this one module because they call each other. A camera at (x, y) with axis theta looks along its
 own x axis; `ahead` and `left` are coordinates in that frame.
@@ -115,18 +115,25 @@ def cast_scans(
     ranges = np.full((len(poses), len(angles)), max_range)
     widest = np.max(np.abs(angles))
     tan_half = np.tan(widest) + EPSILON if widest < 1.5 else 0.0
+    rays, others = np.empty((len(angles), 2)), np.empty((len(poses), 2))
+    for r in range(len(angles)):
+        rays[r, 0], rays[r, 1] = np.cos(angles[r]), np.sin(angles[r])
     for k in range(len(poses)):
         near, _ = walls_in_wedge(poses[k], walls, tan_half, max_range)
         c, s = np.cos(poses[k, 2]), np.sin(poses[k, 2])
+        num_others = 0
+        for j in range(len(poses)):
+            ox, oy = poses[j, 0] - poses[k, 0], poses[j, 1] - poses[k, 1]
+            if j != k and max(abs(ox), abs(oy)) <= max_range + robot_radius:
+                others[num_others, 0], others[num_others, 1] = c * ox + s * oy, c * oy - s * ox
+                num_others += 1
         for r in range(len(angles)):
-            dx, dy = np.cos(angles[r]), np.sin(angles[r])
+            dx, dy = rays[r]
             nearest = max_range
             for i in range(len(near)):
                 nearest = min(nearest, _ray_to_wall(dx, dy, near[i, 0], near[i, 1], near[i, 2], near[i, 3]))
-            for j in range(len(poses)):
-                if j != k:
-                    ox, oy = poses[j, 0] - poses[k, 0], poses[j, 1] - poses[k, 1]
-                    nearest = min(nearest, _ray_to_disc(dx, dy, c * ox + s * oy, c * oy - s * ox, robot_radius))
+            for j in range(num_others):
+                nearest = min(nearest, _ray_to_disc(dx, dy, others[j, 0], others[j, 1], robot_radius))
             ranges[k, r] = nearest
     return ranges
 
@@ -260,56 +267,3 @@ def seen_from_somewhere(
                         break
             radius += spacing
     return seen
-
-
-@jit
-def distances_to_walls(points: FloatArray, walls: FloatArray) -> FloatArray:
-    """Return the distance (P,) float64 [m] from each point to the nearest wall.
-
-    Args:
-        points: (P, 2) float64 [m], world frame.
-        walls: (S, 4) float64 [m], world frame.
-    """
-    nearest = np.full(len(points), np.inf)
-    for i in range(len(walls)):
-        ex, ey = walls[i, 2] - walls[i, 0], walls[i, 3] - walls[i, 1]
-        square = ex * ex + ey * ey
-        for p in range(len(points)):
-            px, py = points[p, 0] - walls[i, 0], points[p, 1] - walls[i, 1]
-            u = min(1.0, max(0.0, (px * ex + py * ey) / square))
-            distance = np.sqrt((px - u * ex) ** 2 + (py - u * ey) ** 2)
-            nearest[p] = min(nearest[p], distance)
-    return nearest
-
-
-@jit
-def clearance_raster(
-    walls: FloatArray, origin: FloatArray, cell: float, rows: int, columns: int, limit: float
-) -> FloatArray:
-    """Return the exact distance (rows, columns) [m] of cell centres to the nearest wall, cut off at `limit` [m].
-
-    Args:
-        walls: (S, 4) float64 [m], world frame.
-        origin: (2,) float64 [m], world frame. Lower left corner of cell (0, 0).
-        cell: Side of a cell [m].
-        rows: Cells along y.
-        columns: Cells along x.
-        limit: Distances beyond are not told apart [m].
-    """
-    clearance = np.full((rows, columns), limit)
-    for i in range(len(walls)):
-        x1, y1 = walls[i, 0] - origin[0], walls[i, 1] - origin[1]
-        ex, ey = walls[i, 2] - walls[i, 0], walls[i, 3] - walls[i, 1]
-        square = ex * ex + ey * ey
-        first_row = max(0, int((min(y1, y1 + ey) - limit) / cell))
-        last_row = min(rows, int((max(y1, y1 + ey) + limit) / cell) + 1)
-        first_column = max(0, int((min(x1, x1 + ex) - limit) / cell))
-        last_column = min(columns, int((max(x1, x1 + ex) + limit) / cell) + 1)
-        for row in range(first_row, last_row):
-            py = (row + 0.5) * cell - y1
-            for column in range(first_column, last_column):
-                px = (column + 0.5) * cell - x1
-                u = min(1.0, max(0.0, (px * ex + py * ey) / square))
-                distance = np.sqrt((px - u * ex) ** 2 + (py - u * ey) ** 2)
-                clearance[row, column] = min(clearance[row, column], distance)
-    return clearance
