@@ -14,7 +14,7 @@ from slam_backend.geometry import rotate_covariances
 from slam_backend.landmark_map import LandmarkMap, MapOutline
 from slam_backend.reports import MergeEvent, Renaming, TeamReport
 from slam_backend.team import TeamSlam
-from vslam_env.navigation import CandidateSlots, SeenGrid
+from vslam_env.navigation import CandidateSlots, TeamGrids
 from vslam_env.readings import Readings
 from vslam_env.robot_belief import Belief, BeliefConfig, Body, Candidates, Glimpse, Teammate
 from vslam_env.shared_grids import SharedGrids
@@ -161,9 +161,9 @@ class TeamBelief:
         return self._poses.starts.copy()
 
     @property
-    def grids(self) -> list[SeenGrid]:
+    def grids(self) -> TeamGrids:
         """The robots' seen grids; to be looked at."""
-        return self._grids.all
+        return self._grids.team
 
     def cells(self, robot: int) -> NDArray[np.uint8]:
         """Return the cells (300, 300) uint8 of a robot's seen grid; a read-only view that follows its changes."""

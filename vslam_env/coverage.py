@@ -1,6 +1,6 @@
 """How much of the reachable floor the robots have seen, by their own grids, and which of them found it."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from slam_backend._jit import jit
 from slam_backend.errors import FloatArray
 from slam_backend.geometry import inverse, transform_points
-from vslam_env.navigation import FREE, GRID_SIZE, SeenGrid, cell_of
+from vslam_env.navigation import FREE, GRID_SIZE, TeamGrids, cell_of
 
 
 @jit
@@ -17,11 +17,11 @@ def _recount(changes: Any, cells: Any, places: Any, floor: Any, seen: Any, seers
     """Bring up to date what one robot sees of the floor.
 
     Args:
-        changes: (1 + k,) int32, as `SeenGrid.take_changes` returns them.
-        cells: (300, 300) uint8. Of the robot's grid.
-        places: (n,) int32, ascending. Places of floor cells in the grid.
-        floor: (n,) int32. These floor cells.
-        seen: (n,) bool. Whether the robot saw them; changed.
+        changes: (1 + n,) int32. Of its grid, see `TeamGrids`.
+        cells: (300, 300) uint8. Of its grid.
+        places: (m,) int32, ascending. Places of floor cells in the flat grid.
+        floor: (m,) int32. These floor cells.
+        seen: (m,) bool. Whether the robot saw them; changed.
         seers: (N,) int64. How many robots see each floor cell; changed.
         ever: (N,) bool. Floor cells that are known to have been found.
         fresh: (1 + N,) int32. How many others have come to be seen, then which; -1: any of them. Added to.
@@ -78,20 +78,65 @@ def _find(fresh: Any, seers: Any, cells: Any, positions: Any, ever: Any, found: 
     fresh[0] = 0
 
 
+@jit
+def _update(
+    changes: Any,
+    cells: Any,
+    bounds: Any,
+    places: Any,
+    floor: Any,
+    seen: Any,
+    seers: Any,
+    ever: Any,
+    fresh: Any,
+    area: Any,
+    positions: Any,
+    found: Any,
+) -> int:
+    """Take in what has changed in all grids; return how many more floor cells are seen by some robot than before.
+
+    Args:
+        changes: (K, 1 + n) int32. Of the grids, see `TeamGrids`; none afterwards.
+        cells: (K, 300, 300) uint8. Of the grids.
+        bounds: (K + 1,) int64. Where each robot's part of the next three begins, and the last ends.
+        places: As in `_recount`, as is what follows; of all robots.
+        floor: Likewise of all robots.
+        seen: Likewise of all robots.
+        seers: Of the floor.
+        ever: Of the floor.
+        fresh: Of the floor.
+        area: (N, 2) float64 [m], world frame. The floor cells.
+        positions: As in `_find`, as is what follows.
+        found: Changed.
+    """
+    more = 0
+    for robot in range(len(cells)):
+        own = slice(bounds[robot], bounds[robot + 1])
+        more += _recount(changes[robot], cells[robot], places[own], floor[own], seen[own], seers, ever, fresh)
+        changes[robot, 0] = 0
+    _find(fresh, seers, area, positions, ever, found)
+    return more
+
+
 class CoverageMeter:
     """Where the cells of the free floor lie in each robot's grid, laid at its true start pose; it never changes.
 
     Args:
         free_area_cells: (n, 2) float64 [m], world frame. Centres of the cells of the free floor.
         true_starts: (K, 3) float64 [m, m, rad], world frame.
+
+    Attributes:
+        cells: The same centres.
+        places: (m,) int32. Robot by robot the places in its flat grid in which floor cells lie, ascending.
+        floor: (m,) int32. These floor cells.
+        bounds: (K + 1,) int64. Where each robot's part of both begins, and the last ends.
     """
 
     def __init__(self, free_area_cells: FloatArray, true_starts: FloatArray) -> None:
-        self.places = tuple(
-            _flat_cells(transform_points(inverse(start), free_area_cells)) for start in np.asarray(true_starts)
-        )
-        self.count = len(free_area_cells)
+        own = [_flat_cells(transform_points(inverse(start), free_area_cells)) for start in np.asarray(true_starts)]
         self.cells = np.ascontiguousarray(free_area_cells)
+        self.places, self.floor = (np.concatenate(parts) for parts in zip(*own, strict=True))
+        self.bounds = np.cumsum([0, *(len(places) for places, _ in own)])
 
 
 class Coverage:
@@ -105,35 +150,39 @@ class Coverage:
 
     def __init__(self, meter: CoverageMeter) -> None:
         self._meter = meter
-        self._seen = [np.zeros(len(floor), np.bool_) for _, floor in meter.places]
-        self._seers = np.zeros(meter.count, np.int64)
+        count = len(meter.cells)
+        self._seen = np.zeros(len(meter.places), np.bool_)
+        self._seers = np.zeros(count, np.int64)
         self._covered = 0
         self._began = False
-        self._ever = np.zeros(meter.count, np.bool_)
-        self._fresh = np.zeros(1 + meter.count, np.int32)
-        self._found = np.zeros(len(meter.places), np.int64)
+        self._ever = np.zeros(count, np.bool_)
+        self._fresh = np.zeros(1 + count, np.int32)
+        self._found = np.zeros(len(meter.bounds) - 1, np.int64)
 
-    def share(self, grids: Sequence[SeenGrid]) -> float:
-        """Return the coverage in [0, 1] of the robots' grids, whose changes are taken."""
-        for grid, (places, floor), seen in zip(grids, self._meter.places, self._seen, strict=True):
-            changes = grid.take_changes()
-            if not self._began:
-                changes[0] = -1
-            self._covered += _recount(changes, grid.cells, places, floor, seen, self._seers, self._ever, self._fresh)
-        self._began = True
-        return self._covered / max(self._meter.count, 1)
+    def update(self, grids: TeamGrids, positions: FloatArray) -> tuple[float, FloatArray]:
+        """Look at what the robots have seen by now, and take their grids' changes.
 
-    def found(self, positions: FloatArray) -> FloatArray:
-        """Return what each robot has found (K,): the share of the free floor that it was nearest to when first seen.
-
-        To be asked after each `share`. A cell is found once, so that what has been found never falls, and sums up to
-        the coverage unless floor has been lost again.
+        A cell is found once, so that what has been found never falls, and sums up to the coverage unless floor has been
+        lost again.
 
         Args:
+            grids: Of the robots.
             positions: (K, 2 or 3) float64 [m], world frame. True positions of the robots.
+
+        Returns:
+            The coverage in [0, 1], and what each robot has found (K,): the share of the free floor that it was nearest
+            to when it was first seen.
         """
-        _find(self._fresh, self._seers, self._meter.cells, positions, self._ever, self._found)
-        return self._found / max(self._meter.count, 1)
+        if not self._began:
+            grids.changes[:, 0] = -1
+            self._began = True
+        meter = self._meter
+        self._covered += _update(
+            grids.changes, grids.cells, meter.bounds, meter.places, meter.floor, self._seen, self._seers, self._ever,
+            self._fresh, meter.cells, positions, self._found,
+        )  # fmt: skip
+        count = max(len(meter.cells), 1)
+        return self._covered / count, self._found / count
 
     def get_state(self) -> dict[str, Any]:
         """Return a copy of what cannot be counted again from the grids."""

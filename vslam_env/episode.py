@@ -126,6 +126,7 @@ class Episode:
         placed = compose(self.true_starts, belief.starts_from_group)  # where its own estimates put each map
         maps = self.ledger.scores(outlines, placed)
         distances, turns = pose_errors(self.true_starts, self.estimated_path[-1], poses)
+        coverage, found = self._coverage.update(belief.grids, poses)
         return Standing(
             map_errors=maps.errors,
             map_rmses=maps.rmses,
@@ -135,8 +136,8 @@ class Episode:
             pose_errors=distances,
             heading_errors=turns,
             pose_sigmas=belief.position_sigmas,
-            coverage=self._coverage.share(belief.grids),
-            found=self._coverage.found(poses),
+            coverage=coverage,
+            found=found,
             collisions=self._collisions.copy(),
             distances=self._distances.copy(),
             bytes_sent=belief.bytes_sent,

@@ -77,9 +77,9 @@ class SharedGrids:
         self._strokes: deque[Strokes] = deque()
 
     @property
-    def all(self) -> list[SeenGrid]:
+    def team(self) -> TeamGrids:
         """All grids, in the order of robots."""
-        return self._grids
+        return self._team
 
     def __getitem__(self, robot: int) -> SeenGrid:
         return self._grids[robot]

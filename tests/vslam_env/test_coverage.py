@@ -5,49 +5,48 @@ import numpy as np
 from slam_backend.errors import FloatArray
 from tests.vslam_env.small_env import small_env
 from vslam_env.coverage import Coverage, CoverageMeter
-from vslam_env.navigation import SeenGrid
+from vslam_env.navigation import TeamGrids
 
 STARTS = np.array([[1.0, 2.0, 0.0], [7.0, 2.0, np.pi]])
 SQUARES = np.stack(np.meshgrid(np.arange(0.1, 8.0, 0.2), np.arange(0.1, 4.0, 0.2)), -1).reshape(-1, 2)
 
 
-def _looked(coverage: Coverage, grids: list[SeenGrid], robot: int, x: float) -> FloatArray:
+def _looked(coverage: Coverage, team: TeamGrids, robot: int, x: float) -> FloatArray:
     """Let a robot see a disc around (x, 2), and return what each robot has found, robot 0 standing at x = 1."""
     own = x - STARTS[0, 0] if robot == 0 else STARTS[1, 0] - x  # robot 1 looks the other way
-    grids[robot].clear_disc(np.array([own, 0.0, 0.0]), 0.5)
-    coverage.share(grids)
-    return coverage.found(STARTS[:, :2])
+    team.grids[robot].clear_disc(np.array([own, 0.0, 0.0]), 0.5)
+    return coverage.update(team, STARTS[:, :2])[1]
 
 
 def test_floor_is_found_once_by_the_nearest() -> None:
     """A cell counts once, for the robot nearest to it when it is first seen, whoever saw it."""
-    coverage, grids = Coverage(CoverageMeter(SQUARES, STARTS)), [SeenGrid(), SeenGrid()]
+    coverage, team = Coverage(CoverageMeter(SQUARES, STARTS)), TeamGrids(2)
     disc = np.mean((np.hypot(*(SQUARES - [1.0, 2.0]).T)) < 0.5)
-    first = _looked(coverage, grids, robot=0, x=1.0)
+    first = _looked(coverage, team, robot=0, x=1.0)
     np.testing.assert_allclose(first, [disc, 0.0], rtol=0.2)
-    assert np.array_equal(_looked(coverage, grids, robot=1, x=1.0), first)
-    np.testing.assert_allclose(_looked(coverage, grids, robot=0, x=5.0), [first[0], first[0]], rtol=0.2)
+    assert np.array_equal(_looked(coverage, team, robot=1, x=1.0), first)
+    np.testing.assert_allclose(_looked(coverage, team, robot=0, x=5.0), [first[0], first[0]], rtol=0.2)
 
 
 def test_finds_are_those_of_a_plain_count() -> None:
     """However grids change, each cell counts once for the nearest robot, as a look at all cells every time says."""
     rng = np.random.default_rng(2)
     starts = rng.uniform(0.0, 6.0, (3, 3))
-    coverage, grids = Coverage(CoverageMeter(SQUARES, starts)), [SeenGrid() for _ in starts]
+    coverage, team = Coverage(CoverageMeter(SQUARES, starts)), TeamGrids(3)
     ever, found, angles = np.zeros(len(SQUARES), np.bool_), np.zeros(3), np.linspace(-0.6, 0.6, 32)
     for turn in range(60):
-        for grid in grids:
+        for grid in team.grids:
             pose = np.append(rng.uniform(-3.0, 3.0, 2), rng.uniform(-3.0, 3.0))
             grid.paint_scan(pose, rng.uniform(0.5, 3.0, 32), angles)
         if turn == 30:
             coverage.set_state(coverage.get_state())
         positions = rng.uniform(0.0, 8.0, (3, 2))
-        coverage.share(grids)
+        said = coverage.update(team, positions)[1]
         fresh = (coverage._seers > 0) & ~ever
         nearest = np.hypot(*np.moveaxis(SQUARES[:, None] - positions, -1, 0)).argmin(axis=1)
         found += np.bincount(nearest[fresh], minlength=3) / len(SQUARES)
         ever |= fresh
-        np.testing.assert_allclose(coverage.found(positions), found)
+        np.testing.assert_allclose(said, found)
     assert ever.mean() > 0.3
 
 

@@ -10,7 +10,7 @@ from slam_backend.metrics import gospa, map_error, map_rmse
 from slam_backend.reports import LandmarksCreated, Renaming, TeamReport
 from vslam_env.coverage import Coverage, CoverageMeter
 from vslam_env.errors_of_maps import ClaimLedger
-from vslam_env.navigation import FREE, SeenGrid, cell_of
+from vslam_env.navigation import FREE, SeenGrid, TeamGrids, cell_of
 
 TRUTHS = np.array([[0.0, 0.0, 0.0], [5.0, 0.0, 0.3], [0.0, 6.0, -0.2], [7.0, 7.0, 0.0], [9.0, 1.0, 0.0]])
 COUNTABLE = np.array([True, True, False, True, True])
@@ -149,15 +149,16 @@ def test_coverage_of_known_floor() -> None:
     centres = np.array([[x, y] for x in (1.0, 2.0, 3.0) for y in (1.0, 2.0)])
     starts = np.array([[1.0, 1.0, 0.0], [3.0, 2.0, np.pi / 2]])
     coverage = Coverage(CoverageMeter(centres, starts))
-    grids = [SeenGrid(), SeenGrid()]
-    assert coverage.share(grids) == 0.0
+    team = TeamGrids(2)
+    grids = team.grids
+    assert coverage.update(team, starts)[0] == 0.0
     grids[0].clear_disc(STAY)
-    assert np.isclose(coverage.share(grids), 1 / 6)
+    assert np.isclose(coverage.update(team, starts)[0], 1 / 6)
     grids[1].clear_disc(STAY)
     grids[1].clear_disc([0.0, 1.0, 0.0])  # one metre to the left of a robot that looks up: (2, 2)
     row, col = cell_of([0.0, 1.0])
     assert grids[1].cells[row, col] == FREE
-    assert np.isclose(coverage.share(grids), 3 / 6)
+    assert np.isclose(coverage.update(team, starts)[0], 3 / 6)
 
 
 def _plain_share(centres: np.ndarray, starts: np.ndarray, grids: list[SeenGrid]) -> float:
@@ -175,7 +176,8 @@ def test_coverage_is_a_union() -> None:
     rng = np.random.default_rng(6)
     centres = rng.uniform(-35.0, 35.0, (2000, 2))  # some lie outside a robot's grid
     starts = rng.uniform(-3.0, 3.0, (3, 3))
-    grids = [SeenGrid() for _ in starts]
+    team = TeamGrids(3)
+    grids = team.grids
     meter = CoverageMeter(centres, starts)
     coverage, shares = Coverage(meter), []
     kept = grids[1].get_state()
@@ -191,8 +193,8 @@ def test_coverage_is_a_union() -> None:
             grids[0].absorb(grids[2], rng.uniform(-1.0, 1.0, 3))
         if turn in (20, 30):
             grids[1].set_state(kept)
-        shares.append(coverage.share(grids))
+        shares.append(coverage.update(team, starts)[0])
         assert shares[-1] == _plain_share(centres, starts, grids)
     assert shares[-1] > 0.1
     assert min(np.diff(shares)) < 0.0  # walls were seen where floor had been, and a grid was restored
-    assert Coverage(meter).share(grids) == shares[-1]
+    assert Coverage(meter).update(team, starts)[0] == shares[-1]

@@ -149,18 +149,6 @@ class SeenGrid:
         x, y, theta = pose_floats(self_from_other, "self_from_other")
         _painting.paint_grid(self._evidence, self._cells, self._changes, other._evidence.copy(), x, y, theta)
 
-    def take_changes(self) -> NDArray[np.int32]:
-        """Return the changes since this was asked last, for the one who keeps count of the cells; then none are left.
-
-        Returns:
-            (1 + n,) int32. How many there were, then that many places in the flat grid of cells whose verdicts changed
-            (some may stand there twice). -1 if all may have changed, as when this is asked for the first time.
-        """
-        self._refuse_if_read_only()
-        changes = self._changes[: 1 + max(0, int(self._changes[0]))].copy()
-        self._changes[0] = 0
-        return changes
-
     def copy(self) -> "SeenGrid":
         """Return an independent grid, which can be written to, with the same content."""
         return SeenGrid._of(self._evidence.copy(), self._cells.copy(), _no_changes())

@@ -16,13 +16,19 @@ class TeamGrids:
 
     Attributes:
         grids: Of the robots.
+        cells: (K, 300, 300) uint8, read-only. Their cells, one after the other.
+        changes: (K, 1 + n) int32. Per grid how many verdicts have changed since whoever keeps count of the cells set
+            this number to 0, then the places of that many cells in the flat grid (some may stand there twice). -1 if
+            all may have changed, as in the beginning.
     """
 
     def __init__(self, num_robots: int) -> None:
         shape = (num_robots, GRID_SIZE, GRID_SIZE)
         self._evidence, self._cells = np.zeros(shape, np.int8), np.full(shape, UNKNOWN, np.uint8)
-        self._changes = np.full((num_robots, 1 + _painting.MOST_CHANGES), -1, np.int32)
-        self.grids = list(map(SeenGrid._of, self._evidence, self._cells, self._changes))
+        self.changes = np.full((num_robots, 1 + _painting.MOST_CHANGES), -1, np.int32)
+        self.grids = list(map(SeenGrid._of, self._evidence, self._cells, self.changes))
+        self.cells = self._cells.view()
+        self.cells.flags.writeable = False
 
     def paint_readings(
         self,
@@ -50,7 +56,7 @@ class TeamGrids:
         Raises:
             ValueError: If a pose is not finite, or ranges or angles are not as described; then nothing is painted.
         """
-        grids = self._evidence, self._cells, self._changes
+        grids = self._evidence, self._cells, self.changes
         fault, pair = _painting.paint_readings(*grids, owners, robots, poses, scans, bumps, angles, max_range, radius)
         if fault != _painting.READINGS_FINE:
             raise bad_reading(fault, poses[pair], scans[robots[pair]], angles)
