@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from slam_backend._existence_step import ExistenceStep
-from slam_backend._frame_buffers import FrameBuffers, Turn
+from slam_backend._frame_buffers import FrameBuffers, Frames
 from slam_backend._map_store import aligned
 from slam_backend._mixtures import pose_mixture
 from slam_backend._particle_maps import ParticleMaps
@@ -76,7 +76,7 @@ class FilterState:
         self._weights = np.full(m, 1.0 / m)
         self._steps = 0
         self._logs = [RobotLog() for _ in range(k)]
-        self._buffers = FrameBuffers(padded)
+        self._buffers = FrameBuffers(k, padded)
         self._estimates = [self._mixture(robot) for robot in range(k)]
 
     @property
@@ -121,7 +121,7 @@ class FilterState:
         self._path_log_weights = self._path_log_weights[ancestors]
         self._weights = np.full(len(ancestors), 1.0 / len(ancestors))
         self._log_weights = np.full(len(ancestors), -np.log(len(ancestors)))
-        self._buffers = FrameBuffers(self._maps.padded)
+        self._buffers = FrameBuffers(self.num_robots, self._maps.padded)
 
     def _renew(self, new: Particles) -> None:
         """Go on with M particles from smoothed paths; the old ones' most probable says which landmarks there are."""
@@ -150,21 +150,24 @@ class FilterState:
 
     # ------------------------------------------------------------------ what a step leaves behind
 
-    def _write_down(self, turns: Sequence[Turn], inputs: Sequence[RobotInput], report: StepReport) -> None:
+    def _write_down(self, frames: Frames, inputs: Sequence[RobotInput], report: StepReport) -> None:
         """Log what the robots did and measured in the step before `_steps`, and what that was taken for."""
-        for robot, (turn, (move, _, _, exact)) in enumerate(zip(turns, inputs, strict=True)):
+        step, buffers, smoother, first = self._steps - 1, self._buffers, self._rejuvenation, 0
+        for robot, (move, frame, names, exact) in enumerate(inputs):
+            size, keep, last = frames.sizes[robot], frames.keeps[robot], frames.ends[robot]
             if exact is not None:
                 self._frame.fill(0.0)  # it is known now
-            if turn.size or move is not None or exact is not None:
+            if size or move is not None or exact is not None:
                 ids = report.associations[robot]
                 self._logs[robot].append(
-                    self._steps - 1, move, exact, turn.points,
-                    ids if turn.keep is None else ids[turn.keep], turn.noises if turn.given else None,
+                    step, move, exact, buffers.points[first:last], ids if keep is None else ids[keep],
+                    buffers.noises[first:last] if size and buffers.given[robot] else None,
                 )  # fmt: skip
-                if self._rejuvenation is not None:
-                    self._rejuvenation.note(robot, self._steps - 1, self._estimates[robot], exact is not None)
-                    if turn.names is None and report.num_rejected:
-                        self._rejuvenation.note_refused(robot, self._steps - 1, ids, turn.descriptors)
+                if smoother is not None:
+                    smoother.note(robot, step, self._estimates[robot], exact is not None)
+                    if names is None and frame is not None and report.num_rejected:
+                        smoother.note_refused(robot, step, ids, frame.descriptors)
+            first = last
 
     # ------------------------------------------------------------------ snapshots
 

@@ -9,110 +9,158 @@ from numpy.typing import NDArray
 from slam_backend import _kernels
 from slam_backend._kernels import LANES
 from slam_backend._map_store import aligned
-from slam_backend.errors import FloatArray, IntArray
+from slam_backend.errors import BoolArray, FloatArray, IntArray
+from slam_backend.input_log import RobotInput
 from slam_backend.measurements import Measurements
 
 CANDIDATES = 64  # of one frame for which there is working space; more get their own each time
 EMPTY = Measurements.empty(0)
 NO_COVARIANCES = np.zeros((0, 3, 3))
 NO_COVARIANCES.setflags(write=False)
+NO_NAMES = np.zeros(0, dtype=np.int64)
 
 
-class Turn(NamedTuple):
-    """One robot's part in a step.
+# One robot's points, covariances or None, descriptors, names or None.
+Readings = tuple[FloatArray, FloatArray | None, NDArray[np.float32], IntArray | None]
+
+
+class Frames(NamedTuple):
+    """What all robots of a filter measured in a step, one robot's measurements after the other's.
 
     Attributes:
-        size: Number of measurements that the caller gave.
-        keep: (n,) which of them are used: those that the caller did not name -1. None: all.
-        points: (n, 3) used measurements relative to the camera centre, robot axes.
-        noises: (n, 6) their covariances, robot axes; zeros unless `given`.
-        given: Whether the caller gave covariances.
+        sizes: Per robot how many the caller gave.
+        keeps: Per robot which of these are used (n_i,): those that the caller did not name -1. None: all.
+        ends: Per robot where its used measurements end among all n; they begin where those before it end.
+        points: (n, 3) [m], camera frame.
+        covariances: (n, 3, 3) [m^2] likewise, or (0, 3, 3) where no robot has any.
         descriptors: (n, d).
-        names: (n,) the caller's names, or None.
-        found: (n, P) slot to which each particle gave each measurement, -1 = none. Valid until the next step.
-        distances: (n, P) squared Mahalanobis distances of matches, else NaN. Likewise.
-        new_slots: (n,) slot of the landmark that a measurement started, -1 = none.
+        names: (n,) the caller's names, or (0,) where no robot has any.
     """
 
-    size: int
-    keep: IntArray | None
+    sizes: list[int]
+    keeps: list[IntArray | None]
+    ends: list[int]
     points: FloatArray
-    noises: FloatArray
-    given: bool
+    covariances: FloatArray
     descriptors: NDArray[np.float32]
-    names: IntArray | None
-    found: NDArray[np.int32]
-    distances: FloatArray
-    new_slots: IntArray
+    names: IntArray
 
 
 class FrameBuffers:
     """Arrays that are used again at each step.
 
     Args:
+        num_robots: K.
         padded: P, number of particles rounded up to whole blocks.
+
+    Attributes:
+        acts: (K,) int64. What each robot did, as `_kernels.take_turns` takes it; with `moves` (K, 3) its odometry.
+        firsts: (K + 1,) int64. Where each robot's measurements begin among all.
+        given, named: (K,) bool. Whether its measurements come with covariances, and with names.
+        log_likelihood: (P,) of the step.
+        points, noises: (n', 3), (n', 6) the measurements relative to the camera centre in robot axes, and their
+            covariances, zeros for those that have none.
+        found: (n', P) int32. Slot to which each particle gave each measurement, -1 = none.
+        distances: (n', P) squared Mahalanobis distances of matches, else NaN.
+        new_slots: (n',) int64. Slot of the landmark that a measurement started, -1 = none.
+        work, records: Of the kernels.
     """
 
-    def __init__(self, padded: int) -> None:
-        self.padded = padded
-        self.used = 0  # measurements of this step so far
-        self._all = True  # that the caller gave
+    def __init__(self, num_robots: int, padded: int) -> None:
+        self.acts: IntArray = np.zeros(num_robots, dtype=np.int64)
+        self.moves: FloatArray = np.zeros((num_robots, 3))
+        self.firsts: IntArray = np.zeros(num_robots + 1, dtype=np.int64)
+        self.given: BoolArray = np.zeros(num_robots, dtype=np.bool_)
+        self.named: BoolArray = np.zeros(num_robots, dtype=np.bool_)
         self.log_likelihood: FloatArray = np.zeros(padded)
         self.work: FloatArray = aligned((_kernels.WORK_ROWS * LANES,), np.float64)
         self.records: FloatArray = aligned((CANDIDATES, _kernels.CANDIDATE_ROWS * LANES), np.float64)
-        self._found: NDArray[np.int32] = np.zeros((0, padded), dtype=np.int32)
-        self._distances: FloatArray = np.zeros((0, padded))
-        self._new_slots: IntArray = np.zeros(0, dtype=np.int64)
-        self._rows: IntArray = np.zeros(0, dtype=np.int64)
+        self._make_room(0)
 
-    def start(self, most: int) -> None:
-        """Begin a step with at most `most` measurements."""
-        self.used, self._all = 0, True
+    def _make_room(self, most: int) -> None:
+        """Provide for so many measurements in a step."""
+        padded = len(self.log_likelihood)
+        self.points: FloatArray = np.zeros((most, 3))
+        self.noises: FloatArray = np.zeros((most, 6))
+        self.found: NDArray[np.int32] = np.zeros((most, padded), dtype=np.int32)
+        self.distances: FloatArray = np.zeros((most, padded))
+        self.new_slots: IntArray = np.zeros(most, dtype=np.int64)
+        self._rows: IntArray = np.arange(most)
+
+    def take(self, inputs: Sequence[RobotInput]) -> Frames:
+        """Begin a step: take what all robots read, and provide for what becomes of it."""
         self.log_likelihood.fill(0.0)
-        if most > len(self._found):
-            self._found = np.zeros((2 * most, self.padded), dtype=np.int32)
-            self._distances = np.zeros((2 * most, self.padded))
-            self._new_slots = np.zeros(2 * most, dtype=np.int64)
-            self._rows = np.arange(2 * most)
+        sizes: list[int] = []
+        keeps: list[IntArray | None] = []
+        ends: list[int] = []
+        used: list[Readings] = []  # of each robot that has measurements
+        total = 0
+        for robot, (move, frame, names, exact) in enumerate(inputs):
+            if exact is not None:
+                self.acts[robot] = _kernels.PLACED
+            elif move is not None:
+                self.acts[robot], self.moves[robot] = _kernels.MOVED, move
+            else:
+                self.acts[robot] = _kernels.IDLE
+            size, keep = 0, None
+            if frame is not None and len(frame.points):
+                own: Readings = (frame.points, frame.covariances, frame.descriptors, names)
+                size = left = len(frame.points)
+                if names is not None and names.min() < 0:
+                    own, keep = _without_rejected(frame.points, frame.covariances, frame.descriptors, names)
+                    left = len(keep)
+                if move is None and exact is None and left:
+                    self.acts[robot] = _kernels.STOOD
+                if left:
+                    used.append(own)
+                self.given[robot], self.named[robot] = frame.covariances is not None, names is not None
+                total += left
+            sizes.append(size)
+            keeps.append(keep)
+            ends.append(total)
+            self.firsts[robot + 1] = total
+        if total > len(self.found):
+            self._make_room(2 * total)
+        return Frames(sizes, keeps, ends, *_joined(used))
 
-    def outcome(self, turns: Sequence[Turn]) -> tuple[NDArray[np.int32], FloatArray, IntArray, IntArray]:
-        """Return what became of the measurements of all turns of a step, one after the other.
+    def rows_used(self, frames: Frames) -> IntArray:
+        """Return which of all measurements that the caller gave are used (n,)."""
+        if all(keep is None for keep in frames.keeps):
+            return self._rows[: len(frames.points)]
+        firsts = np.cumsum([0, *frames.sizes[:-1]])
+        kept = [
+            np.arange(size) if keep is None else keep for size, keep in zip(frames.sizes, frames.keeps, strict=True)
+        ]
+        return np.concatenate([first + own for first, own in zip(firsts, kept, strict=True)])
 
-        Returns:
-            `found`, `distances` and `new_slots` of the turns, and which of all measurements that the caller gave these
-            are (n,).
-        """
-        used, rows = self.used, self._rows[: self.used]
-        if not self._all:
-            firsts = np.cumsum([0] + [turn.size for turn in turns])
-            kept = (np.arange(turn.size) if turn.keep is None else turn.keep for turn in turns)
-            rows = np.concatenate([first + own for first, own in zip(firsts[:-1], kept, strict=True)])
-        return self._found[:used], self._distances[:used], self._new_slots[:used], rows
 
-    def take(self, frame: Measurements | None, names: IntArray | None) -> Turn:
-        """Return a robot's readings as the kernels take them, with room for what becomes of them.
+def _without_rejected(
+    points: FloatArray, covariances: FloatArray | None, descriptors: NDArray[np.float32], names: IntArray
+) -> tuple[Readings, IntArray]:
+    """Return the readings that the caller did not name -1, and which these are."""
+    keep = np.flatnonzero(names >= 0)
+    return (points[keep], None if covariances is None else covariances[keep], descriptors[keep], names[keep]), keep
 
-        Args:
-            frame: What it measured; None: nothing.
-            names: (n,) int64 the caller's names of that, -1 for what is to be rejected; None: unknown.
-        """
-        if frame is None:
-            frame = EMPTY
-        points, covariances, descriptors = frame.points, frame.covariances, frame.descriptors
-        size = len(points)
-        keep: IntArray | None = None
-        if names is not None and size and names.min() < 0:
-            self._all, keep = False, np.flatnonzero(names >= 0)
-            points, descriptors, names = points[keep], descriptors[keep], names[keep]
-            covariances = None if covariances is None else covariances[keep]
-            for array in (points, descriptors, covariances):
-                if array is not None:
-                    array.setflags(write=False)  # as those of a frame: kernels are compiled once
-        first, num = self.used, len(points)
-        turned, noises = np.empty((num, 3)), np.empty((num, 6))
-        _kernels.to_robot_axes(points, NO_COVARIANCES if covariances is None else covariances, turned, noises)
-        self.used = last = first + num
-        return Turn(
-            size, keep, turned, noises, covariances is not None, descriptors, names,
-            self._found[first:last], self._distances[first:last], self._new_slots[first:last],
-        )  # fmt: skip
+
+def _joined(
+    used: Sequence[Readings],
+) -> tuple[FloatArray, FloatArray, NDArray[np.float32], IntArray]:
+    """Return points, covariances, descriptors and names of all robots that have any, one after the other.
+
+    Only names may be written, as in a frame: kernels are compiled for one kind of array.
+    """
+    if not used:
+        return EMPTY.points, NO_COVARIANCES, EMPTY.descriptors, NO_NAMES
+    points, covariances, descriptors, names = used[0]
+    if len(used) > 1:
+        points = np.concatenate([own[0] for own in used])
+        descriptors = np.concatenate([own[2] for own in used])
+        if any(own[1] is not None for own in used):
+            covariances = np.concatenate([np.zeros((len(own[0]), 3, 3)) if own[1] is None else own[1] for own in used])
+        if any(own[3] is not None for own in used):
+            names = np.concatenate([np.zeros(len(own[0]), np.int64) if own[3] is None else own[3] for own in used])
+    covariances = NO_COVARIANCES if covariances is None else covariances
+    if points.flags.writeable:
+        for array in (points, covariances, descriptors):
+            array.setflags(write=False)
+    return points, covariances, descriptors, NO_NAMES if names is None else names

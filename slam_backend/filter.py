@@ -12,13 +12,13 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from slam_backend._frame_buffers import Turn
+from slam_backend._frame_buffers import Frames
 from slam_backend._rejuvenation_step import RejuvenationStep
 from slam_backend._step_input import check_step
-from slam_backend._turns import RobotParticles, conclude, take_turn
+from slam_backend._turns import PoseParticles, conclude, place, take_turns
 from slam_backend.adaptation import AdaptiveParticles, next_num_particles
 from slam_backend.camera import StereoCamera
-from slam_backend.errors import check_array
+from slam_backend.errors import IntArray, check_array
 from slam_backend.existence import ExistenceModel
 from slam_backend.filter_knowledge import FilterKnowledge
 from slam_backend.filter_options import FilterOptions
@@ -164,24 +164,19 @@ class FastSlam(FilterKnowledge):
 
     def _step_checked(self, inputs: Sequence[RobotInput]) -> StepReport:
         """Do what `step` does with readings that `check_step` returned; none of them is written to."""
-        buffers = self._buffers
-        buffers.start(sum([0 if reading.frame is None else len(reading.frame.points) for reading in inputs]))
-        turns, deserted = [], []
-        for robot, reading in enumerate(inputs):
-            turns.append(self._take_turn(robot, reading))
-            if self._existence is not None and reading.frame is not None:
-                where, best = self._poses[robot], self.best_particle
-                deserted.append(self._existence.weigh(self._maps, where, best, turns[robot]))
+        maps, buffers = self._maps, self._buffers
+        frames = buffers.take(inputs)
+        deserted = self._take_turns(inputs, frames)
         self._steps += 1
         weights = self._log_weights, self._path_log_weights, self._weights
-        threshold = self.options.resample_threshold * self._maps.num_particles * (1.0 + 1e-9)
+        threshold = self.options.resample_threshold * maps.num_particles * (1.0 + 1e-9)
         report, self._estimates = conclude(
-            turns, buffers, self._maps.ids, weights, (self._means, self._covariances), threshold
+            frames, buffers, maps.ids, weights, (self._means, self._covariances), threshold
         )  # fmt: skip
-        self._write_down(turns, inputs, report)
+        self._write_down(frames, inputs, report)
         self._widen()
         for slots in deserted:
-            self._maps.release(slots)
+            maps.release(slots)
         if report.resampled:
             self._resample()
         if self._rejuvenation is not None:
@@ -233,18 +228,29 @@ class FastSlam(FilterKnowledge):
             self._renew(result.particles)
         return RejuvenationReport(result.reason, result.ess, result.iterations, result.graph.num_keys)
 
-    def _take_turn(self, robot: int, reading: RobotInput) -> Turn:
-        """Take one robot's turn in the step; where it did and saw nothing no random number is drawn."""
-        move, frame, names, exact = reading
-        turn = self._buffers.take(frame, names)
-        if len(turn.points) or move is not None or exact is not None:
-            own = RobotParticles(
-                self._starts[robot], self._poses[robot], self._means[robot], self._covariances[robot],
-                bool(self._blind[robot]),
-            )  # fmt: skip
-            normals = self._rng.standard_normal((self._maps.num_particles, 3))
-            self._blind[robot] = take_turn(self._assumed, own, self._maps, self._buffers, turn, move, exact, normals)
-        return turn
+    def _take_turns(self, inputs: Sequence[RobotInput], frames: Frames) -> list[IntArray]:
+        """Take all robots' turns; where one did and saw nothing no random number is drawn.
+
+        Returns:
+            Slots of landmarks that turned out not to exist; to be released when nobody asks for their ids.
+        """
+        maps, buffers = self._maps, self._buffers
+        particles = PoseParticles(self._starts, self._poses, self._means, self._covariances, self._blind)
+        for robot, reading in enumerate(inputs):
+            if reading.pose is not None:
+                place(particles, maps.num_particles, robot, reading.pose)
+        normals = self._rng.standard_normal((np.count_nonzero(buffers.acts), maps.num_particles, 3))
+        if self._existence is None:
+            take_turns(self._assumed, particles, maps, buffers, frames, normals, 0, len(inputs))
+            return []
+        deserted = []
+        for robot, reading in enumerate(inputs):
+            take_turns(self._assumed, particles, maps, buffers, frames, normals, robot, robot + 1)
+            if reading.frame is not None:
+                own = slice(buffers.firsts[robot], buffers.firsts[robot + 1])
+                of_frame = buffers.found[own], buffers.new_slots[own]
+                deserted.append(self._existence.weigh(maps, self._poses[robot], self.best_particle, *of_frame))
+        return deserted
 
     def _resample(self) -> None:
         """Draw the particles anew in proportion to their weights; all that a particle holds goes with it."""

@@ -20,17 +20,15 @@ special case. With A = (dr/dx) C and S = Sigma + R, a match adds J = A^T S^-1 A 
 g = A^T S^-1 r to the gradient. A gate takes S + A P A^T, with P the covariance of xi.
 """
 
-from slam_backend._kernels.candidates import extent, to_robot_axes
-from slam_backend._kernels.fastslam1 import update_fastslam1
-from slam_backend._kernels.fastslam2 import update_fastslam2
+from slam_backend._kernels.candidates import extent
 from slam_backend._kernels.landmark_updates import YOUNG
 from slam_backend._kernels.layout import CANDIDATE_ROWS, FAR, LANES, MIN_DEPTH, WORK_ROWS
-from slam_backend._kernels.motion import move_blind
 from slam_backend._kernels.places import carry_odds, refresh
 from slam_backend._kernels.resampling import resample
+from slam_backend._kernels.turns import IDLE, MOVED, PLACED, STOOD, take_turns, write_sigmas
 from slam_backend._kernels.weights import conclude, mixture
 
 __all__ = [
-    "CANDIDATE_ROWS", "FAR", "LANES", "MIN_DEPTH", "WORK_ROWS", "YOUNG", "carry_odds", "conclude", "extent",
-    "mixture", "move_blind", "refresh", "resample", "to_robot_axes", "update_fastslam1", "update_fastslam2",
+    "CANDIDATE_ROWS", "FAR", "IDLE", "LANES", "MIN_DEPTH", "MOVED", "PLACED", "STOOD", "WORK_ROWS", "YOUNG",
+    "carry_odds", "conclude", "extent", "mixture", "refresh", "resample", "take_turns", "write_sigmas",
 ]  # fmt: skip

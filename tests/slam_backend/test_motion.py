@@ -1,7 +1,12 @@
+from dataclasses import astuple
+
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy import stats
 
+from slam_backend import _kernels
 from slam_backend.geometry import compose, wrap_angle
 from slam_backend.motion import OdometryModel
 
@@ -16,6 +21,15 @@ def test_standard_deviations_add_in_squares() -> None:
     expected = [np.hypot(0.1, 0.01), np.hypot(0.03, 0.01), np.sqrt(0.05**2 + (0.2 * 0.5) ** 2 + 0.02**2)]
     np.testing.assert_allclose(MODEL.sigmas(MOVE), expected)
     np.testing.assert_allclose(MODEL.sigmas(np.zeros(3)), [0.01, 0.01, 0.02])
+
+
+@given(st.lists(st.floats(0.0, 1.0), min_size=6, max_size=6), st.lists(st.floats(-10.0, 10.0), min_size=3, max_size=3))
+def test_kernels_assume_the_same_standard_deviations(sigmas: list[float], move: list[float]) -> None:
+    """The compiled form of the model is the model."""
+    model = OdometryModel(**dict(zip(OdometryModel.__slots__, sigmas, strict=True)))
+    compiled = np.empty(3)
+    _kernels.write_sigmas(np.array(astuple(model)), np.array(move), compiled)
+    np.testing.assert_allclose(compiled, model.sigmas(np.array(move)), rtol=1e-14)
 
 
 def test_samples_have_the_stated_moments() -> None:
