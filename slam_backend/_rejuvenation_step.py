@@ -1,4 +1,4 @@
-"""What a filter does to be rejuvenated: when it is due, what the smoother is told, what is kept until the next time."""
+"""What a filter does to be rejuvenated: when it is due, and what is kept until the next time."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -8,21 +8,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend._blas import on_one_thread
+from slam_backend._joint_graphs import joint_graph
 from slam_backend._particle_maps import ParticleMaps
+from slam_backend._smoother_input import known_of, looks_of, most_waiting, places_of, since
 from slam_backend.errors import FloatArray, IntArray
 from slam_backend.filter_options import FilterOptions
-from slam_backend.geometry import compose, inverse, rotate_covariances
+from slam_backend.geometry import compose
 from slam_backend.log_arrays import LogArrays
 from slam_backend.reports import PoseEstimate
 from slam_backend.run_log import RobotLog
-from slam_backend.smoothing.coarsening import coarsened
-from slam_backend.smoothing.extending import Places, first_rows
-from slam_backend.smoothing.graph import PathGraph, mean_pose, scattered
-from slam_backend.smoothing.holding import add_share
-from slam_backend.smoothing.joining import joined
-from slam_backend.smoothing.options import SmoothingOptions
-from slam_backend.smoothing.reassociation import Known, Refused, taken_up
-from slam_backend.smoothing.rejuvenation import Looks, Rejuvenation, rejuvenate
+from slam_backend.smoothing.extending import first_rows
+from slam_backend.smoothing.graph import PathGraph
+from slam_backend.smoothing.reassociation import Refused, taken_up
+from slam_backend.smoothing.rejuvenation import Rejuvenation, rejuvenate
 from slam_backend.smoothing.slices import Draft, Smoother
 
 CLOSURE = 3  # landmarks not seen for long that are matched in one step: a loop is closed
@@ -144,16 +142,16 @@ class RejuvenationStep:
         self._graph, self._held = graph, False
         if (draft := self._draft) is not None:
             outcome = smoother.descend(draft)
-            return self._after(draft.graph, outcome, lambda: _since(logs, graph, draft.graph), smoother)
-        share, waiting = self._share(logs), _most_waiting(logs, graph)
+            return self._after(draft.graph, outcome, lambda: since(logs, graph, draft.graph), smoother)
+        share, waiting = self._share(logs), most_waiting(logs, graph)
         if waiting > 2 * share or not due:
             if waiting < share:
                 return None
             taken = [first_rows(log, share) for log in self._new(logs, graph, maps, best)]
-            outcome = smoother.take_in(graph, taken, self._guesses, _places(maps, best))
+            outcome = smoother.take_in(graph, taken, self._guesses, places_of(maps, best))
             return self._after(graph, outcome, lambda: taken, smoother)
         last = self._new(logs, graph, maps, best)
-        places, looks = _places(maps, best), self._looks(maps)
+        places, looks = places_of(maps, best), looks_of(maps, self._options.descriptor_gate)
         drawn = smoother.draw(graph, last, self._guesses, places, maps.num_particles, looks)
         if isinstance(drawn, Rejuvenation):
             self._rest()
@@ -169,28 +167,16 @@ class RejuvenationStep:
         """Return whether no slice is under way, and too little is new for another one: the rule."""
         if self._graph is None or self._draft is not None:
             return False
-        return _most_waiting(logs, self._graph) < self._share(logs)
+        return most_waiting(logs, self._graph) < self._share(logs)
 
     def _new(
         self, logs: Sequence[RobotLog], graph: PathGraph, maps: ParticleMaps, best: int
     ) -> list[LogArrays]:  # fmt: skip
         """Return what the logs hold after a graph's last steps; what was refused has a name where it must be."""
-        new = _since(logs, graph)
+        new = since(logs, graph)
         if not any(self._refused):
             return new
-        slots = maps.used_slots()
-        slots = slots[maps.identities[slots] < 0]
-        values, counts = maps.of_particle(best, slots)
-        held = counts > 0
-        slots, values = slots[held], values[held]
-        known = Known(maps.ids[slots], values[:, :3], values[:, 3:], counts[held], maps.descriptors[slots])
-        return taken_up(new, self._refused, self._guesses, known, self._options)
-
-    def _looks(self, maps: ParticleMaps) -> Looks:
-        """Return the appearance of landmarks that no caller has named."""
-        slots = maps.used_slots()
-        slots = slots[maps.identities[slots] < 0]
-        return Looks(maps.ids[slots], maps.descriptors[slots], self._options.descriptor_gate)
+        return taken_up(new, self._refused, self._guesses, known_of(maps, best), self._options)
 
     @on_one_thread
     def join(
@@ -211,18 +197,8 @@ class RejuvenationStep:
             PathGraph.at_uncertain_starts(where) if step._graph is None else step._graph
             for step, where in zip((a, b), starts[:2], strict=True)
         )
-        robots, options = len(starts[2]), self._options.smoothing
-        if options.slice_steps is not None and own.num_keys + other.num_keys > options.most_keys(robots):
-            own, other = (_thinned(graph, robots, camera, options) for graph in (own, other))
-        robot = int(np.flatnonzero(other.previous[other.heads] < 0)[0])  # one that defines b's frame
-        start = starts[2][len(starts[0]) + robot]
-        began = other.poses[other.heads[robot]]
-        motion = compose(mean_pose(start), inverse(began))
-        spreads = scattered(start)[None], np.zeros((1, 3, 3))
-        for frame, pose, spread in zip(frames, (mean_pose(start), began), spreads, strict=True):
-            add_share(frame, pose[None], spread)
-        spread = spreads[0][0] + rotate_covariances(float(motion[2]), spreads[1][0])
-        self._graph = joined(own, other, motion, renamed, spread)
+        options = self._options.smoothing
+        self._graph, motion = joint_graph(own, other, starts, frames, renamed, camera, options)
         self._draft = None if options.slice_steps is None else Draft(graph=self._graph)
         moved = [{step: compose(motion, guess) for step, guess in guesses.items()} for guesses in b._guesses]
         self._guesses = [dict(guesses) for guesses in a._guesses] + moved
@@ -238,7 +214,7 @@ class RejuvenationStep:
         """Do all at once."""
         result = rejuvenate(
             graph, logs, smoother.motion, smoother.camera, maps.num_particles, smoother.rng, smoother.options,
-            self._guesses, self._looks(maps), _places(maps, best),
+            self._guesses, looks_of(maps, self._options.descriptor_gate), places_of(maps, best),
         )  # fmt: skip
         self._rest()
         if np.isfinite(result.ess):
@@ -327,35 +303,5 @@ class RejuvenationStep:
         self._refused = [dict(refused) for refused in state["refused"]]
 
 
-def _places(maps: ParticleMaps, best: int) -> Places:
-    """Return where the most probable particle holds its landmarks to be."""
-    slots = maps.used_slots()
-    slots = slots[np.argsort(maps.ids[slots])]
-    values, counts = maps.of_particle(best, slots)
-    held = counts > 0
-    return Places(maps.ids[slots[held]], values[held, :3])
-
-
-def _since(logs: Sequence[RobotLog], graph: PathGraph, until: PathGraph | None = None) -> list[LogArrays]:
-    """Return what the logs hold after a graph's last steps, up to another's."""
-    new = [log.arrays(int(latest) + 1) for log, latest in zip(logs, graph.latest, strict=True)]
-    if until is None:
-        return new
-    ends = [np.searchsorted(log.steps, last, side="right") for log, last in zip(new, until.latest, strict=True)]
-    return [first_rows(log, int(end)) for log, end in zip(new, ends, strict=True)]
-
-
-def _most_waiting(logs: Sequence[RobotLog], graph: PathGraph) -> int:
-    """Return how many steps after the last ones of a graph the log has that holds most of them."""
-    return max(log.num_since(step + 1) for log, step in zip(logs, graph.latest.tolist(), strict=True))
-
-
 def _told(graph: PathGraph, reason: str) -> Rejuvenation:
     return Rejuvenation(graph, reason, float("nan"), 0, None)
-
-
-def _thinned(graph: PathGraph, robots: int, camera: FloatArray, options: SmoothingOptions) -> PathGraph:
-    """Return a graph with no more than its share of all robots' keys."""
-    share = len(graph.tips) / robots
-    keys, fresh = max(2, int(share * options.most_keys(robots))), max(1, int(share * options.fresh_keys))
-    return coarsened(graph, camera, replace(options, max_keys=keys, further_keys=0, fresh_keys=fresh))
