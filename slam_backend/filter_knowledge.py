@@ -1,20 +1,23 @@
 """What a filter knows: poses, particles, maps, logs. `FastSlam` adds what changes them."""
 
+from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from slam_backend import _kernels
 from slam_backend._best_map import best_map, best_outline, slots_held
 from slam_backend._filter_state import FilterState
-from slam_backend._mixtures import map_mixture, pose_mixture
-from slam_backend._start_frames import AT_ORIGIN, KNOWN, seen_from_starts, start_kind
+from slam_backend._mixtures import map_mixture
 from slam_backend.errors import FloatArray, IntArray, bad_argument, check_choice
-from slam_backend.geometry import between, rotate_covariances
+from slam_backend.geometry import between, inverse
 from slam_backend.landmark_map import LandmarkMap, MapOutline
 from slam_backend.reports import PoseEstimate
 from slam_backend.run_log import RobotLog
 from slam_backend.smoothing.holding import of_points
+
+FROM_ORIGIN = inverse(np.zeros((1, 3)))  # the motion to a start frame that is the map frame
 
 
 class FilterKnowledge(FilterState):
@@ -72,22 +75,22 @@ class FilterKnowledge(FilterState):
         Each particle's pose is seen from where the robot started in that particle, so that what the filter does not
         know of the start, after a merge, does not blur it.
         """
-        return self._seen_from_start(self._check_robot(robot))[0]
+        return self._own_frames()[0][self._check_robot(robot)]
 
-    def _seen_from_start(self, robot: int) -> tuple[PoseEstimate, FloatArray]:
-        """Return what `pose_from_start` and `start_pose` return."""
-        estimate = self._estimates[robot]
-        if self._from_origin:  # the map frame is its own start frame
-            return estimate, np.zeros(3)
-        start = np.empty(3)
-        kind = start_kind(self._starts[robot], self.num_particles, self.best_particle, start)
-        if kind == AT_ORIGIN:
-            return estimate, start
-        if kind == KNOWN:
-            turned = rotate_covariances(-start[2], estimate.covariance)
-            return PoseEstimate(between(start, estimate.mean), turned), start
-        seen = seen_from_starts(self._starts[robot], self._means[robot], self._covariances[robot], self.num_particles)
-        return pose_mixture(*seen, self.weights), start
+    def _own_frames(self) -> tuple[Sequence[PoseEstimate], FloatArray]:
+        """Return what `pose_from_start` does for each robot, and the motions (K, 3) from the map frame to the starts.
+
+        The latter [m, m, rad] are those of the most probable particle.
+        """
+        robots = self.num_robots
+        if self._from_origin:  # the map frame is their own start frame
+            return self._estimates, np.repeat(FROM_ORIGIN, robots, axis=0)
+        poses, spreads, frames = np.empty((robots, 3)), np.empty((robots, 3, 3)), np.empty((robots, 3))
+        for robot, estimate in enumerate(self._estimates):
+            poses[robot], spreads[robot] = estimate
+        of_particles = (self._starts, self._means, self._covariances, self.weights, self.best_particle)
+        _kernels.own_frames(*of_particles, poses, spreads, frames)
+        return list(map(PoseEstimate, poses, spreads)), frames
 
     def particles_from_start(self, robot: int = 0) -> FloatArray:
         """Return a robot's poses (M, 3) [m, m, rad], each seen from where it started in that particle."""

@@ -13,8 +13,6 @@ from slam_backend.landmark_map import LandmarkMap, MapOutline
 from slam_backend.records import Records
 from slam_backend.reports import MergeEvent, PoseEstimate
 
-FROM_ORIGIN = inverse(np.zeros(3))  # what `start_from_group` is where the start frame is the map frame
-
 
 class Standpoint(NamedTuple):
     """What a robot goes by, as the methods of `TeamKnowledge` tell it one by one.
@@ -188,15 +186,18 @@ class TeamKnowledge:
         """Return the outline of `map(robot, min_count=min_count)`, much faster."""
         return self._find(robot)[0].filter.outline(min_count)
 
-    def standpoint(self, robot: int) -> Standpoint:
-        """Return where a robot stands, all at once."""
-        _, branch, index = self._place(robot)
-        slam, report = branch.filter, branch.report
-        own_pose, start = slam._seen_from_start(index)
-        at_origin = slam._from_origin or not any(start.tolist())  # its start frame is the map frame
-        start_from_group = FROM_ORIGIN.copy() if at_origin else inverse(start)
-        ess = 1.0 if report is None else report.ess / slam.num_particles
-        return Standpoint(branch.robots, branch.live, branch.number, slam._estimates, own_pose, start_from_group, ess)
+    def standpoints(self) -> list[Standpoint]:
+        """Return where each robot stands, all at once."""
+        points: dict[int, Standpoint] = {}
+        for group in self._groups:
+            for branch in group.branches:
+                slam, report, robots, live = branch.filter, branch.report, branch.robots, branch.live
+                own_poses, frames = slam._own_frames()
+                ess = 1.0 if report is None else report.ess / slam.num_particles
+                for robot, own_pose, frame in zip(robots, own_poses, frames, strict=True):
+                    if robot in live:
+                        points[robot] = Standpoint(robots, live, branch.number, slam._estimates, own_pose, frame, ess)
+        return [points[robot] for robot in range(self._num_robots)]
 
     def _group_of(self, robot: int) -> Group:
         """Return the robot's group."""

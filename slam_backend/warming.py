@@ -59,7 +59,7 @@ def warm_up() -> float:
         team = TeamSlam(2, num_particles=4, attempts=AttemptOptions(every=1))
         for _ in range(STEPS):
             team.step([None, None], [plain, plain])
-        team.standpoint(1), team.outline(1)
+        team.standpoints(), team.outline(1)
         own = team.map(0)
         map_error(own.means, names, points)
         align_maps(own, own, "clique")

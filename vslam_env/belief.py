@@ -221,7 +221,7 @@ class TeamBelief:
     def _look_up_poses(self) -> None:
         """Take note of the groups and poses after a step or a merge, and forget what was derived from those before."""
         self._groups = self._team.groups
-        self._poses = TeamPoses([self._team.standpoint(robot) for robot in range(self.num_robots)])
+        self._poses = TeamPoses(self._team.standpoints())
         self._beliefs.clear()
         self._maps.clear()
         self._outlines.clear()

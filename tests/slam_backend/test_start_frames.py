@@ -1,7 +1,7 @@
 import numpy as np
 
+from slam_backend._kernels.start_frames import AT_ORIGIN, KNOWN, SPREAD, see_from_starts, start_kind
 from slam_backend._packed import UNPACK
-from slam_backend._start_frames import AT_ORIGIN, KNOWN, SPREAD, seen_from_starts, start_kind
 from slam_backend.filter import FastSlam
 from slam_backend.geometry import between, compose, rotation, wrap_angle
 from slam_backend.measurements import Measurements
@@ -29,15 +29,14 @@ def test_known_starts() -> None:
 
 
 def test_starts_are_told_apart() -> None:
-    """All at the origin, all at one place, or spread: surplus lanes do not count, and the asked one is returned."""
-    starts, best = np.zeros((3, 8)), np.empty(3)
+    """All at the origin, all at one place, or spread: surplus lanes do not count."""
+    starts = np.zeros((3, 8))
     starts[:, 5:] = 9.0
-    assert start_kind(starts, 5, 2, best) == AT_ORIGIN
+    assert start_kind(starts, 5) == AT_ORIGIN
     starts[1, :5] = 4.0
-    assert start_kind(starts, 5, 2, best) == KNOWN
+    assert start_kind(starts, 5) == KNOWN
     starts[2, 4] = 1e-9
-    assert start_kind(starts, 5, 4, best) == SPREAD
-    assert best.tolist() == [0.0, 4.0, 1e-9]
+    assert start_kind(starts, 5) == SPREAD
 
 
 def test_unknown_starts_do_not_blur_the_pose() -> None:
@@ -68,7 +67,8 @@ def test_the_change_of_frame_is_that_of_matrices() -> None:
     roots = rng.normal(0.0, 0.3, (11, 3, 3))
     covariances = roots @ roots.transpose(0, 2, 1)
     packed = covariances[:, *np.triu_indices(3)].T
-    seen, spread = seen_from_starts(starts, means, np.ascontiguousarray(packed), 9)
+    seen, spread = np.zeros((3, 11)), np.zeros((6, 11))
+    see_from_starts(starts, means, np.ascontiguousarray(packed), 9, seen, spread)
     for m in range(9):
         np.testing.assert_allclose(seen[:, m], between(starts[:, m], means[:, m]), atol=1e-12)
         turn = np.eye(3)

@@ -4,10 +4,12 @@ from typing import Any
 import numpy as np
 import pytest
 from mapped_once import LANDMARKS, frame_of, starts_of
+from same_bits import assert_same
 from simulated_team import ASSUMED_CAMERA, MOTION, SimulatedTeam
 from standing_team import SIGMA, STARTS, hand_made, standing_team
 
 from slam_backend.alignment import align_maps
+from slam_backend.attempts import AttemptOptions
 from slam_backend.filter import FastSlam
 from slam_backend.filter_options import FilterOptions
 from slam_backend.geometry import between, compose, inverse, transform_points, wrap_angle
@@ -89,6 +91,27 @@ def test_a_renaming_names_every_landmark_of_b_s_map() -> None:
         assert looks[new_id[landmark]] == look
     for landmark, look in zip(before[1].ids.tolist(), before[1].descriptors.argmax(axis=1).tolist(), strict=True):
         assert looks[landmark] == look
+
+
+def test_where_robots_stand_is_told_at_once_as_one_by_one() -> None:
+    """Before, while and after two of three robots merge, one of which then loses contact."""
+    simulation = SimulatedTeam(num_robots=3, seed=5)
+    team = simulation.build(num_particles=20, attempts=AttemptOptions(enabled=False))
+    apart = np.eye(3, dtype=bool)
+    for stage in range(4):
+        if stage:
+            simulation.run(team, 30, apart if stage == 3 else None)
+        if stage == 2:
+            team.merge(0, 1, align_maps(team.map(0, "mixture"), team.map(1, "mixture")))
+        for robot, point in enumerate(team.standpoints()):
+            assert_same(point.members, team.members(robot))
+            assert_same(point.mates, team.mates(robot))
+            assert_same(point.number, team.maps[robot])
+            assert_same(tuple(point.poses), tuple(team.pose(mate, robot) for mate in point.members))
+            assert_same(point.own_pose, team.pose_from_start(robot))
+            np.testing.assert_allclose(point.start_from_group, team.start_from_group(robot), atol=1e-15)
+            assert point.ess == team.ess(robot) / 20
+    assert len(team.mates(0)) == 1 < len(team.members(0))
 
 
 def test_own_start_frames_do_not_jump_at_a_merge() -> None:

@@ -63,7 +63,7 @@ for size in (1, 3, 9, 30, 30, 30):
     team.step([None, None], [Measurements(points[:size], looks[:size])] * 2)
 assert len(team.groups) == 1
 for robot in range(2):
-    team.standpoint(robot), team.outline(robot)
+    team.standpoints(), team.outline(robot)
 map_error(team.map(0).means, rng.permutation(len(team.map(0))), np.asfortranarray(points))
 for late in sorted(versions() - before):
     print(*late)
