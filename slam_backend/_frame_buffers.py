@@ -35,6 +35,7 @@ class Frames(NamedTuple):
         covariances: (n, 3, 3) [m^2] likewise, or (0, 3, 3) where no robot has any.
         descriptors: (n, d).
         names: (n,) the caller's names, or (0,) where no robot has any.
+        active: How many robots did or saw anything.
     """
 
     sizes: list[int]
@@ -44,6 +45,7 @@ class Frames(NamedTuple):
     covariances: FloatArray
     descriptors: NDArray[np.float32]
     names: IntArray
+    active: int
 
 
 class FrameBuffers:
@@ -94,39 +96,41 @@ class FrameBuffers:
         keeps: list[IntArray | None] = []
         ends: list[int] = []
         used: list[Readings] = []  # of each robot that has measurements
-        total = 0
+        total = idle = 0
         for robot, (move, frame, names, exact) in enumerate(inputs):
-            if exact is not None:
-                self.acts[robot] = _kernels.PLACED
-            elif move is not None:
-                self.acts[robot], self.moves[robot] = _kernels.MOVED, move
-            else:
-                self.acts[robot] = _kernels.IDLE
-            size, keep = 0, None
+            size, left, keep = 0, 0, None
             if frame is not None and len(frame.points):
                 own: Readings = (frame.points, frame.covariances, frame.descriptors, names)
                 size = left = len(frame.points)
                 if names is not None and names.min() < 0:
                     own, keep = _without_rejected(frame.points, frame.covariances, frame.descriptors, names)
                     left = len(keep)
-                if move is None and exact is None and left:
-                    self.acts[robot] = _kernels.STOOD
                 if left:
                     used.append(own)
+                    total += left
                 self.given[robot], self.named[robot] = frame.covariances is not None, names is not None
-                total += left
+            if exact is not None:
+                self.acts[robot] = _kernels.PLACED
+            elif move is not None:
+                self.acts[robot], self.moves[robot] = _kernels.MOVED, move
+            elif left:
+                self.acts[robot] = _kernels.STOOD
+            else:
+                self.acts[robot] = _kernels.IDLE
+                idle += 1
             sizes.append(size)
             keeps.append(keep)
             ends.append(total)
             self.firsts[robot + 1] = total
         if total > len(self.found):
             self._make_room(2 * total)
-        return Frames(sizes, keeps, ends, *_joined(used))
+        return Frames(sizes, keeps, ends, *_joined(used), len(inputs) - idle)
 
     def rows_used(self, frames: Frames) -> IntArray:
         """Return which of all measurements that the caller gave are used (n,)."""
-        if all(keep is None for keep in frames.keeps):
-            return self._rows[: len(frames.points)]
+        used = len(frames.points)
+        if used == sum(frames.sizes):
+            return self._rows[:used]
         firsts = np.cumsum([0, *frames.sizes[:-1]])
         kept = [
             np.arange(size) if keep is None else keep for size, keep in zip(frames.sizes, frames.keeps, strict=True)

@@ -239,7 +239,7 @@ class FastSlam(FilterKnowledge):
         for robot, reading in enumerate(inputs):
             if reading.pose is not None:
                 place(particles, maps.num_particles, robot, reading.pose)
-        normals = self._rng.standard_normal((np.count_nonzero(buffers.acts), maps.num_particles, 3))
+        normals = self._rng.standard_normal((frames.active, maps.num_particles, 3))
         if self._existence is None:
             take_turns(self._assumed, particles, maps, buffers, frames, normals, 0, len(inputs))
             return []

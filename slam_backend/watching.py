@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from slam_backend._alignment_kernels import moved_away
-from slam_backend._candidates import match_table
+from slam_backend._candidates import match_table, may_suffice
 from slam_backend.alignment import RIVAL_ANGLE, RIVAL_DISTANCE, Alignment, AlignmentOptions, align_maps
 from slam_backend.errors import FloatArray, IntArray
 from slam_backend.geometry import transform_points
@@ -96,7 +96,8 @@ class Watch:
             return True
         ids = joint.ids.tolist()
         parts = [joint.subset(np.flatnonzero([name in own for name in ids])) for own in self.own]
-        if min(len(part) for part in parts) < options.min_inliers:
+        looks = (parts[0].descriptors, parts[1].descriptors)
+        if min(map(len, looks)) < options.min_inliers or not may_suffice(*looks, options):
             return False
         rival = align_maps(parts[0], parts[1], options=options)
         return rival.success and differs(rival.transform, parts[1].means[rival.inliers[:, 1]])
