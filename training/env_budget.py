@@ -12,9 +12,8 @@ import numpy as np
 
 from slam_backend.filter import FastSlam
 from slam_backend.team import TeamSlam
-from vslam_env import observation
+from vslam_env import environment, observation
 from vslam_env.belief import TeamBelief
-from vslam_env.environment import ExplorationEnv
 from vslam_env.episode import Episode
 from vslam_env.navigation import CandidateSlots
 from vslam_env.sensors import LandmarkSensor, Scan
@@ -52,7 +51,7 @@ PHASES = (
     Phase(
         "beliefs, dictionaries",
         70,
-        ((TeamBelief, "step"), (ExplorationEnv, "_observations"), (ExplorationEnv, "_infos")),
+        ((TeamBelief, "step"), (environment, "observations_of"), (environment, "infos_of")),
     ),
 )
 

@@ -1,15 +1,12 @@
-"""Actions become velocity commands: their spaces, their check, and the driving towards `goal` candidates."""
+"""Actions: their spaces, their check, and the velocity commands that continuous and discrete ones stand for."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from numpy.typing import NDArray
 
-from slam_backend.errors import FloatArray, bad_argument
-from vslam_env.belief import Belief
-from vslam_env.navigation import follow_path, plan_path
+from slam_backend.errors import bad_argument
 from vslam_env.observation import NUM_ACTIONS
 
 MAX_SPEED, MAX_REVERSE, MAX_TURN = 1.0, 0.3, 1.5  # [m/s], [m/s], [rad/s]
@@ -52,6 +49,7 @@ def checked_actions(actions: Any, agents: Sequence[str], action_type: str) -> li
 
 
 def _checked_pair(agent: str, action: Any) -> tuple[float, float]:
+    """Return a continuous action as two floats in [-1, 1], or raise."""
     name, cure = "actions[%r]", "Give (speed, turn) in [-1, 1]."
     try:
         array = np.asarray(action, dtype=np.float64)
@@ -66,6 +64,7 @@ def _checked_pair(agent: str, action: Any) -> tuple[float, float]:
 
 
 def _checked_index(agent: str, action: Any, limit: int) -> int:
+    """Return a discrete or `goal` action as an int from 0 to `limit` - 1, or raise."""
     value = action.item() if isinstance(action, (np.generic, np.ndarray)) and np.size(action) == 1 else action
     if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < limit:
         cure = "Sample from env.action_space(agent)."
@@ -82,54 +81,3 @@ def command_of(action_type: str, action: Any) -> tuple[float, float]:
         return DISCRETE_COMMANDS[action]
     speed, turn = action
     return speed * (MAX_SPEED if speed > 0.0 else MAX_REVERSE), turn * MAX_TURN
-
-
-class GoalDriver:
-    """Drives one robot to the candidate that it chose, over the floor of its own grid.
-
-    A path is planned when the goal is set, and again when the robot bumps into something.
-    """
-
-    def __init__(self) -> None:
-        self._goal: FloatArray | None = None
-        self._heading = 0.0
-        self._path: FloatArray | None = None
-
-    def choose(self, belief: Belief, action: int) -> bool:
-        """Head for the candidate of slot `action` - 1, or stay with 0.
-
-        Returns:
-            Whether the action was valid; a masked one acts as 0.
-        """
-        candidates = belief.candidates
-        valid = action == 0 or bool(candidates.valid[action - 1])
-        if action == 0 or not valid:
-            self._goal = None
-        else:
-            self._goal, self._heading = candidates.goals[action - 1], float(candidates.headings[action - 1])
-            self._path = plan_path(belief.grid.cells, belief.pose[:2], self._goal)
-        return valid
-
-    def command(self, pose: FloatArray, cells: NDArray[np.uint8], bumped: bool) -> FloatArray:
-        """Return the velocity command (2,) [m/s, rad/s] for the next tick.
-
-        Args:
-            pose: (3,) float64 [m, m, rad], start frame. As the robot believes.
-            cells: (300, 300) uint8. Of its seen grid.
-            bumped: Whether it bumped into something in the last tick.
-        """
-        if self._goal is None:
-            return np.zeros(2)
-        if bumped:
-            self._path = plan_path(cells, pose[:2], self._goal)
-        if self._path is None:
-            return np.zeros(2)
-        return np.array(follow_path(pose, self._path, MAX_SPEED, MAX_TURN, self._heading))
-
-    def get_state(self) -> dict[str, Any]:
-        """Return where it is heading, and by which way."""
-        return {"goal": self._goal, "heading": self._heading, "path": self._path}
-
-    def set_state(self, state: Mapping[str, Any]) -> None:
-        """Go on as the driver that gave `state`; goals and paths are replaced as a whole and can be shared."""
-        self._goal, self._heading, self._path = state["goal"], state["heading"], state["path"]

@@ -10,12 +10,14 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from slam_backend.errors import FloatArray, bad_argument, check_choice, check_int
-from vslam_env.actions import GoalDriver, action_space, checked_actions, command_of
+from vslam_env.actions import action_space, checked_actions
 from vslam_env.config import EnvConfig
+from vslam_env.driving import Drivers
 from vslam_env.env_knowledge import STATE_PER_ROBOT, AgentID, EnvKnowledge
 from vslam_env.episode import Episode, Tap
 from vslam_env.infos import infos_of
-from vslam_env.observation import flatten, observation_space, observe_glimpse
+from vslam_env.observation import observation_space
+from vslam_env.observing import observations_of
 from vslam_env.rendering import draw_frame
 from vslam_env.reward import RewardSpec, Standing, evaluate, make_terms
 from vslam_env.scenes import scene_of
@@ -118,10 +120,11 @@ class ExplorationEnv(EnvKnowledge):
         self._episode.begin()
         self.agents = self.possible_agents[:]
         self._cycle = 0
-        self._drivers = [GoalDriver() for _ in self.agents]
+        self._drivers = Drivers(self.config)
         self._standing = self._episode.standing()
         nothing = dict.fromkeys((term.name for term in self._terms), self._nothing)
-        return self._observations(), self._infos(nothing, [0] * len(self.agents))
+        observations = observations_of(self.agents, self._episode, self.config)
+        return observations, self._infos(nothing, [0] * len(self.agents))
 
     def step(
         self, actions: Mapping[AgentID, Any]
@@ -149,7 +152,7 @@ class ExplorationEnv(EnvKnowledge):
             raise RuntimeError("step: expected a running episode, got one that has ended. Call reset() first.")
         agents = self.agents
         chosen = checked_actions(actions, agents, self.config.action_type)
-        invalid = self._drive(episode, chosen)
+        invalid = self._drivers.carry_out(episode, chosen)
         before = self._standing
         self._standing = episode.standing()
         self._cycle += 1
@@ -160,7 +163,7 @@ class ExplorationEnv(EnvKnowledge):
         terminated = goal is not None and bool(self._standing.map_recalls.min() >= goal)
         truncated = not terminated and self._cycle >= self.max_cycles
         results = (
-            self._observations(),
+            observations_of(agents, episode, self.config),
             dict(zip(agents, rewards.tolist(), strict=True)),
             dict.fromkeys(agents, terminated),
             dict.fromkeys(agents, truncated),
@@ -207,7 +210,7 @@ class ExplorationEnv(EnvKnowledge):
             "agents": tuple(self.agents),
             "cycle": 0 if episode is None else self._cycle,
             "episode": None if episode is None else episode.get_state(),
-            "drivers": [] if episode is None else [driver.get_state() for driver in self._drivers],
+            "drivers": [] if episode is None else self._drivers.get_state(),
             "standing": None if episode is None else self._standing,
         }
 
@@ -229,9 +232,8 @@ class ExplorationEnv(EnvKnowledge):
         if self._episode is None:
             self._episode = Episode(self.config, state["episode"]["setting"], self._tap)
         self._episode.set_state(state["episode"])
-        self._drivers = [GoalDriver() for _ in state["drivers"]]
-        for driver, kept in zip(self._drivers, state["drivers"], strict=True):
-            driver.set_state(kept)
+        self._drivers = Drivers(self.config)
+        self._drivers.set_state(state["drivers"])
         self._standing, self._cycle, self.agents = state["standing"], state["cycle"], list(state["agents"])
 
     def clone(self) -> "ExplorationEnv":
@@ -251,46 +253,6 @@ class ExplorationEnv(EnvKnowledge):
 
     # ------------------------------------------------------------------ within
 
-    def _drive(self, episode: Episode, chosen: list[Any]) -> list[int]:
-        """Carry out one action per robot; return which were masked (K,)."""
-        config = self.config
-        if config.action_type != "goal":
-            commands = np.array([command_of(config.action_type, action) for action in chosen])
-            for _ in range(config.ticks_per_step):
-                episode.advance(commands)
-            return [0] * len(chosen)
-        beliefs = episode.belief
-        valid = [
-            driver.choose(beliefs.belief(robot), action)
-            for robot, (driver, action) in enumerate(zip(self._drivers, chosen, strict=True))
-        ]
-        for _ in range(config.ticks_per_step):
-            poses, readings = beliefs.poses, episode.readings
-            episode.advance(
-                [
-                    driver.command(poses[robot], beliefs.cells(robot), readings[robot].bump)
-                    for robot, driver in enumerate(self._drivers)
-                ]
-            )
-        return [int(not ok) for ok in valid]
-
-    def _observations(self) -> dict[AgentID, Any]:
-        episode, config = self._running_episode("step"), self.config
-        goal = config.action_type == "goal"
-        observations: dict[AgentID, Any] = {}
-        for robot, agent in enumerate(self.agents):
-            observation = observe_glimpse(episode.belief.glimpse(robot), episode.readings[robot].scan, goal)
-            image = episode.readings[robot].image
-            if image is not None:
-                observation["image"] = image[:, :, None].copy()
-            if config.observation_type == "dict":
-                observations[agent] = observation
-            elif goal:
-                observations[agent] = {"observation": flatten(observation), "action_mask": observation["action_mask"]}
-            else:
-                observations[agent] = flatten(observation)
-        return observations
-
     def _infos(self, terms: Mapping[str, FloatArray], invalid: list[int]) -> dict[AgentID, dict[str, Any]]:
         """Return each agent's figures after a step that paid `terms`."""
         belief = self._running_episode("step").belief
@@ -299,6 +261,7 @@ class ExplorationEnv(EnvKnowledge):
 
 
 def _unpickled(made_from: tuple[Any, ...], max_cycles: int, state: EnvState) -> ExplorationEnv:
+    """Return the environment that `ExplorationEnv.__reduce__` took apart."""
     env = ExplorationEnv(*made_from)
     env.max_cycles = max_cycles
     env.set_state(state)

@@ -25,37 +25,23 @@ def infos_of(
         terms: (K,) by name: what each term of the reward has paid for the step.
         invalid: Per robot 1 if its action was masked.
     """
-    figures = zip(
-        standing.map_errors.tolist(),
-        standing.map_rmses.tolist(),
-        standing.map_recalls.tolist(),
-        standing.map_precisions.tolist(),
-        standing.pose_errors.tolist(),
-        standing.heading_errors.tolist(),
-        standing.collisions.tolist(),
-        standing.distances.tolist(),
-        standing.bytes_sent.tolist(),
-        strict=True,
-    )
-    paid = {f"reward/{name}": values.tolist() for name, values in terms.items()}
-    infos: dict[str, dict[str, Any]] = {}
-    for robot, (agent, group, own) in enumerate(zip(agents, groups, figures, strict=True)):
-        error, rmse, recall, precision, pose_error, heading_error, collisions, distance, bytes_sent = own
-        infos[agent] = {
-            "map_error": error,
-            "map_rmse": rmse,
-            "map_recall": recall,
-            "map_precision": precision,
-            "pose_error": pose_error,
-            "heading_error": heading_error,
-            "coverage": standing.coverage,
-            "group": group[0],
-            "group_size": len(group),
-            "merges": standing.merges,
-            "collisions": collisions,
-            "distance": distance,
-            "bytes_sent": bytes_sent,
-            "invalid_action": invalid[robot],
-            **{name: values[robot] for name, values in paid.items()},
-        }
-    return infos
+    robots = len(agents)
+    columns: dict[str, Sequence[Any]] = {
+        "map_error": standing.map_errors.tolist(),
+        "map_rmse": standing.map_rmses.tolist(),
+        "map_recall": standing.map_recalls.tolist(),
+        "map_precision": standing.map_precisions.tolist(),
+        "pose_error": standing.pose_errors.tolist(),
+        "heading_error": standing.heading_errors.tolist(),
+        "coverage": [standing.coverage] * robots,
+        "group": [group[0] for group in groups],
+        "group_size": [len(group) for group in groups],
+        "merges": [standing.merges] * robots,
+        "collisions": standing.collisions.tolist(),
+        "distance": standing.distances.tolist(),
+        "bytes_sent": standing.bytes_sent.tolist(),
+        "invalid_action": invalid,
+    }
+    columns |= {f"reward/{name}": paid.tolist() for name, paid in terms.items()}
+    rows = zip(*columns.values(), strict=True)
+    return {agent: dict(zip(columns, row, strict=True)) for agent, row in zip(agents, rows, strict=True)}

@@ -1,0 +1,116 @@
+"""Robots carry out actions: commands as they stand, or the ways to the `goal` candidates that they chose."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_backend.errors import FloatArray
+from vslam_env.actions import MAX_SPEED, MAX_TURN, command_of
+from vslam_env.belief import Belief
+from vslam_env.config import EnvConfig
+from vslam_env.episode import Episode
+from vslam_env.navigation import follow_path, plan_path
+
+
+class GoalDriver:
+    """Drives one robot to the candidate that it chose, over the floor of its own grid.
+
+    A path is planned when the goal is set, and again when the robot bumps into something.
+    """
+
+    def __init__(self) -> None:
+        self._goal: FloatArray | None = None
+        self._heading = 0.0
+        self._path: FloatArray | None = None
+
+    def choose(self, belief: Belief, action: int) -> bool:
+        """Head for the candidate of slot `action` - 1, or stay with 0.
+
+        Returns:
+            Whether the action was valid; a masked one acts as 0.
+        """
+        candidates = belief.candidates
+        valid = action == 0 or bool(candidates.valid[action - 1])
+        if action == 0 or not valid:
+            self._goal = None
+        else:
+            self._goal, self._heading = candidates.goals[action - 1], float(candidates.headings[action - 1])
+            self._path = plan_path(belief.grid.cells, belief.pose[:2], self._goal)
+        return valid
+
+    def command(self, pose: FloatArray, cells: NDArray[np.uint8], bumped: bool) -> FloatArray:
+        """Return the velocity command (2,) [m/s, rad/s] for the next tick.
+
+        Args:
+            pose: (3,) float64 [m, m, rad], start frame. As the robot believes.
+            cells: (300, 300) uint8. Of its seen grid.
+            bumped: Whether it bumped into something in the last tick.
+        """
+        if self._goal is None:
+            return np.zeros(2)
+        if bumped:
+            self._path = plan_path(cells, pose[:2], self._goal)
+        if self._path is None:
+            return np.zeros(2)
+        return np.array(follow_path(pose, self._path, MAX_SPEED, MAX_TURN, self._heading))
+
+    def get_state(self) -> dict[str, Any]:
+        """Return where it is heading, and by which way."""
+        return {"goal": self._goal, "heading": self._heading, "path": self._path}
+
+    def set_state(self, state: Mapping[str, Any]) -> None:
+        """Go on as the driver that gave `state`; goals and paths are replaced as a whole and can be shared."""
+        self._goal, self._heading, self._path = state["goal"], state["heading"], state["path"]
+
+
+class Drivers:
+    """Drives all robots of an environment for a step.
+
+    Args:
+        config: Of the environment.
+    """
+
+    def __init__(self, config: EnvConfig) -> None:
+        self._action_type, self._ticks = config.action_type, config.ticks_per_step
+        self._drivers = [GoalDriver() for _ in range(config.num_robots)]
+
+    def carry_out(self, episode: Episode, chosen: Sequence[Any]) -> list[int]:
+        """Let an episode advance by the ticks of a step.
+
+        Args:
+            episode: It is changed.
+            chosen: One action per robot, as `checked_actions` returns them.
+
+        Returns:
+            Per robot 1 if its action was masked, else 0.
+        """
+        if self._action_type != "goal":
+            commands = np.array([command_of(self._action_type, action) for action in chosen])
+            for _ in range(self._ticks):
+                episode.advance(commands)
+            return [0] * len(chosen)
+        beliefs = episode.belief
+        valid = [
+            driver.choose(beliefs.belief(robot), action)
+            for robot, (driver, action) in enumerate(zip(self._drivers, chosen, strict=True))
+        ]
+        for _ in range(self._ticks):
+            poses, readings = beliefs.poses, episode.readings
+            episode.advance(
+                [
+                    driver.command(poses[robot], beliefs.cells(robot), readings[robot].bump)
+                    for robot, driver in enumerate(self._drivers)
+                ]
+            )
+        return [int(not ok) for ok in valid]
+
+    def get_state(self) -> list[dict[str, Any]]:
+        """Return where each robot is heading."""
+        return [driver.get_state() for driver in self._drivers]
+
+    def set_state(self, state: Sequence[Mapping[str, Any]]) -> None:
+        """Go on as the drivers that gave `state`."""
+        for driver, kept in zip(self._drivers, state, strict=True):
+            driver.set_state(kept)
