@@ -72,7 +72,8 @@ def _check_move(robot: int, move: Any) -> FloatArray:
     """Return a robot's odometry as a checked array."""
     if type(move) is np.ndarray and move.dtype == np.float64 and move.shape == (3,):
         x, y, turn = move.tolist()
-        if max(abs(x), abs(y), abs(turn)) <= FARTHEST_MOVE and x == x and y == y and turn == turn:  # NaN is not itself
+        far = FARTHEST_MOVE
+        if -far <= x <= far and -far <= y <= far and -far <= turn <= far:  # NaN is not
             return np.array(move)
     cure = "Give the motion (dx, dy, dtheta) in the previous robot frame, or None."
     checked = check_array(f"odometry[{robot}]", move, (3,), cure)

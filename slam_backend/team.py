@@ -128,9 +128,10 @@ class TeamSlam(TeamKnowledge):
         inputs = check_step(self._num_robots, size, camera, odometry, measurements, identities, poses)
         records, before = self._records, len(self._events)
         records.log.record(self._step, inputs)
-        for group in self._groups:
-            group.regroup(networks, records)
-        self._places = []
+        if contacts is not None or any(len(group.branches) > 1 for group in self._groups):
+            for group in self._groups:
+                group.regroup(networks, records)
+            self._places = []
         associations: list[IntArray] = [np.empty(0, np.int64)] * self._num_robots
         created = list(associations)
         rejuvenations: list[tuple[tuple[int, ...], RejuvenationReport]] = []
