@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from slam_backend._jit import jit
 from slam_backend.errors import FloatArray
 from vslam_env.local_grid import CHANNELS, MARK, SIZE, local_grid
-from vslam_env.navigation.frontiers import NUM_SLOTS
+from vslam_env.navigation.candidate_slots import NUM_SLOTS
 from vslam_env.robot_belief import Belief, Glimpse
 
 MOST_TEAMMATES = 7

@@ -17,6 +17,8 @@ from vslam_env.navigation import (
     follow_path,
     plan_path,
 )
+from vslam_env.navigation._search_kernels.boxes import OUTSIDE, PAD, known_bounds, known_box
+from vslam_env.navigation._search_kernels.frontiers import _unseen_edges
 
 
 def room(doors: tuple[float, ...] = (), width: float = 1.2) -> np.ndarray:
@@ -249,3 +251,19 @@ def test_the_nearest_frontier_explores_a_building_and_ends(seed: int, start: tup
     reachable = points[clearance(walls, points) > 0.2]
     rows, cols = cell_of(transform_points(inverse(start_pose), reachable)).T
     assert (grid.cells[rows, cols] == FREE).mean() > 0.98
+
+
+@pytest.mark.parametrize("corner", [(0, 0), (GRID_SIZE - 12, 40), (100, GRID_SIZE - 15)])
+def test_frontiers_are_made_of_unknown_cells_beside_free_ones(corner: tuple[int, int]) -> None:
+    """Also at the border of the grid; what is ignored counts nowhere."""
+    rng = np.random.default_rng(3)
+    cells = np.full((GRID_SIZE, GRID_SIZE), UNKNOWN, np.uint8)
+    row, col = corner
+    cells[row : row + 12, col : col + 15] = rng.integers(0, 3, (12, 15))
+    ignored = rng.random(cells.shape) < 0.2
+    padded = np.pad(cells, 1, constant_values=OUTSIDE) == FREE
+    beside = padded[:-2, 1:-1] | padded[2:, 1:-1] | padded[1:-1, :-2] | padded[1:-1, 2:]
+    bounds = known_bounds(cells)
+    edges = _unseen_edges(known_box(cells, *bounds), ignored, bounds[0] - PAD, bounds[1] - PAD)
+    found = np.argwhere(edges) + bounds[:2] - PAD
+    assert found.tolist() == np.argwhere((cells == UNKNOWN) & beside & ~ignored).tolist()

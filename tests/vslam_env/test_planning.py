@@ -22,18 +22,9 @@ from vslam_env.navigation import (
     follow_path,
     plan_path,
 )
-from vslam_env.navigation._wavefront import (
-    CLOSE,
-    NEAR,
-    OPEN,
-    OUTSIDE,
-    PAD,
-    UNREACHED,
-    known_bounds,
-    known_box,
-    wavefront,
-    weigh,
-)
+from vslam_env.navigation._search_kernels.boxes import OUTSIDE, PAD, known_bounds, known_box
+from vslam_env.navigation._search_kernels.ways import UNREACHED, wavefront
+from vslam_env.navigation._search_kernels.weights import CLOSE, NEAR, OPEN, weigh
 
 
 def floor(low: tuple[float, float], high: tuple[float, float], walls: list[tuple[float, ...]]) -> np.ndarray:

@@ -4,7 +4,7 @@ Only cells known to be free are travelled: unknown ones may hide walls, and fron
 reached over free cells anyway. Walls are widened by the robot's radius and half a cell, and cells within 0.4 m of
 that cost more, so that a path keeps away from walls where there is room but still goes through a door.
 
-The search is one of our own (`_wavefront`), because candidates for a robot have to cost less than 0.4 ms: over
+The search is one of our own (`_search_kernels`), because candidates for a robot have to cost less than 0.4 ms: over
 the 7,000 cells of a 20 x 14 m office, on one core, scipy.sparse.csgraph needs 1.5 ms to build the graph and 0.9 ms
 for `dijkstra` (0.3 ms for `breadth_first_order`, which ignores costs). Here weights and wavefront take
 0.1 ms, and an update of the candidates 0.1 to 0.2 ms in all. scipy's `dijkstra` is the oracle of the tests.
@@ -20,16 +20,7 @@ from slam_backend._jit import jit
 from slam_backend.errors import FloatArray, bad_argument, check_float
 from vslam_env.navigation._arguments import check_cells, point_floats, pose_floats
 from vslam_env.navigation._painting_kernels import CELL, HALF_WIDTH
-from vslam_env.navigation._wavefront import (
-    PAD,
-    UNREACHED,
-    known_bounds,
-    known_box,
-    nearest_open,
-    straight_path,
-    wavefront,
-    weigh,
-)
+from vslam_env.navigation._search_kernels import UNREACHED, nearest_open, straight_path, ways_over
 from vslam_env.navigation.seen_grid import centre_of
 
 ESCAPE_CELLS = 5  # a robot that drift or a bump put into a wall's margin looks this far for open floor
@@ -99,13 +90,9 @@ def distance_map(cells: NDArray[np.uint8], start_xy: ArrayLike, radius: float = 
 
 def ways_from(cells: NDArray[np.uint8], x: float, y: float, radius: float) -> DistanceMap:
     """Return what `distance_map` returns, for arguments that need no checks."""
-    row, column, height, width = known_bounds(cells)
-    box = known_box(cells, row, column, height, width)
-    weights = weigh(box, radius / CELL + 0.5)
-    corner = row - PAD, column - PAD
-    first = nearest_open(box, weights, *_cell_in_box(corner, x, y), ESCAPE_CELLS)
-    cost, parent = wavefront(weights, *first)
-    return DistanceMap(corner=corner, box=box, weights=weights, cost=cost, parent=parent)
+    row, col = _cell_in_box((0, 0), x, y)
+    box, weights, cost, parent, *corner = ways_over(cells, row, col, radius / CELL + 0.5, ESCAPE_CELLS)
+    return DistanceMap(corner=(corner[0], corner[1]), box=box, weights=weights, cost=cost, parent=parent)
 
 
 def plan_path(

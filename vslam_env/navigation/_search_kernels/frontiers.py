@@ -1,4 +1,4 @@
-"""The compiled search for frontiers in the known part of a grid."""
+"""Where the known floor of a box borders on what has not been seen."""
 
 import math
 from typing import Any
@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 
 from slam_backend._jit import jit
-from vslam_env.navigation._painting_kernels import CELL, FREE, HALF_WIDTH, UNKNOWN
-from vslam_env.navigation._wavefront import UNREACHED
+from vslam_env.navigation._painting_kernels import CELL, FREE, GRID_SIZE, HALF_WIDTH, UNKNOWN
+from vslam_env.navigation._search_kernels.ways import UNREACHED
 
 MIN_CELLS = 3  # a robot needs 0.4 m; what is smaller is a speck or the corner of a wall
 MAX_CELLS = 20  # longer frontiers are cut, as one goal cannot stand for them
@@ -99,19 +99,39 @@ def _heading_to_unknown(box: Any, row: int, col: int) -> float:
 
 
 @jit
+def _unseen_edges(box: Any, ignored: Any, row: int, col: int) -> Any:
+    """Return (h, w) int8, 1 for unknown cells beside free ones that are not to be ignored; see `frontier_rows`."""
+    height, width = box.shape
+    edges = np.zeros((height, width), np.int8)
+    for r in range(max(1, -row), min(height - 1, GRID_SIZE - row)):
+        first, last = max(1, -col), min(width - 1, GRID_SIZE - col)
+        asked = ignored[row + r, col + first : col + last]
+        here, edge = box[r, first:last], edges[r, first:last]
+        below, above = box[r - 1, first:last], box[r + 1, first:last]
+        right, left = box[r, first - 1 : last - 1], box[r, first + 1 : last + 1]
+        for i in range(len(here)):  # without branches, it becomes vector code
+            beside = (below[i] == FREE) | (above[i] == FREE) | (right[i] == FREE) | (left[i] == FREE)
+            edge[i] = beside & (here[i] == UNKNOWN) & ~asked[i]
+    return edges
+
+
+@jit
 def frontier_rows(box: Any, cost: Any, parent: Any, ignored: Any, row: int, col: int) -> Any:
-    """Collect the frontiers of a box whose first cell is the grid's (row, col).
+    """Collect the frontiers of a box.
+
+    Args:
+        box: (h, w) uint8, of `known_box`.
+        cost: (h, w) int32, of `wavefront`.
+        parent: (h, w) int32, likewise.
+        ignored: (300, 300) bool. Unknown cells of the grid that do not count.
+        row: Of the box's first cell in the grid.
+        col: Likewise.
 
     Returns:
-        (n, 5) float64 rows (x, y, heading, size, length).
+        (n, 5) float64 rows (x, y, heading, size, length), by increasing length.
     """
     height, width = box.shape
-    mark = np.zeros((height, width), np.int8)  # 1: unseen beside free floor; 2: its component known; 3: in a piece
-    for r in range(1, height - 1):
-        for c in range(1, width - 1):
-            at_edge = FREE in (box[r - 1, c], box[r + 1, c], box[r, c - 1], box[r, c + 1])
-            if at_edge and box[r, c] == UNKNOWN and not ignored[row + r, col + c]:
-                mark[r, c] = 1
+    mark = _unseen_edges(box, ignored, row, col)  # 1: such an edge; 2: its component known; 3: in a piece
 
     found = np.empty((height * width // MIN_CELLS + 1, NUM_COLUMNS))
     count = 0
@@ -136,10 +156,14 @@ def frontier_rows(box: Any, cost: Any, parent: Any, ignored: Any, row: int, col:
                 goal_row, goal_col = _goal_near(piece[:num], box, cost, visited, num_tried)
                 if goal_row < 0:
                     continue
-                found[count, 0] = (col + goal_col + 0.5) * CELL - HALF_WIDTH
-                found[count, 1] = (row + goal_row + 0.5) * CELL - HALF_WIDTH
-                found[count, HEADING] = _heading_to_unknown(box, goal_row, goal_col)
-                found[count, SIZE] = num * CELL
-                found[count, LENGTH] = _path_length(parent, goal_row, goal_col)
+                length, at = _path_length(parent, goal_row, goal_col), count
+                while at > 0 and found[at - 1, LENGTH] > length:
+                    found[at] = found[at - 1]
+                    at -= 1
+                found[at, 0] = (col + goal_col + 0.5) * CELL - HALF_WIDTH
+                found[at, 1] = (row + goal_row + 0.5) * CELL - HALF_WIDTH
+                found[at, HEADING] = _heading_to_unknown(box, goal_row, goal_col)
+                found[at, SIZE] = num * CELL
+                found[at, LENGTH] = length
                 count += 1
     return found[:count]

@@ -1,0 +1,140 @@
+"""The cheapest ways from one cell to all others."""
+
+from typing import Any
+
+import numpy as np
+
+from slam_backend._jit import jit
+from vslam_env.navigation._painting_kernels import OCCUPIED
+from vslam_env.navigation._search_kernels.boxes import PAD, known_bounds, known_box
+from vslam_env.navigation._search_kernels.weights import weigh
+
+STRAIGHT, DIAGONAL = 5, 7  # length of a step in fifths of a cell; 7/5 is 1 % short of the diagonal
+NUM_BUCKETS = 64  # a power of two above the dearest step, DIAGONAL * (CLOSE + CLOSE)
+UNREACHED = np.iinfo(np.int32).max
+
+
+@jit
+def nearest_open(box: Any, weights: Any, row: int, col: int, reach: int) -> tuple[int, int]:
+    """Find the open cell that is the fewest steps away, without stepping through a wall.
+
+    Args:
+        box: (h, w) uint8. Cells.
+        weights: (h, w) uint8. 0 where a robot may not be.
+        row: Where to begin; this cell itself may be a wall's.
+        col: See `row`.
+        reach: How far to look, in cells.
+
+    Returns:
+        Its row and column, or (-1, -1).
+    """
+    height, width = box.shape
+    if not (0 <= row < height and 0 <= col < width):
+        return -1, -1
+    side = 2 * reach + 1
+    visited = np.zeros((side, side), np.bool_)
+    queue = np.empty((side * side, 2), np.int64)
+    queue[0, 0], queue[0, 1] = row, col
+    visited[reach, reach] = True
+    head, tail = 0, 1
+    while head < tail:
+        r, c = queue[head]
+        head += 1
+        if weights[r, c] > 0:
+            return r, c
+        for i, j in ((0, 1), (1, 0), (0, -1), (-1, 0)):
+            nr, nc = r + i, c + j
+            if not (0 <= nr < height and 0 <= nc < width) or abs(nr - row) > reach or abs(nc - col) > reach:
+                continue
+            if visited[nr - row + reach, nc - col + reach] or box[nr, nc] == OCCUPIED:
+                continue
+            visited[nr - row + reach, nc - col + reach] = True
+            queue[tail, 0], queue[tail, 1] = nr, nc
+            tail += 1
+    return -1, -1
+
+
+@jit
+def wavefront(weights: Any, row: int, col: int) -> tuple[Any, Any]:
+    """Find the cheapest ways from one cell to all others (Dijkstra's algorithm with Dial's buckets).
+
+    A step to one of the eight neighbours costs its length times the sum of the weights of its two cells. Diagonal
+    steps need no look at the cells beside them, since walls have been widened by more than a cell. Costs are small
+    integers, so that the queue is a ring of buckets, each a linked list. A cell whose cost falls is listed again; its
+    older entries are passed over.
+
+    Args:
+        weights: (h, w) uint8, 0 = closed. The outermost cells must be closed.
+        row: The first cell, open; -1 if there is none, and nothing is reached.
+        col: See `row`.
+
+    Returns:
+        Of each cell, (h, w) int32: the cost, `UNREACHED` if there is no way; and the flat index of the cell before
+        it, -1 at the first cell and where there is no way.
+    """
+    width = weights.shape[1]
+    weight = weights.ravel()
+    cost = np.empty(weight.size, np.int32)
+    num_open = 0
+    for cell in range(weight.size):
+        # Closed cells are below all costs, so that one comparison passes over closed and settled cells alike.
+        cost[cell] = UNREACHED if weight[cell] > 0 else -1
+        num_open += weight[cell] > 0
+    parent = np.full(weight.size, -1, np.int32)
+    entries = np.empty(8 * num_open + 1, np.int32)  # a cost falls at most once per neighbour
+    following = np.empty(8 * num_open + 1, np.int32)
+    heads = np.full(NUM_BUCKETS, -1, np.int32)
+
+    offsets = np.array([1, width, -1, -width, 1 + width, width - 1, -1 - width, 1 - width])  # four straight ones first
+
+    used, waiting, current = 0, 0, 0
+    if row >= 0:
+        cost[row * width + col] = 0
+        entries[0], following[0], heads[0] = row * width + col, -1, 0
+        used = waiting = 1
+    while waiting > 0:
+        bucket = current & (NUM_BUCKETS - 1)
+        while heads[bucket] >= 0:
+            cell = entries[heads[bucket]]
+            heads[bucket] = following[heads[bucket]]
+            waiting -= 1
+            if cost[cell] != current:
+                continue
+            for k in range(8):
+                neighbour = cell + offsets[k]
+                step = STRAIGHT if k < 4 else DIAGONAL
+                through = current + step * (np.int64(weight[cell]) + weight[neighbour])
+                if through >= cost[neighbour]:
+                    continue
+                cost[neighbour], parent[neighbour] = through, cell
+                target = through & (NUM_BUCKETS - 1)
+                entries[used], following[used], heads[target] = neighbour, heads[target], used
+                used += 1
+                waiting += 1
+        current += 1
+    for cell in range(weight.size):
+        cost[cell] &= UNREACHED  # turns -1 into it, and leaves all costs as they are
+    return cost.reshape(weights.shape), parent.reshape(weights.shape)
+
+
+@jit
+def ways_over(cells: Any, row: int, col: int, reach: float, escape: int) -> tuple[Any, Any, Any, Any, int, int]:
+    """Find the cheapest ways over the known floor of a grid.
+
+    Args:
+        cells: (300, 300) uint8. The grid.
+        row: Of the cell where they begin, or near which: the nearest open one is taken.
+        col: Likewise.
+        reach: See `weigh`.
+        escape: How far to look for an open cell, in cells.
+
+    Returns:
+        The known box, (h, w) uint8; its weights, of `weigh`; costs and parents, of `wavefront`; and the grid's row and
+        column of its first cell.
+    """
+    first_row, first_col, height, width = known_bounds(cells)
+    box = known_box(cells, first_row, first_col, height, width)
+    weights = weigh(box, reach)
+    start_row, start_col = nearest_open(box, weights, row - first_row + PAD, col - first_col + PAD, escape)
+    cost, parent = wavefront(weights, start_row, start_col)
+    return box, weights, cost, parent, first_row - PAD, first_col - PAD

@@ -1,0 +1,84 @@
+"""Where a disc fits, and how near to walls that is."""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from slam_backend._jit import jit
+from vslam_env.navigation._painting_kernels import FREE, OCCUPIED, UNKNOWN
+
+CLOSE, NEAR, OPEN = 4, 2, 1  # weights of cells by their distance from walls
+
+
+@jit
+def _spread(squares: Any, span: int, stride: int) -> Any:
+    """Return the least of each entry and those up to `span` strides before and after it plus the number squared.
+
+    Args:
+        squares: (n,) uint8, whose sums with span^2 fit.
+        span: >= 0.
+        stride: >= 1.
+    """
+    least = squares.copy()
+    for gap in range(1, span + 1):
+        square = np.uint8(gap * gap)
+        after, later = squares[gap * stride :], least[gap * stride :]
+        for i in range(len(after)):
+            through = np.uint8(after[i] + square)
+            least[i] = through if through < least[i] else least[i]  # unlike min(), this becomes vector code
+        for i in range(len(later)):
+            through = np.uint8(squares[i] + square)
+            later[i] = through if through < later[i] else later[i]
+    return least
+
+
+@jit
+def _squared_clearance(box: Any, span: int) -> Any:
+    """Return each cell's squared distance to the nearest occupied one, (h, w) uint8, if at most `span`; else more.
+
+    Args:
+        box: (h, w) uint8.
+        span: At most 10, so that sums of squares fit.
+    """
+    height, width = box.shape
+    squares = np.empty((height, width + span), np.uint8)  # rows end in what keeps the next one out of reach
+    far = np.uint8((span + 1) ** 2)
+    squares[:] = far
+    for r in range(height):
+        for c in range(width):
+            squares[r, c] = 0 if box[r, c] == OCCUPIED else far
+    along_rows = _spread(squares.ravel(), span, 1)
+    return _spread(along_rows, span, width + span).reshape(squares.shape)
+
+
+@jit
+def weigh(box: Any, reach: float) -> Any:
+    """Weigh the cells of a box by how near they are to walls.
+
+    Args:
+        box: (h, w) uint8.
+        reach: Distance from an occupied cell below which a robot may not be, in cells, at most 9.
+
+    Returns:
+        (h, w) uint8: 0 where a robot may not be (occupied, unknown, too near to a wall, or at the edge of the box),
+        `CLOSE` within one more cell of that, `NEAR` within two or beside the unknown, else `OPEN`.
+    """
+    clearance = _squared_clearance(box, math.ceil(reach + 1.0))
+    # Squared distances are whole numbers, so that those below a bound are those below the next whole number.
+    closed, close = np.uint8(math.ceil(reach**2)), np.uint8(math.ceil((reach + 1.0) ** 2))
+    near = np.uint8(math.ceil((reach + 2.0) ** 2))
+    weights = np.zeros(box.shape, np.uint8)
+    for r in range(1, box.shape[0] - 1):
+        for c in range(1, box.shape[1] - 1):
+            gap = clearance[r, c]
+            at_edge = (
+                (box[r - 1, c] == UNKNOWN)
+                | (box[r + 1, c] == UNKNOWN)
+                | (box[r, c - 1] == UNKNOWN)
+                | (box[r, c + 1] == UNKNOWN)
+            )
+            weight = NEAR if at_edge | (gap < near) else OPEN
+            weight = CLOSE if gap < close else weight
+            weights[r, c] = 0 if (box[r, c] != FREE) | (gap < closed) else weight
+    return weights

@@ -1,0 +1,208 @@
+"""The 16 slots that hand frontiers to a policy under stable numbers."""
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import linear_sum_assignment
+
+from slam_backend._jit import jit
+from slam_backend.errors import BoolArray, FloatArray
+from vslam_env.navigation._arguments import check_cells, pose_floats, positions_array
+from vslam_env.navigation._painting_kernels import CELL, GRID_SIZE, HALF_WIDTH
+from vslam_env.navigation._search_kernels import HEADING, LENGTH, NUM_COLUMNS, SIZE, XY
+from vslam_env.navigation.frontiers import rows_of
+from vslam_env.navigation.planning import ways_from
+
+NUM_SLOTS = 16
+ROBOT_RADIUS = 0.2  # [m]
+
+SAME_GOAL = 1.0  # [m] between updates the goal of a living candidate moves less than this
+AT_GOAL = 0.5  # [m]
+LOOKING = 0.6  # [rad] a robot whose heading is this near to a candidate's looks at the unknown
+LOOK_COUNTS = 4  # times as much as a visit without a look, for a teammate's direction is not told
+PATIENCE = 16  # visits, after which what is still unseen there never will be seen
+GIVEN_UP = 0.8  # [m] radius of what is then left out
+NO_TEAMMATE = 60.0  # [m] stands for the distance of a teammate when there is none
+
+
+@jit
+def _costs(goals: Any, places: Any) -> Any:
+    """Return the distances (m, n), at most `SAME_GOAL`, between goals (m, 2 or more) and places (n, 2 or more).
+
+    They are `SAME_GOAL` for goals that are NaN, of empty slots.
+    """
+    costs = np.empty((len(goals), len(places)))
+    for i in range(len(goals)):
+        for j in range(len(places)):
+            distance = np.hypot(goals[i, 0] - places[j, 0], goals[i, 1] - places[j, 1])
+            costs[i, j] = distance if distance < SAME_GOAL else SAME_GOAL
+    return costs
+
+
+@jit
+def _visit(slots: Any, x: float, y: float, theta: float, teammates: Any, visits: Any) -> bool:
+    """Add to the visits (16,) of the slots what the robot and its teammates (k, 2) count; tell if patience ran out."""
+    ran_out = False
+    for i in range(NUM_SLOTS):
+        at_goal = np.hypot(slots[i, 0] - x, slots[i, 1] - y) <= AT_GOAL
+        looked = at_goal and math.cos(slots[i, HEADING] - theta) > math.cos(LOOKING)
+        for k in range(len(teammates)):
+            at_goal |= np.hypot(slots[i, 0] - teammates[k, 0], slots[i, 1] - teammates[k, 1]) <= AT_GOAL
+        visits[i] += (1 if at_goal else 0) + (LOOK_COUNTS - 1 if looked else 0)
+        ran_out |= visits[i] >= PATIENCE
+    return ran_out
+
+
+@jit
+def _refill(costs: Any, slots: Any, sources: Any, found: Any, visits: Any) -> tuple[Any, Any]:
+    """Return the next rows and visits of the slots: old candidates stay where they were, new ones fill the gaps."""
+    chosen = np.full(NUM_SLOTS, -1, np.int64)
+    is_new = np.ones(len(found), np.bool_)
+    for k in range(len(slots)):
+        if costs[slots[k], sources[k]] < SAME_GOAL:
+            chosen[slots[k]], is_new[sources[k]] = sources[k], False
+
+    rows = np.full((NUM_SLOTS, NUM_COLUMNS), np.nan)
+    next_visits = np.zeros(NUM_SLOTS, np.int64)
+    new = 0
+    for slot in range(NUM_SLOTS):
+        source = chosen[slot]
+        if source >= 0:
+            next_visits[slot] = visits[slot]
+        else:
+            while new < len(found) and not is_new[new]:
+                new += 1
+            if new == len(found):
+                continue
+            source = new
+            new += 1
+        for column in range(NUM_COLUMNS):
+            rows[slot, column] = found[source, column]
+    return rows, next_visits
+
+
+@jit
+def _describe(slots: Any, pose: Any, teammates: Any, features: Any, valid: Any) -> None:
+    """Write `CandidateSlots.features` (16, 5) and `valid` (16,) of the rows of the slots."""
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    for i in range(NUM_SLOTS):
+        valid[i] = not np.isnan(slots[i, 0])
+        if not valid[i]:
+            features[i] = 0.0
+            continue
+        u, v = slots[i, 0] - pose[0], slots[i, 1] - pose[1]
+        nearest = NO_TEAMMATE
+        for k in range(len(teammates)):
+            nearest = min(nearest, np.hypot(slots[i, 0] - teammates[k, 0], slots[i, 1] - teammates[k, 1]))
+        features[i, 0], features[i, 1] = c * u + s * v, c * v - s * u
+        features[i, 2], features[i, 3], features[i, 4] = slots[i, LENGTH], slots[i, SIZE], nearest
+
+
+class CandidateSlots:
+    """Sixteen places to explore, each in a slot that it keeps while it lives.
+
+    At an update, old candidates are paired with the frontiers found now, at least total distance, and live on where a
+    pair is less than 1 m apart; others die. New frontiers fill free slots, nearest first. A frontier that stays though
+    the robot looked at it from its goal at 4 updates (or somebody was there at 16) cannot be seen, as it is a speck of
+    noise or a nook behind a corner: what is unknown within 0.8 m of the goal is given up, so that exploration ends.
+    """
+
+    __slots__ = ("_given_up", "_rows", "_visits")
+
+    def __init__(self) -> None:
+        self._rows: FloatArray = np.full((NUM_SLOTS, NUM_COLUMNS), np.nan)
+        self._visits = np.zeros(NUM_SLOTS, np.int64)
+        self._given_up = np.zeros((GRID_SIZE, GRID_SIZE), np.bool_)
+
+    @property
+    def valid(self) -> BoolArray:
+        """Which slots hold a candidate, (16,) bool; none when nothing is left to explore."""
+        return ~np.isnan(self._rows[:, 0])
+
+    @property
+    def goals(self) -> FloatArray:
+        """Where to go, (16, 2) float64 [m], start frame; NaN in empty slots."""
+        return self._rows[:, XY].copy()
+
+    @property
+    def headings(self) -> FloatArray:
+        """Where to look from the goals, (16,) float64 [rad], start frame; NaN in empty slots."""
+        return self._rows[:, HEADING].copy()
+
+    @property
+    def sizes(self) -> FloatArray:
+        """How long the frontiers are, (16,) float64 [m]; NaN in empty slots."""
+        return self._rows[:, SIZE].copy()
+
+    @property
+    def lengths(self) -> FloatArray:
+        """How long the robot's paths to the goals were at the last update, (16,) float64 [m]; NaN in empty slots."""
+        return self._rows[:, LENGTH].copy()
+
+    def update(self, cells: NDArray[np.uint8], pose: ArrayLike, teammates: ArrayLike = ()) -> None:
+        """Bring the candidates up to date; meant to be called once a second.
+
+        Args:
+            cells: (300, 300) uint8. `SeenGrid.cells`.
+            pose: (3,) float64 [m, m, rad], start frame. Of the robot.
+            teammates: (k, 2) float64 [m], start frame. Where the others of its group are: their visits count as well.
+
+        Raises:
+            ValueError: If an array has the wrong shape or is not finite.
+        """
+        x, y, theta = pose_floats(pose)
+        self._count_visits(x, y, theta, positions_array(teammates, "teammates"))
+        check_cells(cells)
+        found = rows_of(ways_from(cells, x, y, ROBOT_RADIUS), self._given_up)
+
+        costs = _costs(self._rows, found)
+        slots, sources = linear_sum_assignment(costs)
+        self._rows, self._visits = _refill(costs, slots, sources, found, self._visits)
+
+    def _count_visits(self, x: float, y: float, theta: float, teammates: FloatArray) -> None:
+        """Count who is at a goal, and give up what is unknown around goals where patience has run out."""
+        if not _visit(self._rows, x, y, theta, teammates, self._visits):
+            return
+        for slot in np.flatnonzero(self._visits >= PATIENCE):
+            along = (np.arange(GRID_SIZE) + 0.5) * CELL - HALF_WIDTH
+            goal_x, goal_y = self._rows[slot, XY]
+            self._given_up |= (along - goal_x) ** 2 + (along[:, None] - goal_y) ** 2 <= GIVEN_UP**2
+            self._visits[slot] = 0
+
+    def features(self, pose: ArrayLike, teammates: ArrayLike = ()) -> NDArray[np.float32]:
+        """Describe the candidates to a policy.
+
+        Args:
+            pose: (3,) float64 [m, m, rad], start frame. Of the robot.
+            teammates: (k, 2) float64 [m], start frame. Of the others in its group.
+
+        Returns:
+            (16, 5) float32, all metres: x and y of the goal in the robot frame, length of the path at the last update,
+            size of the frontier, and distance from the goal to the nearest teammate, 60 if there is none. Zeros in
+            empty slots.
+        """
+        place = np.array(pose_floats(pose))
+        return self.described(place, positions_array(teammates, "teammates"))[0]
+
+    def described(self, pose: FloatArray, teammates: FloatArray) -> tuple[NDArray[np.float32], NDArray[np.int8]]:
+        """Return `features`, and as (16,) int8 which slots hold a candidate; for arrays that need no checks.
+
+        Args:
+            pose: (3,) float64 [m, m, rad], start frame.
+            teammates: (k, 2 or more) float64 [m], start frame.
+        """
+        features, valid = np.empty((NUM_SLOTS, 5), np.float32), np.empty(NUM_SLOTS, np.int8)
+        _describe(self._rows, pose, teammates, features, valid)
+        return features, valid
+
+    def get_state(self) -> dict[str, Any]:
+        """Return a copy of all that `set_state` needs to continue bit by bit."""
+        return {"rows": self._rows.copy(), "visits": self._visits.copy(), "given_up": self._given_up.copy()}
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Restore what `get_state` returned."""
+        self._rows = state["rows"].copy()
+        self._visits = state["visits"].copy()
+        self._given_up = state["given_up"].copy()
