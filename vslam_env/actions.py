@@ -52,12 +52,14 @@ def _checked_pair(agent: str, action: Any) -> tuple[float, float]:
     """Return a continuous action as two floats in [-1, 1], or raise."""
     name, cure = "actions[%r]", "Give (speed, turn) in [-1, 1]."
     try:
-        array = np.asarray(action, dtype=np.float64)
+        array = np.asarray(action)
     except (TypeError, ValueError) as error:
         raise bad_argument(name % agent, "an array of shape (2,)", action, cure) from error
+    if array.dtype.kind not in "fiu":  # text and complex numbers could be turned into floats, but mean something else
+        raise bad_argument(name % agent, "an array of shape (2,) of real numbers", action, cure)
     if array.shape != (2,):
         raise bad_argument(name % agent, "an array of shape (2,)", f"shape {array.shape}", cure)
-    speed, turn = array.tolist()
+    speed, turn = map(float, array.tolist())
     if not (abs(speed) <= 1.0 and abs(turn) <= 1.0):  # false for NaN
         raise bad_argument(name % agent, "two numbers in [-1, 1]", [speed, turn], cure)
     return speed, turn

@@ -138,7 +138,7 @@ def make_terms(reward: RewardSpec) -> tuple[RewardTerm, ...]:
     """Turn names with weights, or ready-made terms, into terms.
 
     Raises:
-        ValueError: If there is no term, a name is unknown or repeats, or an object is no term.
+        ValueError: If there is no term, a name is unknown, repeats or is no text, or an object is no term.
     """
     if isinstance(reward, (Mapping, list, tuple)) and not reward:
         raise bad_argument("reward", "at least one term", reward, "E.g. {'map_error': 1.0}.")
@@ -152,8 +152,12 @@ def make_terms(reward: RewardSpec) -> tuple[RewardTerm, ...]:
     if not isinstance(reward, (list, tuple)):
         raise bad_argument("reward", "weights by name, or a list of terms", reward, "E.g. {'map_error': 1.0}.")
     for term in reward:
+        if isinstance(term, type):
+            raise bad_argument("reward", "terms, not their classes", term, f"Make one: {term.__name__}(...).")
         if not isinstance(term, RewardTerm):
             raise bad_argument("reward", "terms with name, weight and a call", term, "See vslam_env.reward.RewardTerm.")
+        if not isinstance(term.name, str) or not term.name:
+            raise bad_argument("reward", "terms whose name is a text", term.name, "Infos show it as reward/<name>.")
     names_used = [term.name for term in reward]
     if len(set(names_used)) < len(names_used):
         raise bad_argument("reward", "terms with different names", names_used, "Rename one of them.")
@@ -177,10 +181,14 @@ def evaluate(
     robots = len(after.map_errors)
     rewards = {}
     for term in terms:
-        value = np.asarray(term(before, after), dtype=np.float64)
+        given = term(before, after)
+        try:
+            value = np.asarray(given, dtype=np.float64)
+        except (TypeError, ValueError):  # no numbers at all
+            value = np.array(np.nan)
         if value.shape != (robots,) or not all(map(math.isfinite, value.tolist())):
             raise bad_argument(
-                f"reward term {term.name!r}", f"{robots} finite numbers", value, "Return one number for each robot."
+                f"reward term {term.name!r}", f"{robots} finite numbers", given, "Return one number for each robot."
             )
         rewards[term.name] = term.weight * (np.full(robots, value.mean()) if shared else value)
     return rewards

@@ -71,7 +71,7 @@ def draw_setting(
         start_poses: (K, 3) [m, m, rad], world frame; None: those of the world, or drawn.
 
     Raises:
-        ValueError: If there is no such world, or robots cannot start there.
+        ValueError: If there is no such world, robots cannot start there, or no landmark can be seen.
     """
     layout, textures, starts, odometry, sensor, scan, belief_seed, radio = seed.spawn(8)
     if world_seed is None and config.world_split is not None:
@@ -89,6 +89,10 @@ def draw_setting(
         given = bare.landmarks
         landmarks = place_landmarks(bare, paint, config.landmarks, free_space) if given is None else given
         eyes = LandmarkSensor(config.landmark_sensor, bare.walls, landmarks, config.robot_radius)
+    countable = free_space.visible_landmarks(landmarks, eyes.config.camera, eyes.config.max_incidence)
+    if not countable.any():
+        got, cure = f"no such landmark among {len(landmarks)} in {bare.name!r}", "Put some on walls that robots pass."
+        raise bad_argument("world", "landmarks that robots can see", got, cure)
     world = World(bare.name, bare.walls, landmarks, bare.start_poses)
     true_starts = _starts(config, world, free_space, start_poses, np.random.default_rng(starts))
     true_starts.setflags(write=False)
@@ -105,7 +109,7 @@ def draw_setting(
         sensor=eyes,
         scan=Scan(config.scan, world.walls, config.robot_radius),
         coverage=CoverageMeter(free_space.free_area_cells, true_starts),
-        countable=free_space.visible_landmarks(landmarks, eyes.config.camera, eyes.config.max_incidence),
+        countable=countable,
     )
 
 

@@ -6,7 +6,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend.errors import bad_argument
+from slam_backend.errors import bad_argument, check_int
 from slam_backend.reports import MergeEvent
 from vslam_env.belief import Belief
 from vslam_env.config import EnvConfig
@@ -42,6 +42,7 @@ class SoloExplorationEnv(gymnasium.Env[Any, Any]):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start an episode; see `ExplorationEnv.reset`."""
+        seed = None if seed is None else check_int("seed", seed, 0, "Give an int >= 0, or None.")
         super().reset(seed=seed)
         observations, infos = self.parallel.reset(seed, options)
         return observations[AGENT], infos[AGENT]

@@ -9,6 +9,7 @@ from small_env import MEETING, WALLS, small_env
 
 from vslam_env import EnvConfig, ExplorationEnv, World, vslam_v0
 from vslam_env.solo import SoloExplorationEnv
+from vslam_env.world import Landmarks
 
 NARROW = World("narrow", [[0, 0, 9, 0], [9, 0, 9, 0.3], [9, 0.3, 0, 0.3], [0, 0.3, 0, 0]])
 CLOSET = World("closet", [[0, 0, 2, 0], [2, 0, 2, 2], [2, 2, 0, 2], [0, 2, 0, 0]])
@@ -43,6 +44,23 @@ def _world_file(name: str, content: bytes) -> Callable[[], Any]:
 
 class _Nameless:
     weight = 1.0
+
+
+def _blank_world(positions: Any) -> World:
+    """The room with landmarks of its own at these places (n, 3), all on the first wall."""
+    n = len(positions)
+    looks = np.tile(np.eye(1, 64, dtype=np.float32), (n, 1))
+    return World("blank", WALLS, Landmarks(positions, np.tile([0.0, 1.0], (n, 1)), np.zeros(n, np.int64), looks))
+
+
+class _Returns:
+    """A reward term that returns what it was made with."""
+
+    def __init__(self, value: Any, name: Any = "given") -> None:
+        self.value, self.name, self.weight = value, name, 1.0
+
+    def __call__(self, before: Any, after: Any) -> Any:
+        return self.value
 
 
 class _Twice:
@@ -106,6 +124,19 @@ CASES: dict[str, tuple[Callable[[], Any], str]] = {
         _step({"robot_0": [0, 0], "robot_1": [0, 0]}, reward=[_Twice()]),
         "reward term 'twice': expected 2 finite numbers",
     ),
+    "reward of texts": (
+        _step({"robot_0": [0, 0], "robot_1": [0, 0]}, reward=[_Returns(["a", "b"])]),
+        "reward term 'given': expected 2 finite numbers, got \\['a', 'b'\\]",
+    ),
+    "reward by name of a robot": (
+        _step({"robot_0": [0, 0], "robot_1": [0, 0]}, reward=[_Returns({"robot_0": 1.0})]),
+        "reward term 'given': expected 2 finite numbers, got {'robot_0': 1.0}",
+    ),
+    "class of a reward": (lambda: small_env(reward=[_Twice]), "reward: expected terms, not their classes.*_Twice"),
+    "reward named by a number": (
+        lambda: small_env(reward=[_Returns(0.0, name=3)]),
+        "reward: expected terms whose name is a text, got 3",
+    ),
     "weight that is NaN": (lambda: small_env(reward={"map_error": float("nan")}), "reward.*map_error.*finite number"),
     "negative seed": (_reset(seed=-1), "seed: expected an int >= 0, got -1"),
     "seed as text": (_reset(seed="x"), "seed: expected an int >= 0, got 'x'"),
@@ -149,6 +180,14 @@ CASES: dict[str, tuple[Callable[[], Any], str]] = {
         _step({"robot_0": "go", "robot_1": [0, 0]}),
         r"actions\['robot_0'\]: expected an array of shape",
     ),
+    "action of texts": (
+        _step({"robot_0": ["0.1", "0.2"], "robot_1": [0, 0]}),
+        r"actions\['robot_0'\]: expected an array of shape \(2,\) of real numbers",
+    ),
+    "complex action": (
+        _step({"robot_0": np.zeros(2, complex), "robot_1": [0, 0]}),
+        r"actions\['robot_0'\]: expected an array of shape \(2,\) of real numbers",
+    ),
     "discrete action out of range": (
         _step({"robot_0": 4, "robot_1": 0}, action_type="discrete"),
         r"actions\['robot_0'\]: expected an int from 0 to 3, got 4",
@@ -165,6 +204,16 @@ CASES: dict[str, tuple[Callable[[], Any], str]] = {
     "broken walls": (_world_file("plan.json", b"{"), "world: expected a JSON file, got a syntax error"),
     "broken map": (_world_file("map.yaml", b"image: [1, 2"), "world: expected a YAML file, got a syntax error"),
     "map without an image": (_world_file("map.yaml", b"resolution: 1"), "expected a mapping with the key 'image'"),
+    "walls nested without end": (_world_file("plan.json", b"[" * 100_000), "world: expected a JSON file"),
+    "walls as text": (
+        _world_file("plan.json", b'{"walls": "all"}'),
+        r"world\.walls: expected an array of shape \(n, 4\), got 'all'.* The file is .*plan\.json\.$",
+    ),
+    "no landmarks": (_reset(world=_blank_world(np.zeros((0, 3)))), "world: expected landmarks that robots can see"),
+    "landmarks out of sight": (
+        _reset(world=_blank_world(np.array([[500.0, 0.0, 0.0]]))),
+        "world: expected landmarks that robots can see, got no such landmark among 1 in 'blank'",
+    ),
     "walls that enclose nothing": (
         _world_file("plan.json", b'{"walls": [[0, 0, 5, 0]]}'),
         "world: expected walls that enclose a space",
@@ -178,6 +227,10 @@ CASES: dict[str, tuple[Callable[[], Any], str]] = {
         "landmarks.density: expected a finite number > 0, got -1",
     ),
     "no state": (lambda: small_env().set_state([]), "state: expected what get_state returned, got a list"),
+    "negative seed in a solo environment": (
+        lambda: SoloExplorationEnv(world="fig5").reset(seed=-1),
+        "seed: expected an int >= 0, got -1",
+    ),
     "team in a solo environment": (lambda: SoloExplorationEnv(num_robots=2), "num_robots: expected 1, got 2"),
     "fewer starts than robots": (
         _reset(world=World("two", WALLS, start_poses=MEETING), num_robots=3),

@@ -81,6 +81,8 @@ def test_an_imported_map_comes_back(tmp_path: Path) -> None:
         ({"free_thresh": 3}, "free_thresh: expected a finite number > 0 and <= 1"),
         ({"free_thresh": 0.001}, "expected a map with free space"),
         ({"resolution": 0.001}, r"expected free space for robots of radius 0\.2 m"),
+        ({"negate": "'false'"}, "negate: expected 0 or 1, got 'false'"),
+        ({"negate": 2}, "negate: expected 0 or 1, got 2"),
         ({"negate": "{"}, "world: expected a YAML file, got a syntax error"),
     ],
 )

@@ -86,7 +86,7 @@ def load_walls_json(path: str | Path) -> World:
     cure = 'Write {"walls": [[x1, y1, x2, y2], ...]}, in metres; "start_poses" and "name" are optional.'
     try:
         content: Any = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise bad_argument("world", "a JSON file", f"a syntax error in {path}: {error}", cure) from error
     if not isinstance(content, dict) or "walls" not in content:
         got = sorted(content) if isinstance(content, dict) else content

@@ -83,11 +83,16 @@ def _load(world: str | Path, rng: np.random.Generator, split: str | None) -> Wor
 
 @lru_cache(maxsize=64)
 def _read(path: Path, changed: int) -> World:
-    """Read a file once for as long as it does not change."""
+    """Read a file once for as long as it does not change; what is wrong with it names it, among many of a folder."""
     suffix = path.suffix.lower()
-    if suffix in MAP_SUFFIXES:
-        return load_ros_map(path)
-    return load_walls_json(path) if suffix == ".json" else load_floorplan(path)
+    try:
+        if suffix in MAP_SUFFIXES:
+            return load_ros_map(path)
+        return load_walls_json(path) if suffix == ".json" else load_floorplan(path)
+    except ValueError as error:
+        if str(path) in str(error):
+            raise
+        raise ValueError(f"{error} The file is {path}.") from error
 
 
 def _files(world: str | Path) -> list[Path]:

@@ -56,11 +56,14 @@ def _checked(content: Any, path: str) -> dict[str, Any]:
     if not isinstance(content["image"], str):
         raise bad_argument("world", f"a path as image in {path}", content["image"], CURE)
     name = "world: " + Path(path).name
+    negate = content.get("negate", 0)
+    if negate not in (0, 1):  # True and False are such numbers; a text is true whatever it says
+        raise bad_argument(f"{name} negate", "0 or 1", negate, CURE)
     return {
         "image": content["image"],
         "resolution": check_float(f"{name} resolution", content["resolution"], "Give metres per pixel.", above=0.0),
         "origin": check_array(f"{name} origin", content.get("origin", [0.0, 0.0, 0.0]), (3,), "Give x, y, yaw."),
-        "negate": bool(content.get("negate", 0)),
+        "negate": bool(negate),
         "free_thresh": check_float(
             f"{name} free_thresh", content.get("free_thresh", 0.196), "Give a probability.", above=0.0, at_most=1.0
         ),
