@@ -38,16 +38,12 @@ def check_state(state: Any, config: EnvConfig) -> Mapping[str, Any]:
     Raises:
         ValueError: If it is no state, one of another version, or one of another configuration.
     """
-    if not isinstance(state, Mapping) or not all(key in state for key in KEYS):
-        raise bad_argument("state", "what get_state returned", _kind(state), "Pass it unchanged.")
-    _check_version("state", state["version"])
-    if state["config"] != config:
-        for field in dataclasses.fields(config):
-            theirs, ours = getattr(state["config"], field.name), getattr(config, field.name)
-            if theirs != ours:
-                cure = "Restore into an environment of the same configuration."
-                raise bad_argument("state", f"one made with {field.name} = {_short(ours)}", theirs, cure)
-    return state
+    found = _checked("state", state)
+    if found["config"] != config:
+        name, ours, theirs = _difference(config, found["config"])
+        cure = "Restore into an environment of the same configuration."
+        raise bad_argument("state", f"one made with {name} = {_short(ours)}", theirs, cure)
+    return found
 
 
 def save_state(state: Mapping[str, Any], path: str | Path) -> None:
@@ -56,10 +52,9 @@ def save_state(state: Mapping[str, Any], path: str | Path) -> None:
     The file is a marked pickle: like any pickle, load it only from where you would run code from.
 
     Raises:
-        ValueError: If it is no state, or the file cannot be written.
+        ValueError: If it is no state of this version, or the file cannot be written.
     """
-    if not isinstance(state, Mapping) or not all(key in state for key in KEYS):
-        raise bad_argument("state", "what get_state returned", _kind(state), "Pass it unchanged.")
+    _checked("state", state)
     path = Path(path)
     try:
         with NamedTemporaryFile(dir=path.parent, prefix=path.name, suffix=".part", delete=False) as file:
@@ -91,10 +86,11 @@ def load_state(path: str | Path) -> EnvState:
         raise bad_argument("path", "the file of a state", str(path), "Write one with save_state.")
     _check_version(str(path), head[len(MAGIC) :].decode(errors="replace"))  # before anything of it is unpickled
     try:
-        return dict(pickle.loads(body))
+        state = pickle.loads(body)
     except Exception as error:
         cure = f"Save it again; reading says: {error}."
         raise bad_argument("path", "a whole file of a state", f"a damaged file {path}", cure) from error
+    return dict(_checked(str(path), state))
 
 
 def sequence_state(sequence: np.random.SeedSequence | None) -> dict[str, Any] | None:
@@ -116,11 +112,28 @@ def _check_version(name: str, found: Any) -> None:
         raise bad_argument(name, f"a state of version {state_version()!r}", found, cure)
 
 
-def _kind(state: Any) -> str:
-    if isinstance(state, Mapping):
-        missing = next(key for key in KEYS if key not in state)
-        return f"a mapping without {missing!r}"
-    return f"a {type(state).__name__}"
+def _checked(name: str, state: Any) -> Mapping[str, Any]:
+    """Return a state of this version, or refuse it; another version's may have other parts, so that is said first."""
+    expected, cure = "what get_state returned", "Pass it unchanged."
+    if not isinstance(state, Mapping):
+        raise bad_argument(name, expected, f"a {type(state).__name__}", cure)
+    if "version" in state:
+        _check_version(name, state["version"])
+    for key in KEYS:
+        if key not in state:
+            raise bad_argument(name, expected, f"a mapping without {key!r}", cure)
+    if not isinstance(state["config"], EnvConfig):
+        raise bad_argument(name, expected, f"a mapping whose config is a {type(state['config']).__name__}", cure)
+    return state
+
+
+def _difference(ours: Any, theirs: Any, name: str = "") -> tuple[str, Any, Any]:
+    """Return where two unequal configurations differ first: the field, through nested parts, and both values."""
+    if not dataclasses.is_dataclass(ours) or type(ours) is not type(theirs):
+        return name, ours, theirs
+    pairs = ((f.name, getattr(ours, f.name), getattr(theirs, f.name)) for f in dataclasses.fields(ours))
+    field, own, other = next(pair for pair in pairs if pair[1] != pair[2])
+    return _difference(own, other, f"{name}.{field}" if name else field)
 
 
 def _short(value: Any) -> str:

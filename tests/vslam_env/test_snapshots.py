@@ -205,7 +205,13 @@ def _from_other(**kwargs: Any) -> Callable[[], Any]:
         (lambda: small_env().set_state(3), "state: expected what get_state returned, got a int. Pass it unchanged"),
         (_without("drivers"), "state: expected what get_state returned, got a mapping without 'drivers'"),
         (_edited(version="0/0.0.1"), rf"state: expected a state of version '{state_version()}', got '0/0.0.1'"),
+        (lambda: small_env().set_state({"version": "0/0.0.1"}), "state: expected a state of version .*, got '0/0.0.1'"),
+        (_edited(config={}), "state: expected what get_state returned, got a mapping whose config is a dict"),
         (_from_other(num_robots=4), "state: expected one made with world = 'room', got 'office'"),
+        (
+            lambda: small_env().set_state(small_env(num_particles=30).get_state()),
+            r"state: expected one made with belief\.filter\.num_particles = 20, got 30\. Restore",
+        ),
         (_from_other(world="fig5"), "state: expected one made with world = 'room', got 'fig5'"),
     ],
 )  # fmt: skip
@@ -231,6 +237,10 @@ def test_a_refused_state_leaves_the_environment_alone() -> None:
         (
             lambda content: content.replace(f"state {STATE_FORMAT}/".encode(), b"state 9/", 1),
             r"expected a state of version .*got '9/",
+        ),
+        (
+            lambda content: content[: content.index(b"\n") + 1] + pickle.dumps(3),
+            "expected what get_state returned, got a int",
         ),
         (None, "path: expected the file of a state, .*no such file|No such file"),
     ],
