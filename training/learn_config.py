@@ -7,7 +7,8 @@ from typing import Any
 
 from slam_backend.errors import bad_argument, check_choice, check_float, check_int
 from training.plain_config import PlainConfig
-from vslam_env.config import MAX_ROBOTS, PRESETS, EnvConfig, preset_config
+from vslam_env.config import MAX_ROBOTS, EnvConfig
+from vslam_env.presets import PRESETS, preset_config
 from vslam_env.world import WORLD_FAMILIES, check_source, is_one_building
 
 SPLIT_TRAIN, SPLIT_TRY = "train", "validation"

@@ -10,8 +10,9 @@ from agents.trained import load_model
 from slam_backend.errors import check_choice, check_int
 from training.plain_config import PlainConfig
 from vslam_env import vslam_v0
-from vslam_env.config import ACTION_TYPES, GOAL_DECISION_TICKS, PRESETS, SENSORS, TICK, EnvConfig, preset_config
+from vslam_env.config import ACTION_TYPES, GOAL_DECISION_TICKS, SENSORS, TICK, EnvConfig
 from vslam_env.environment import ExplorationEnv
+from vslam_env.presets import PRESETS, preset_config
 from vslam_env.world import WORLD_FAMILIES
 
 # Time for three robots to see the office and to meet each other's traces there [s].

@@ -7,12 +7,22 @@ import gymnasium
 import pettingzoo
 
 from vslam_env.belief import Belief
-from vslam_env.config import EnvConfig, preset_config
+from vslam_env.config import EnvConfig
 from vslam_env.environment import ExplorationEnv
+from vslam_env.presets import preset_config, stereo_belief
 from vslam_env.snapshots import load_state, save_state
 from vslam_env.world import World
 
-__all__ = ["Belief", "EnvConfig", "ExplorationEnv", "World", "load_state", "preset_config", "save_state"]
+__all__ = [
+    "Belief",
+    "EnvConfig",
+    "ExplorationEnv",
+    "World",
+    "load_state",
+    "preset_config",
+    "save_state",
+    "stereo_belief",
+]
 
 if hasattr(pettingzoo, "register"):  # since 1.27
     pettingzoo.register("parallel", "vslam_env/Exploration-v0", "vslam_env.vslam_v0:parallel_env")

@@ -1,35 +1,26 @@
-"""`EnvConfig`: everything that defines an environment, frozen and validated, with presets and a TOML form."""
+"""`EnvConfig`: everything that defines an environment, frozen and validated, with a TOML form."""
 
-import dataclasses
-import json
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, Self, TypeVar
+from typing import Any, Literal, Self
 
-import numpy as np
 import tomli_w
-from pydantic import ConfigDict, TypeAdapter, ValidationError
+from pydantic import ConfigDict
 
 from slam_backend.errors import bad_argument, check_choice, check_float, check_int
-from slam_backend.existence import ExistenceModel
-from slam_backend.frontend import KINDS
-from slam_backend.motion import OdometryModel
+from vslam_env import _config_values as nested
 from vslam_env.robot_belief import BeliefConfig
 from vslam_env.sensors import LandmarkSensorConfig, ScanConfig, StereoSensorConfig
 from vslam_env.world import SPLITS, LandmarkConfig, OdometryNoise
 
-T = TypeVar("T")
-
 ACTION_TYPES = ("continuous", "discrete", "goal")
 OBSERVATION_TYPES = ("dict", "flat")
 SENSORS = ("landmark", "stereo")
-PRESETS = ("easy", "standard", "hard")
 MAX_ROBOTS = 8
 TICK = 0.1  # [s]
 GOAL_DECISION_TICKS = 10
-NONE = "none"  # what TOML, which has no word for it, says for None
 PARTS = {
     "landmarks": LandmarkConfig,
     "odometry": OdometryNoise,
@@ -174,12 +165,12 @@ class EnvConfig:
         Raises:
             ValueError: If a field is unknown or a value is refused; the text names it.
         """
-        return _validated(type(self), _merged(_plain(self), changes))
+        return nested.validated(type(self), nested.merged(nested.plain(self), changes))
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
         """Build a configuration from nested dicts; what is left out has the value of the `standard` preset."""
-        return _validated(cls, _merged(_plain(cls()), values))
+        return nested.validated(cls, nested.merged(nested.plain(cls()), values))
 
     @classmethod
     def from_toml(cls, path: str | Path) -> Self:
@@ -195,131 +186,8 @@ class EnvConfig:
     @classmethod
     def from_toml_text(cls, text: str) -> Self:
         """Build a configuration from what `to_toml` returned."""
-        return cls.from_dict(_read(tomllib.loads(text)))
+        return cls.from_dict(nested.with_none(tomllib.loads(text)))
 
     def to_toml(self) -> str:
         """Return the configuration as TOML; None is left out where it is the standard, else it is the text "none"."""
-        return tomli_w.dumps(_written(_plain(self), _plain(type(self)())))
-
-
-def preset_config(name: str, sensor: str = "landmark") -> EnvConfig:
-    """Return a preset.
-
-    `standard`: odometry with sigma 5 % of the distance and 2 degrees per metre, and a bias per episode of 2 % and 0.5
-    degrees per metre; 5 landmarks a tick within 8 m, detected with probability 0.9, 0.02 false points, descriptor
-    noise 0.17.
-    `easy`: odometry noise and bias halved, 10 landmarks a tick within 12 m, detected with probability 0.95, no false
-    points, descriptor noise 0.1.
-    `hard`: odometry noise and bias doubled, 3 landmarks a tick within 5 m, detected with probability 0.8, 0.1 false
-    points, descriptor noise 0.25, every fifth landmark looks like another one, and radios lose half of the contacts.
-    The filters know the range and the odometry noise of their preset.
-    With `sensor="stereo"` only odometry and radios differ, and filters assume what `stereo_belief` says.
-
-    Raises:
-        ValueError: If there is no such preset or sensor.
-    """
-    check_choice("preset", name, PRESETS)
-    check_choice("sensor", sensor, SENSORS)
-    if sensor == "stereo":
-        plain = preset_config(name)
-        eyes = dataclasses.replace(plain, sensor="stereo")
-        return dataclasses.replace(eyes, belief=stereo_belief(eyes.stereo, plain.belief))
-    if name == "standard":
-        return EnvConfig()
-    scale, reach = (0.5, 12.0) if name == "easy" else (2.0, 5.0)
-    standard, motion = EnvConfig(), OdometryModel()
-    sensors = {
-        "easy": {"max_measurements": 10, "detection_probability": 0.95, "false_points": 0.0, "descriptor_noise": 0.1},
-        "hard": {"max_measurements": 3, "detection_probability": 0.8, "false_points": 0.1, "descriptor_noise": 0.25},
-    }
-    assumed = {part: scale * getattr(motion, part) for part in ("sigma_along", "sigma_across", "sigma_heading")}
-    camera = {"max_range": reach}
-    return standard.replace(
-        odometry={f.name: scale * getattr(standard.odometry, f.name) for f in dataclasses.fields(standard.odometry)},
-        belief={"filter": {"motion": assumed, "camera": camera}},
-        landmark_sensor=sensors[name] | {"camera": camera},
-        landmarks={"repeated": 0.2 if name == "hard" else 0.0},
-        comm_loss=0.5 if name == "hard" else 0.0,
-    )
-
-
-def stereo_belief(eyes: StereoSensorConfig, belief: BeliefConfig) -> BeliefConfig:
-    """Return a belief fit for rendered eyes: their optics, twice their noise, and landmarks that come and go.
-
-    Rendered eyes measure disparities to 0.05 px and corners to 0.1 to 0.2 px, but corners wander with the viewpoint,
-    and some points slide along edges: these landmarks die because they are not seen again where they should be.
-    Twenty points a frame among many that look alike are now and then taken for a lost pose, so nothing is recovered
-    that way: in offices 100 and 101 (three robots, 60 s) the six paths were off by 1 to 9 cm with recovery, 1 to 2 cm
-    without. Rejuvenation is left out: with rendered eyes it has not been measured.
-
-    Args:
-        eyes: The sensor.
-        belief: All that has nothing to do with the sensor is taken from here.
-    """
-    optics = {name: getattr(eyes.camera, name) for name in ("focal_px", "baseline", "width", "height", "max_range")}
-    doubled = dataclasses.replace(belief.filter.camera, mount=eyes.camera.mount, **optics)
-    existence = ExistenceModel(detection=0.7, frame_limit=eyes.front_end.max_measurements)
-    gate = KINDS[eyes.front_end.descriptor].gate
-    changes: dict[str, Any] = {"existence": existence, "descriptor_gate": gate, "recovery_position": 0.0}
-    changes["rejuvenate_every"] = None
-    assumed = dataclasses.replace(belief.filter, camera=doubled, **changes)
-    return dataclasses.replace(belief, filter=assumed)
-
-
-def _validated(cls: type[T], values: Mapping[str, Any]) -> T:
-    """Build `cls` from nested dicts, or raise the project's one error for the first thing that is wrong."""
-    try:
-        # Strict on JSON refuses 2.0, "2" and True as ints, but takes dicts for parts, lists for tuples, int for float.
-        return TypeAdapter(cls).validate_json(json.dumps(_plain(values), default=str), strict=True)
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        own = first.get("ctx", {}).get("error")
-        if isinstance(own, ValueError):  # raised by a check of ours, which explains itself
-            raise own from None
-        name = ".".join(str(part) for part in first["loc"])
-        if first["type"] == "unexpected_keyword_argument":
-            raise bad_argument(name, "a known field", first["input"], "Check the spelling.") from None
-        expected = first["msg"].removeprefix("Input should be ")
-        raise bad_argument(name, expected, first["input"], "Correct this value.") from None
-
-
-def _plain(value: Any) -> Any:
-    """Turn nested configurations into dicts, lists and numbers."""
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
-    if isinstance(value, Mapping):
-        return {key: _plain(entry) for key, entry in value.items()}
-    if isinstance(value, tuple):
-        return [_plain(entry) for entry in value]
-    return value.item() if isinstance(value, np.generic) else value
-
-
-def _merged(values: dict[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Return nested dicts with some entries changed; weights of rewards are replaced as a whole."""
-    merged = dict(values)
-    for key, change in changes.items():
-        change = _plain(change)
-        nested = isinstance(change, dict) and isinstance(merged.get(key), dict) and key != "reward"
-        merged[key] = _merged(merged[key], change) if nested else change
-    return merged
-
-
-def _written(values: Mapping[str, Any], standard: Any) -> dict[str, Any]:
-    """Return nested dicts without None: left out where the standard is None or knows no such entry, else `NONE`."""
-    usual = standard if isinstance(standard, Mapping) else {}
-    written: dict[str, Any] = {}
-    for key, value in values.items():
-        if isinstance(value, Mapping):
-            written[key] = _written(value, usual.get(key))
-        elif value is not None:
-            written[key] = value
-        elif usual.get(key) is not None:
-            written[key] = NONE
-    return written
-
-
-def _read(values: Any) -> Any:
-    """Turn the text `NONE` into None in nested dicts."""
-    if isinstance(values, Mapping):
-        return {key: _read(value) for key, value in values.items()}
-    return None if values == NONE else values
+        return tomli_w.dumps(nested.without_none(nested.plain(self), nested.plain(type(self)())))

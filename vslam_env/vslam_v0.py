@@ -9,8 +9,9 @@ from pettingzoo.utils.conversions import parallel_to_aec
 from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 
 from slam_backend.errors import bad_argument
-from vslam_env.config import EnvConfig, preset_config
+from vslam_env.config import EnvConfig
 from vslam_env.environment import ExplorationEnv
+from vslam_env.presets import preset_config
 from vslam_env.reward import RewardSpec
 from vslam_env.world import World, WorldSource
 

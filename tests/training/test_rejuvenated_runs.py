@@ -12,7 +12,8 @@ from small_logs import write_drive, write_log, write_park
 from slam_backend import _rejuvenation_step
 from training.replay_images import ImagesConfig
 from training.run_config import RunConfig
-from vslam_env.config import EnvConfig, preset_config
+from vslam_env.config import EnvConfig
+from vslam_env.presets import preset_config
 
 WRITERS: Mapping[str, Callable[[Path], None]] = {
     "mrclam": lambda folder: write_log(folder, noise=1.0),

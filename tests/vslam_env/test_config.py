@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from vslam_env import EnvConfig, preset_config, vslam_v0
-from vslam_env.config import PRESETS
+from vslam_env.presets import PRESETS
 
 
 @pytest.mark.parametrize("name", PRESETS)

@@ -9,7 +9,7 @@ from small_env import MEETING, small_env, turning
 
 from slam_backend.camera import StereoCamera
 from vslam_env import EnvConfig, ExplorationEnv
-from vslam_env.config import preset_config, stereo_belief
+from vslam_env.presets import preset_config, stereo_belief
 from vslam_env.sensors import EyeFrame, StereoSensor
 
 # pettingzoo.test imports connect_four in a way that pettingzoo itself deprecates
