@@ -34,7 +34,7 @@ def joint_graph(
         own, other = (_thinned(graph, robots, camera, options) for graph in (own, other))
     robot = int(np.flatnonzero(other.previous[other.heads] < 0)[0])  # one that defines b's frame
     start = starts[2][len(starts[0]) + robot]
-    began = other.poses[other.heads[robot]]
+    began = other.poses[other.heads[robot]].copy()  # can be written: `add_share` is compiled for such arrays alone
     motion = compose(mean_pose(start), inverse(began))
     spreads = scattered(start)[None], np.zeros((1, 3, 3))
     for frame, pose, spread in zip(frames, (mean_pose(start), began), spreads, strict=True):

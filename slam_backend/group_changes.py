@@ -165,5 +165,6 @@ def _hand_over(branch: Branch, restored: list[Group], records: Records) -> None:
 def _of_frames(frame_a: FloatArray, frame_b: FloatArray, alignment: Alignment) -> FloatArray:
     """Return what two frames that are held, (3, 3) each, leave open of the motion between where the groups began."""
     covariance = rotate_covariances(alignment.theta, frame_b)
-    add_share(frame_a, alignment.transform[None], covariance[None])
+    transform = alignment.transform.copy()  # can be written: the kernel is compiled for such arrays alone
+    add_share(frame_a, transform[None], covariance[None])
     return covariance

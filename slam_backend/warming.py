@@ -12,8 +12,10 @@ from slam_backend.existence import ExistenceModel
 from slam_backend.filter import FastSlam
 from slam_backend.frontend import StereoFrontEnd
 from slam_backend.measurements import Measurements
+from slam_backend.merge_options import MergeOptions
 from slam_backend.metrics.maps import map_error
 from slam_backend.smoothing.bending import bend
+from slam_backend.smoothing.options import SmoothingOptions
 from slam_backend.team import TeamSlam
 
 PROPOSALS: tuple[Literal["fastslam2", "fastslam1"], ...] = ("fastslam2", "fastslam1")
@@ -50,13 +52,14 @@ def warm_up() -> float:
         watching = FastSlam(num_particles=4, existence=ExistenceModel(), resample_threshold=1.0)
         for _ in range(STEPS):
             watching.step([move], [plain])
-        smoothing = FastSlam(num_particles=4, rejuvenate_every=2)
-        for _ in range(STEPS):
+        few_keys = SmoothingOptions(max_keys=2, fresh_keys=1)  # logs come in parts, between which keys are joined
+        smoothing = FastSlam(num_particles=4, rejuvenate_every=STEPS + 1, smoothing=few_keys)
+        for _ in range(2 * (STEPS + 1)):
             smoothing.step([move], [plain])
         root = np.array([-1])
         root.setflags(write=False)
         bend(np.zeros((1, 3)), root, np.zeros((1, 3, 1)))
-        team = TeamSlam(2, num_particles=4, attempts=AttemptOptions(every=1))
+        team = TeamSlam(2, num_particles=4, attempts=AttemptOptions(every=1), merging=MergeOptions(watch_every=1))
         for _ in range(STEPS):
             team.step([None, None], [plain, plain])
         team.standpoints(), team.outline(1)

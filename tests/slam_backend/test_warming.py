@@ -1,3 +1,4 @@
+import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -19,9 +20,11 @@ from slam_backend import FastSlam, Measurements, TeamSlam
 from slam_backend.adaptation import AdaptiveParticles
 from slam_backend.existence import ExistenceModel
 from slam_backend.attempts import AttemptOptions
-from slam_backend.existence import ExistenceModel
+from slam_backend.merge_options import MergeOptions
 from slam_backend.metrics.maps import map_error
+from slam_backend.smoothing.options import SmoothingOptions
 from slam_backend.warming import warm_up
+from simulated_team import SimulatedTeam
 
 def versions():
     modules = [module for name, module in list(sys.modules.items()) if name.startswith("slam_backend")]
@@ -64,6 +67,16 @@ for size in (1, 3, 9, 30, 30, 30):
 assert len(team.groups) == 1
 for robot in range(2):
     team.standpoints(), team.outline(robot)
+slices = SmoothingOptions(slice_steps=20, rigid_within=0.01, max_keys=12, further_keys=4, fresh_keys=6)
+for smoothing in (slices, SmoothingOptions()):
+    simulation = SimulatedTeam(2, seed=100)
+    smoothed = simulation.build(
+        rejuvenate_every=20, smoothing=smoothing, attempts=AttemptOptions(every=5),
+        merging=MergeOptions(watch_every=5, sure=0.0),
+    )
+    told = simulation.run(smoothed, 100)
+    assert len(smoothed.groups) == 1
+    assert any(report.rejuvenations for report in told if len(report.groups) == 1)
 map_error(team.map(0).means, rng.permutation(len(team.map(0))), np.asfortranarray(points))
 for late in sorted(versions() - before):
     print(*late)
@@ -89,7 +102,8 @@ def _kernel(module: str) -> Callable[[float], float]:
 @pytest.mark.slow
 def test_nothing_is_compiled_after_the_warm_up() -> None:
     """However the backend is used afterwards, it needs no kernel that the warm-up has not made ready."""
-    done = subprocess.run([sys.executable, "-c", VARIED_USE], capture_output=True, text=True, check=False)
+    beside = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}  # where its simulated team is found
+    done = subprocess.run([sys.executable, "-c", VARIED_USE], env=beside, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (0, ""), done.stderr
 
 
