@@ -109,6 +109,8 @@ class NearestFrontier:
         self._path = plan_path(belief.grid.cells, belief.pose[:2], goal)
         if self._path is None:
             self._patrol = None
+        elif self._held is None:
+            self._patrol = self._path[-1]  # as near as one gets to a place beside which a wall has come to be seen
 
 
 def far_place(belief: Belief, rng: np.random.Generator) -> FloatArray:

@@ -5,9 +5,10 @@ import pytest
 
 from agents import POLICIES, make_policy
 from agents.nearest_frontier import choose_slot, far_place
+from slam_backend.geometry import compose
 from vslam_env import ExplorationEnv, World, vslam_v0
 from vslam_env.belief import Belief, Teammate
-from vslam_env.navigation import plan_path
+from vslam_env.navigation import SeenGrid, cell_of, plan_path
 
 ROOM = World("room", [[0, 0, 11, 0], [11, 0, 11, 9], [11, 9, 0, 9], [0, 9, 0, 0], [5, 0, 5, 5]])
 MATCHES = [
@@ -107,6 +108,29 @@ def test_patrols_lead_far_over_seen_floor() -> None:
         assert plan_path(belief.grid.cells, belief.pose[:2], place) is not None
     assert np.linalg.norm(places - belief.pose[:2], axis=1).min() > 2.0
     assert len(np.unique(places, axis=0)) > 1
+
+
+def test_a_patrol_goes_on_where_a_wall_is_seen_at_its_place() -> None:
+    """Who gets no nearer to the place of a patrol, for a wall that came to be seen there, is sent to another one."""
+    env = _env("continuous")
+    env.reset(seed=0)
+    grid = SeenGrid()
+    grid.clear_disc([0.0, 0.0, 0.0], 4.0)
+    policy, pose, way = make_policy("frontier", "continuous"), np.zeros(3), []
+    belief = _belief(env, pose=pose, candidates=_candidates(env, {}), grid=grid.frozen())
+    row, col = cell_of(far_place(belief, np.random.default_rng(0)))  # which the policy draws as well
+    assert row > 150 < col
+    rng = np.random.default_rng(0)
+    for tick in range(400):
+        belief = _belief(env, pose=pose, candidates=_candidates(env, {}), grid=grid.frozen())
+        speed, turn = policy.act(None, belief, rng)
+        if tick == 0:
+            state = grid.get_state()
+            state["evidence"][row + np.arange(-4, 5), col - np.arange(-4, 5)] = 1  # across the way to it
+            grid.set_state(state)
+        pose = compose(pose, [0.1 * speed, 0.0, 0.15 * turn])
+        way.append(pose[:2])
+    assert np.ptp(way[200:], axis=0).max() > 2.0
 
 
 def test_unknown_names_and_mismatches() -> None:
