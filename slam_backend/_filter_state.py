@@ -174,7 +174,8 @@ class FilterState:
     def get_state(self) -> dict[str, Any]:
         """Return all that decides how the filter goes on, its random stream included. Shares nothing with it."""
         state: dict[str, Any] = {name: getattr(self, name).copy() for name in KEPT}
-        state |= {"steps": self._steps, "estimates": _copies(self._estimates), "maps": self._maps.get_state()}
+        estimates = tuple(map(copied, self._estimates))
+        state |= {"steps": self._steps, "estimates": estimates, "maps": self._maps.get_state()}
         state["logs"] = tuple(log.get_state() for log in self._logs)
         if self._rejuvenation is not None:
             state["rejuvenation"] = self._rejuvenation.get_state()
@@ -201,12 +202,12 @@ class FilterState:
             log.set_state(logged)
         if self._rejuvenation is not None:
             self._rejuvenation.set_state(state["rejuvenation"])
-        self._steps, self._estimates = state["steps"], list(_copies(state["estimates"]))
+        self._steps, self._estimates = state["steps"], list(map(copied, state["estimates"]))
         # A stream of its own: the old one may be the caller's, or of another kind.
         self._rng = np.random.Generator(getattr(np.random, state["rng"]["bit_generator"])(0))
         self._rng.bit_generator.state = state["rng"]
 
 
-def _copies(estimates: Sequence[PoseEstimate]) -> tuple[PoseEstimate, ...]:
-    """Return the same estimates in arrays of their own."""
-    return tuple(PoseEstimate(estimate.mean.copy(), estimate.covariance.copy()) for estimate in estimates)
+def copied(estimate: PoseEstimate) -> PoseEstimate:
+    """Return the same estimate in arrays of its own."""
+    return PoseEstimate(estimate.mean.copy(), estimate.covariance.copy())

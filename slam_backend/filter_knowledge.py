@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from slam_backend import _kernels
 from slam_backend._best_map import best_map, best_outline, slots_held
-from slam_backend._filter_state import FilterState
+from slam_backend._filter_state import FilterState, copied
 from slam_backend._mixtures import map_mixture
 from slam_backend.errors import FloatArray, IntArray, bad_argument, check_choice
 from slam_backend.geometry import between, inverse
@@ -55,11 +55,11 @@ class FilterKnowledge(FilterState):
         return np.asarray(np.exp(self._log_weights))
 
     def pose(self, robot: int = 0) -> PoseEstimate:
-        """Return the mean and covariance of a robot's pose [m, m, rad] over all particles, map frame.
+        """Return the mean and covariance of a robot's pose [m, m, rad] over all particles, map frame. Copies.
 
         They are those of the mixture of N(x^, P^) before sampling, which scatters less than the samples.
         """
-        return self._estimates[self._check_robot(robot)]
+        return copied(self._estimates[self._check_robot(robot)])
 
     def particles(self, robot: int = 0) -> tuple[FloatArray, FloatArray]:
         """Return a robot's poses (M, 3) [m, m, rad], map frame, and the normalised log-weights (M,). Copies."""
@@ -70,17 +70,17 @@ class FilterKnowledge(FilterState):
         return np.array(self._starts[self._check_robot(robot), :, self.best_particle])
 
     def pose_from_start(self, robot: int = 0) -> PoseEstimate:
-        """Return the mean and covariance of a robot's pose [m, m, rad] in its own start frame.
+        """Return the mean and covariance of a robot's pose [m, m, rad] in its own start frame. Copies.
 
         Each particle's pose is seen from where the robot started in that particle, so that what the filter does not
         know of the start, after a merge, does not blur it.
         """
-        return self._own_frames()[0][self._check_robot(robot)]
+        return copied(self._own_frames()[0][self._check_robot(robot)])
 
     def _own_frames(self) -> tuple[Sequence[PoseEstimate], FloatArray]:
         """Return what `pose_from_start` does for each robot, and the motions (K, 3) from the map frame to the starts.
 
-        The latter [m, m, rad] are those of the most probable particle.
+        The latter [m, m, rad] are those of the most probable particle. The estimates may be the filter's own.
         """
         robots = self.num_robots
         if self._from_origin:  # the map frame is their own start frame

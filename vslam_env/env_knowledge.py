@@ -89,8 +89,8 @@ class EnvKnowledge(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # Pe
 
     @property
     def true_landmarks(self) -> FloatArray:
-        """(N, 3) float64 [m], world frame. The landmarks that count: those that some robot could ever see."""
-        return self._running_episode("true_landmarks").ledger.true_positions
+        """(N, 3) float64 [m], world frame. The landmarks that count, those that some robot could ever see; a copy."""
+        return self._running_episode("true_landmarks").ledger.true_positions.copy()
 
     @property
     def true_poses(self) -> FloatArray:

@@ -197,14 +197,16 @@ def test_a_landmark_is_updated_in_the_particle_that_holds_it_only(proposal: Any,
 
 
 def test_what_is_handed_out_is_the_callers() -> None:
-    """Particles, weights and start poses are copies."""
+    """Particles, weights, poses and start poses are copies."""
     slam = filter_after(2)
-    for array in (*slam.particles(), slam.weights, slam.start_pose()):
+    for array in (*slam.particles(), slam.weights, slam.start_pose(), *slam.pose(), *slam.pose_from_start()):
         array += 1.0
     again = filter_after(2)
     np.testing.assert_array_equal(slam.particles()[0], again.particles()[0])
     np.testing.assert_array_equal(slam.weights, again.weights)
     np.testing.assert_array_equal(slam.start_pose(), again.start_pose())
+    assert_same(slam.pose(), again.pose())
+    assert_same(slam.pose_from_start(), again.pose_from_start())
 
 
 @PROPOSALS
@@ -267,7 +269,7 @@ def test_a_snapshot_shares_nothing_that_can_be_written(proposal: Any) -> None:
     state = slam.get_state()
     kept = copy.deepcopy(state)
     other.set_state(state)
-    in_use = [array for each in (slam, other) for array in [*arrays_of(each).values(), *arrays_in(each.pose())]]
+    in_use = [array for each in (slam, other) for array in [*arrays_of(each).values(), *arrays_in(each._estimates)]]
     for array in arrays_in(state):
         assert not any(held.flags.writeable and np.shares_memory(array, held) for held in in_use)
     for odometry, frames in inputs(8)[5:]:

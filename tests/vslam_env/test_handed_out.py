@@ -1,0 +1,79 @@
+"""What an environment hands out belongs to the caller: steps leave it as it was, and who writes to it changes nothing."""
+
+import copy
+import dataclasses
+import hashlib
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from digests import digest
+from small_env import MEETING, small_env, turning, wander
+
+from vslam_env import ExplorationEnv
+
+STEPS = {"continuous": 130, "discrete": 130, "goal": 25}  # two robots meet, and their maps are merged
+
+
+def _handed_out(env: ExplorationEnv, results: Any) -> list[Any]:
+    """Return all that a caller can hold after a step; of beliefs all but the grid, which is said to follow the robot."""
+    agents = env.possible_agents
+    beliefs = [env.belief(agent) for agent in agents]
+    rows = [{f.name: getattr(b, f.name) for f in dataclasses.fields(b) if f.name != "grid"} for b in beliefs]
+    truth = [env.true_poses, env.true_start_poses, env.true_landmarks, env.state()]
+    return [results, rows, [belief.map for belief in beliefs], truth, env.readings, env.events, env._standing]
+
+
+def _arrays(nest: Any) -> Iterator[np.ndarray]:
+    """Yield all arrays in nested dicts, sequences and records."""
+    if isinstance(nest, np.ndarray):
+        yield nest
+    elif isinstance(nest, dict):
+        yield from _arrays(list(nest.values()))
+    elif isinstance(nest, (list, tuple)):
+        for entry in nest:
+            yield from _arrays(entry)
+    elif dataclasses.is_dataclass(nest):
+        yield from _arrays([getattr(nest, field.name) for field in dataclasses.fields(nest)])
+
+
+def _episode(env: ExplorationEnv) -> Iterator[Any]:
+    """Yield what the reset and each step of an episode with a merge return."""
+    rng = np.random.default_rng(2)
+    yield env.reset(seed=5, options={"start_poses": MEETING})
+    for _ in range(STEPS[env.config.action_type]):
+        yield env.step(turning(env.agents) if env.config.action_type == "continuous" else wander(env, rng))
+
+
+@pytest.mark.parametrize("action_type", ["continuous", "goal"])
+def test_what_is_kept_stays_as_it_was(action_type: str) -> None:
+    """Nothing that was handed out lies in memory that later steps write to."""
+    env = small_env(action_type=action_type, max_cycles=200)
+    kept = []
+    for results in _episode(env):
+        held = _handed_out(env, results)
+        kept.append((held, copy.deepcopy(held)))
+    assert any(event.kind == "merge" for event in env.events)
+    for held, then in kept:
+        for one, other in zip(_arrays(held), _arrays(then), strict=True):
+            np.testing.assert_array_equal(one, other)
+        assert held[0][-1] == then[0][-1]  # infos
+
+
+@pytest.mark.parametrize("kind", [{}, {"observation_type": "flat"}, {"action_type": "goal"}])
+def test_who_writes_to_what_is_returned_changes_nothing(kind: dict[str, Any]) -> None:
+    """An episode goes on with the same bytes though all arrays that can be written were filled with ones.
+
+    But for `Standing`, which only reward terms see.
+    """
+    digests = []
+    for writes in (False, True):
+        env, said = small_env(max_cycles=200, **kind), hashlib.sha256()
+        for results in _episode(env):
+            digest(results, said)
+            for array in _arrays(_handed_out(env, results)[:-1]) if writes else ():
+                if array.flags.writeable:
+                    array.fill(1)
+        digests.append(said.hexdigest())
+    assert digests[0] == digests[1]
