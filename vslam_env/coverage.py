@@ -29,13 +29,10 @@ def _recount(changes: Any, cells: Any, places: Any, floor: Any, seen: Any, seers
     Returns:
         How many more floor cells are seen by some robot than before.
     """
-    more, flat = 0, cells.ravel()
-    for k in range(max(changes[0], 1)):
-        if changes[0] < 0:
-            first, last = 0, len(places)
-        elif changes[0] == 0:
-            first, last = 0, 0
-        else:
+    more, flat, all_may_have = 0, cells.ravel(), changes[0] < 0
+    for k in range(1 if all_may_have else changes[0]):
+        first, last = 0, len(places)
+        if not all_may_have:
             first, last = np.searchsorted(places, changes[1 + k]), np.searchsorted(places, changes[1 + k], "right")
         for i in range(first, last):
             now = flat[places[i]] == FREE

@@ -2,8 +2,15 @@
 
 import numpy as np
 
-from slam_backend._jit import jit
+from slam_backend._jit import inlined, jit
 from slam_backend.errors import FloatArray
+
+
+@inlined
+def _distance(px: float, py: float, ex: float, ey: float, square: float) -> float:
+    """Return how far (px, py) is from the line from the origin to (ex, ey), whose squared length is `square`."""
+    u = min(1.0, max(0.0, (px * ex + py * ey) / square))
+    return float(np.sqrt((px - u * ex) ** 2 + (py - u * ey) ** 2))
 
 
 @jit
@@ -20,9 +27,7 @@ def distances_to_walls(points: FloatArray, walls: FloatArray) -> FloatArray:
         square = ex * ex + ey * ey
         for p in range(len(points)):
             px, py = points[p, 0] - walls[i, 0], points[p, 1] - walls[i, 1]
-            u = min(1.0, max(0.0, (px * ex + py * ey) / square))
-            distance = np.sqrt((px - u * ex) ** 2 + (py - u * ey) ** 2)
-            nearest[p] = min(nearest[p], distance)
+            nearest[p] = min(nearest[p], _distance(px, py, ex, ey, square))
     return nearest
 
 
@@ -53,7 +58,5 @@ def clearance_raster(
             py = (row + 0.5) * cell - y1
             for column in range(first_column, last_column):
                 px = (column + 0.5) * cell - x1
-                u = min(1.0, max(0.0, (px * ex + py * ey) / square))
-                distance = np.sqrt((px - u * ex) ** 2 + (py - u * ey) ** 2)
-                clearance[row, column] = min(clearance[row, column], distance)
+                clearance[row, column] = min(clearance[row, column], _distance(px, py, ex, ey, square))
     return clearance

@@ -18,7 +18,7 @@ from vslam_env.navigation._painting_kernels.evidence import (
 from vslam_env.navigation._painting_kernels.rays import READINGS_FINE, fault_of_scan
 from vslam_env.navigation._painting_kernels.scans import paint_scan
 
-BAD_POSE = 3  # beside the faults of `paint_scan`
+BAD_POSE = 3  # beside what `fault_of_scan` finds
 
 
 @jit
