@@ -1,4 +1,4 @@
-"""What an environment hands out belongs to the caller: steps leave it as it was, and who writes to it changes nothing."""
+"""What an environment hands out is the caller's: steps leave it as it was, and who writes to it changes nothing."""
 
 import copy
 import dataclasses
@@ -17,7 +17,7 @@ STEPS = {"continuous": 130, "discrete": 130, "goal": 25}  # two robots meet, and
 
 
 def _handed_out(env: ExplorationEnv, results: Any) -> list[Any]:
-    """Return all that a caller can hold after a step; of beliefs all but the grid, which is said to follow the robot."""
+    """Return all that a caller can hold after a step; of beliefs all but the grid, which follows the robot."""
     agents = env.possible_agents
     beliefs = [env.belief(agent) for agent in agents]
     rows = [{f.name: getattr(b, f.name) for f in dataclasses.fields(b) if f.name != "grid"} for b in beliefs]
