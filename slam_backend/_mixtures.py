@@ -17,7 +17,7 @@ def pose_mixture(means: FloatArray, covariances: FloatArray, weights: FloatArray
     """Return mean and covariance of a weighted mixture of Gaussian poses; headings are averaged on the circle.
 
     Args:
-        means: (3, P) float64 [m, m, rad], P >= M.
+        means: (3, P) float64 [m, m, rad], P >= M whole blocks of lanes.
         covariances: (6, P) float64: xx, xy, xt, yy, yt, tt of each.
         weights: (M,) float64, summing to 1; lanes beyond M mean nothing.
 

@@ -1,9 +1,11 @@
 import numpy as np
 
-from slam_backend._kernels.start_frames import AT_ORIGIN, KNOWN, SPREAD, see_from_starts, start_kind
+from slam_backend._kernels import LANES
+from slam_backend._kernels.start_frames import AT_ORIGIN, KNOWN, SPREAD, own_frames, see_from_starts, start_kind
+from slam_backend._mixtures import pose_mixture
 from slam_backend._packed import UNPACK
 from slam_backend.filter import FastSlam
-from slam_backend.geometry import between, compose, rotation, wrap_angle
+from slam_backend.geometry import between, compose, inverse, rotate_covariances, rotation, wrap_angle
 from slam_backend.measurements import Measurements
 
 STARTS = np.array([[1.0, -2.0, 0.7], [4.0, 3.0, -2.0]])
@@ -76,3 +78,33 @@ def test_the_change_of_frame_is_that_of_matrices() -> None:
         np.testing.assert_allclose(spread[UNPACK, m], turn @ covariances[m] @ turn.T, atol=1e-12)
     assert not seen[:, 9:].any()
     assert not spread[:, 9:].any()
+
+
+def test_own_frames_are_the_plain_definition() -> None:
+    """Of robots that start at the origin, at a known place and at an unknown one; surplus lanes do not count."""
+    rng = np.random.default_rng(8)
+    count, best = 9, 4
+    starts, means = rng.uniform(-3.0, 3.0, (2, 3, 3, LANES))
+    starts[0, :, :count], starts[1, :, :count] = 0.0, STARTS[1][:, None]
+    roots = rng.normal(0.0, 0.3, (3, LANES, 3, 3))
+    matrices = roots @ roots.transpose(0, 1, 3, 2)
+    covariances = np.ascontiguousarray(matrices[:, :, *np.triu_indices(3)].transpose(0, 2, 1))
+    weights = rng.dirichlet(np.ones(count))
+    estimates = [pose_mixture(means[robot], covariances[robot], weights) for robot in range(3)]
+    poses, spreads = (np.array(parts) for parts in zip(*estimates, strict=True))
+    frames = np.empty((3, 3))
+    own_frames(starts, means, covariances, weights, best, poses, spreads, frames)
+
+    np.testing.assert_allclose(frames, inverse(starts[:, :, best]), atol=1e-15)
+    np.testing.assert_array_equal(poses[0], estimates[0].mean)
+    np.testing.assert_array_equal(spreads[0], estimates[0].covariance)
+    np.testing.assert_allclose(poses[1], between(STARTS[1], estimates[1].mean), atol=1e-12)
+    np.testing.assert_allclose(spreads[1], rotate_covariances(-STARTS[1, 2], estimates[1].covariance), atol=1e-12)
+    seen = between(starts[2].T, means[2].T)[:count]
+    turned = np.array([rotate_covariances(-starts[2, 2, m], matrices[2, m]) for m in range(count)])
+    mean = np.append(weights @ seen[:, :2], np.angle(weights @ np.exp(1j * seen[:, 2])))
+    off = seen - mean
+    off[:, 2] = wrap_angle(off[:, 2])
+    np.testing.assert_allclose(poses[2], mean, atol=1e-12)
+    covariance = np.einsum("m,mij->ij", weights, turned) + (weights * off.T) @ off
+    np.testing.assert_allclose(spreads[2], covariance, atol=1e-12)
