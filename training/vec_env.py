@@ -8,12 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
-from slam_backend import warm_up
 from slam_backend.errors import BoolArray, FloatArray, bad_argument, check_int
 from training.compiling import prepare
 from training.vec_slots import MASK, WHOLE, MakeEnv, SlotBatch, Stepped
 from training.vec_workers import SlotWorkers
-from vslam_env import vslam_v0
+from vslam_env import vslam_v0, warm_up
 from vslam_env.config import EnvConfig
 
 
@@ -45,7 +44,7 @@ def make_vec_env(
 
 
 def load_kernels(config: EnvConfig) -> None:
-    """Load or compile the kernels that the first steps of an environment need, then all of the backend."""
+    """Load or compile the kernels that an environment needs in its first steps, then those of later ones."""
     env = vslam_v0.parallel_env(config=config)
     env.reset(seed=0)
     for _ in range(min(2, config.max_cycles)):

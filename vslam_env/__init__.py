@@ -11,6 +11,7 @@ from vslam_env.config import EnvConfig
 from vslam_env.environment import ExplorationEnv
 from vslam_env.presets import preset_config, stereo_belief
 from vslam_env.snapshots import load_state, save_state
+from vslam_env.warming import warm_up
 from vslam_env.world import World
 
 __all__ = [
@@ -22,6 +23,7 @@ __all__ = [
     "preset_config",
     "save_state",
     "stereo_belief",
+    "warm_up",
 ]
 
 if hasattr(pettingzoo, "register"):  # since 1.27
