@@ -2,10 +2,15 @@
 
 The archive is that of UCSD's course ECE 276A: an extract of KITTI raw data (Geiger et al., IJRR 2013) whose features
 were tracked from frame to frame, so that a track's number is a landmark's identity. A track that ends never comes back.
+
+Where new features were sought, in 91 of the 1,106 frames of `0027.npz`, the archive has each old track just where it
+was in the frame before, while the car went on. The tracker goes on from that pixel, which shows another point of the
+world by then: what follows is a track of its own.
 """
 
 import zipfile
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,7 +31,8 @@ class KittiLog:
     Attributes:
         times: (T,) float64 [s]. Of the frames, strictly increasing.
         velocities: (T, 6) float64 [m/s, rad/s]. Linear, then angular velocity, axes of the unit: ahead, left, up.
-        tracks: T arrays (n,) int64. Numbers of the tracks that a frame shows.
+        tracks: T arrays (n,) int64. Numbers of the tracks that a frame shows: rows of the archive, and numbers beyond
+            these for what goes on after a track was held where it stood, see `number_tracks`.
         pixels: T arrays (n, 4) float64 [px]. Their column and row in the left image, then in the right one.
         focal_px: Focal length [px]; pixels are square.
         centre_px: (2,) float64 [px]. Column and row of the optical axis.
@@ -84,14 +90,15 @@ def load_kitti(path: str | Path, truth: str | Path | None = None, duration: floa
     _check(file, "cam_T_imu", rigid, "a 4 x 4 rigid motion")
     keep = int(np.searchsorted(times, end, side="right"))
     shown = [np.flatnonzero((features[:, :, k] != ABSENT).all(axis=0)) for k in range(keep)]
+    tracks = number_tracks(features, shown)
     velocities = np.concatenate([content["linear_velocity"], content["rotational_velocity"]]).T[:keep].copy()
     pixels = [features[:, rows, k].T.copy() for k, rows in enumerate(shown)]
-    for array in (times, velocities, *shown, *pixels):
+    for array in (times, velocities, *tracks, *pixels):
         array.setflags(write=False)
     return KittiLog(
         times=times[:keep],
         velocities=velocities,
-        tracks=tuple(shown),
+        tracks=tuple(tracks),
         pixels=tuple(pixels),
         focal_px=float(intrinsics[0, 0]),
         centre_px=intrinsics[:2, 2].copy(),
@@ -100,6 +107,27 @@ def load_kitti(path: str | Path, truth: str | Path | None = None, duration: floa
         mount=camera[:3, 3].copy(),
         truth=None if (poses := _find_truth(file, truth)) is None else read_truth(poses, times),
     )
+
+
+def number_tracks(features: FloatArray, shown: Sequence[IntArray]) -> list[IntArray]:
+    """Return the numbers of the tracks that each frame shows, new ones for those that were held where they stood.
+
+    Tracks are held in a frame that begins new ones and has all that it shares with the frame before at the same pixels,
+    to the last bit.
+
+    Args:
+        features: (4, m, T) float64 [px]. Of each track in each frame.
+        shown: Per frame the tracks (n,) that it shows.
+    """
+    numbers, free = np.arange(features.shape[1]), features.shape[1]
+    result: list[IntArray] = []
+    for frame, rows in enumerate(shown):
+        old = np.intersect1d(shown[frame - 1], rows) if frame else rows
+        if 0 < len(old) < len(rows) and np.array_equal(features[:, old, frame - 1], features[:, old, frame]):
+            numbers[old] = np.arange(free, free + len(old))
+            free += len(old)
+        result.append(numbers[rows])
+    return result
 
 
 def _find(path: Path) -> Path:

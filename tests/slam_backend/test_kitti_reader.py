@@ -52,6 +52,23 @@ def test_frames_hold_the_tracks_they_show(tmp_path: Path) -> None:
     assert len(load_kitti(tmp_path, duration=0.15).times) == 2
 
 
+def test_tracks_that_were_held_where_they_stood_are_new_ones(tmp_path: Path) -> None:
+    """Only where others begin and all stand, to the last bit; if one moves, or none begins, all keep their numbers."""
+    features = np.full((4, 4, FRAMES), ABSENT)
+    features[:, :2, :] = 100.0 + np.arange(FRAMES)
+    features[:, 2, 2:] = 200.0 + np.arange(2, FRAMES)
+    features[:, :2, 2] = features[:, :2, 1]  # the third begins, the others are held
+    features[:, :3, 3] = features[:, :3, 2]  # all stand still, and none begins
+    features[:, 3, 4] = 300.0
+    features[:, :2, 4] = features[:, :2, 3]  # the fourth begins, and two stand still, but the third moves
+    log = load_kitti(_write(tmp_path, features=features))
+    assert [rows.tolist() for rows in log.tracks] == [[0, 1], [0, 1], [4, 5, 2], [4, 5, 2], [4, 5, 2, 3]]
+    features[:, 2, 4] = features[:, 2, 3]
+    log = load_kitti(_write(tmp_path, features=features))
+    assert log.tracks[4].tolist() == [6, 7, 8, 3]
+    np.testing.assert_array_equal(log.pixels[4], features[:, :, 4].T)
+
+
 def test_true_poses_are_flattened(tmp_path: Path) -> None:
     """Ahead in the image is x, right is -y; a turn to the left is positive. Rows may begin with a time."""
     _write(tmp_path)
