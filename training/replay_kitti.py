@@ -24,6 +24,8 @@ DEAD_ZONE = 1e9
 RECOVERY_POSITION = 0.0
 LOOP_AFTER = 100.0  # [m] driven before a place counts as seen again
 LOOP_WITHIN = 10.0  # [m] between two poses of one place
+SEGMENTS = range(100, 801, 100)  # [m] over which KITTI compares motions, from every `SEGMENT_EVERY`th pose
+SEGMENT_EVERY = 10
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,6 +74,7 @@ class KittiScore:
         odometry: Score of dead reckoning.
         loop: Steps (earlier, later) at which the car was at one place again, nearest of all; None if it never was.
         loop_error: Error [m] of the estimated motion between these two steps; NaN if there are none.
+        drifts: Mean errors of the motions over segments, of the estimate and of dead reckoning; see `mean_drift`.
     """
 
     truth: FloatArray
@@ -81,6 +84,7 @@ class KittiScore:
     odometry: PositionScore
     loop: tuple[int, int] | None
     loop_error: float
+    drifts: tuple[float, float]
 
 
 def replay(log: KittiLog, config: KittiConfig, on_step: Callable[[float], None] = lambda done: None) -> OneReplay:
@@ -121,7 +125,32 @@ def score(result: OneReplay, log: KittiLog) -> KittiScore | None:
     if loop is not None:
         motions = [between(path[loop[0]], path[loop[1]]) for path in (paths[0], truth)]
         error = float(np.hypot(*(motions[0] - motions[1])[:2]))
-    return KittiScore(truth, paths[0], paths[1], scores[0], scores[1], loop, error)
+    drifts = (mean_drift(paths[0], truth), mean_drift(paths[1], truth))
+    return KittiScore(truth, paths[0], paths[1], scores[0], scores[1], loop, error, drifts)
+
+
+def mean_drift(path: FloatArray, truth: FloatArray) -> float:
+    """Return the mean error of the estimated motion over segments of the true path, as a share of their lengths.
+
+    Segments are of 100, 200, ..., 800 m, and weigh alike (Geiger, Lenz, Urtasun, CVPR 2012).
+
+    Args:
+        path: (T, 3) float64 [m, m, rad]. Estimate, any frame.
+        truth: (n, 3) float64 [m, m, rad]. At the first n <= T steps, any frame.
+
+    Returns:
+        The share; NaN if the true path is shorter than 100 m.
+    """
+    driven = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(truth[:, :2], axis=0).T))])
+    errors = [np.empty(0)]
+    for length in SEGMENTS:
+        first = np.arange(0, len(truth), SEGMENT_EVERY)
+        last = np.searchsorted(driven, driven[first] + length)
+        first, last = first[last < len(truth)], last[last < len(truth)]
+        off = between(between(truth[first], truth[last]), between(path[first], path[last]))
+        errors.append(np.hypot(off[:, 0], off[:, 1]) / length)
+    found = np.concatenate(errors)
+    return float(found.mean()) if len(found) else float("nan")
 
 
 def find_loop(truth: FloatArray) -> tuple[int, int] | None:
@@ -138,5 +167,7 @@ def summarise(result: OneReplay, scored: KittiScore | None) -> dict[str, Any]:
     own = {
         "true_path_m": path_length(scored.truth) if scored else float("nan"),
         "loop_error_m": scored.loop_error if scored else float("nan"),
+        "mean_drift": scored.drifts[0] if scored else float("nan"),
+        "dead_reckoning_mean_drift": scored.drifts[1] if scored else float("nan"),
     }
     return metrics_of(result, (scored.estimate, scored.odometry) if scored else None, own)

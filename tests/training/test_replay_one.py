@@ -12,7 +12,7 @@ from slam_backend.readers.velocities import integrate_commands
 from slam_backend.readers.victoria import load_victoria
 from slam_backend.readers.victoria_steps import axle_velocities, steps
 from slam_backend.trajectory import Trajectory
-from training.replay_kitti import KittiConfig, find_loop
+from training.replay_kitti import KittiConfig, find_loop, mean_drift
 from training.replay_kitti import replay as replay_kitti
 from training.replay_kitti import score as score_kitti
 from training.replay_kitti import summarise as summarise_kitti
@@ -115,6 +115,20 @@ def test_a_loop_is_the_place_that_is_passed_twice() -> None:
     assert np.hypot(*(circle[loop[0]] - circle[loop[1]])[:2]) < 1.0
     assert loop[1] - loop[0] in (100, 101)
     assert find_loop(circle[:80]) is None
+
+
+def test_drift_is_a_share_of_the_way_in_any_frame() -> None:
+    """A path 3 % too long drifts by that, wherever it starts; one that turns, by the chord; a short one has none."""
+    along = np.arange(0.0, 351.0)
+    truth = np.column_stack([along, np.zeros_like(along), np.zeros_like(along)])
+    assert mean_drift(compose(np.array([5.0, -2.0, 0.7]), truth * [1.03, 1.0, 1.0]), truth) == pytest.approx(0.03)
+    turned = np.where(along < 120.0, 0.0, 0.1)  # after 120 m all goes aside
+    bent = np.column_stack([np.cumsum(np.cos(turned)), np.cumsum(np.sin(turned)), turned])
+    starts, lengths = np.arange(0.0, 351.0, 10.0), np.array([100.0, 200.0, 300.0])
+    aside = np.clip(starts + lengths[:, None] - 119.0, 0.0, lengths[:, None]) * (starts < 120.0)
+    shares = (2.0 * np.sin(0.05) * aside / lengths[:, None])[starts + lengths[:, None] <= 350.0]
+    assert mean_drift(bent, truth) == pytest.approx(shares.mean(), rel=1e-6)
+    assert np.isnan(mean_drift(truth[:90], truth[:90]))
 
 
 def test_positions_are_scored_before_and_after_the_fit() -> None:
