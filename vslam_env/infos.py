@@ -25,23 +25,31 @@ def infos_of(
         terms: (K,) by name: what each term of the reward has paid for the step.
         invalid: Per robot 1 if its action was masked.
     """
-    robots = len(agents)
-    columns: dict[str, Sequence[Any]] = {
-        "map_error": standing.map_errors.tolist(),
-        "map_rmse": standing.map_rmses.tolist(),
-        "map_recall": standing.map_recalls.tolist(),
-        "map_precision": standing.map_precisions.tolist(),
-        "pose_error": standing.pose_errors.tolist(),
-        "heading_error": standing.heading_errors.tolist(),
-        "coverage": [standing.coverage] * robots,
-        "group": [group[0] for group in groups],
-        "group_size": [len(group) for group in groups],
-        "merges": [standing.merges] * robots,
-        "collisions": standing.collisions.tolist(),
-        "distance": standing.distances.tolist(),
-        "bytes_sent": standing.bytes_sent.tolist(),
-        "invalid_action": invalid,
-    }
-    columns |= {f"reward/{name}": paid.tolist() for name, paid in terms.items()}
-    rows = zip(*columns.values(), strict=True)
-    return {agent: dict(zip(columns, row, strict=True)) for agent, row in zip(agents, rows, strict=True)}
+    errors, rmses = standing.map_errors.tolist(), standing.map_rmses.tolist()
+    recalls, precisions = standing.map_recalls.tolist(), standing.map_precisions.tolist()
+    pose_errors, heading_errors = standing.pose_errors.tolist(), standing.heading_errors.tolist()
+    collisions, distances = standing.collisions.tolist(), standing.distances.tolist()
+    bytes_sent = standing.bytes_sent.tolist()
+    paid = [(f"reward/{name}", values.tolist()) for name, values in terms.items()]
+    infos: dict[str, dict[str, Any]] = {}
+    for robot, agent in enumerate(agents):
+        group = groups[robot]
+        infos[agent] = info = {
+            "map_error": errors[robot],
+            "map_rmse": rmses[robot],
+            "map_recall": recalls[robot],
+            "map_precision": precisions[robot],
+            "pose_error": pose_errors[robot],
+            "heading_error": heading_errors[robot],
+            "coverage": standing.coverage,
+            "group": group[0],
+            "group_size": len(group),
+            "merges": standing.merges,
+            "collisions": collisions[robot],
+            "distance": distances[robot],
+            "bytes_sent": bytes_sent[robot],
+            "invalid_action": invalid[robot],
+        }
+        for name, values in paid:
+            info[name] = values[robot]
+    return infos
