@@ -57,10 +57,13 @@ def preview(
     """Draw worlds of some seeds, with landmarks and start poses, into one picture."""
     import imageio.v3 as imageio
 
+    from slam_backend.errors import bad_argument
     from training.compiling import compilation_shown
     from training.run_folder import check_writable
     from training.worlds_survey import contact_sheet
 
+    if out.suffix.lower() != ".png":
+        raise bad_argument("out", "a name that ends in .png", str(out), "Pictures are written as PNG.")
     check_writable(out, "out")
     with compilation_shown(Console(stderr=True)):
         picture = contact_sheet(world, first_seed, seeds, robots)
@@ -79,10 +82,11 @@ def validate(
     from rich.table import Table
 
     from slam_backend.errors import check_int
-    from training.worlds_survey import survey
+    from training.worlds_survey import survey_all
 
     check_int("seeds", seeds, 1, "Check one world or more.")
-    found = [survey(world, seed, robots) for seed in range(first_seed, first_seed + seeds)]
+    check_int("first_seed", first_seed, 0, "Use 0 or a positive number.")
+    found = survey_all(world, range(first_seed, first_seed + seeds), robots)
     table = Table("figure", "least", "most", title=f"{found[0].name}: {seeds} of {seeds} worlds are sound")
     for title, values in (
         ("walls", [float(each.walls) for each in found]),

@@ -1,5 +1,6 @@
 """What worlds are like: their figures, and pictures of several side by side."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -62,6 +63,21 @@ def survey(world: str, world_seed: int, robots: int = 3) -> WorldFigures:
         height_m=y_max - y_min,
         start_gap_m=float(gaps.min(initial=np.inf)),
     )
+
+
+def survey_all(world: str, world_seeds: Iterable[int], robots: int) -> list[WorldFigures]:
+    """Build the worlds of some seeds and start robots in each.
+
+    Raises:
+        ValueError: If that is not possible; the text says why, what to do, and for which seed.
+    """
+    found = []
+    for seed in world_seeds:
+        try:
+            found.append(survey(world, seed, robots))
+        except ValueError as error:
+            raise ValueError(f"{error} That was world seed {seed}, after {len(found)} sound ones.") from error
+    return found
 
 
 def contact_sheet(world: str, first_seed: int, count: int, robots: int) -> NDArray[np.uint8]:

@@ -16,7 +16,9 @@ def why_no_window() -> str:
     except ImportError:
         return "pygame is not installed. Install the extra: pip install 'vslam-env[viz]'"
     named = any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER"))
-    return "" if named or sys.platform in ("win32", "darwin") else "there is no screen. Use render_mode='rgb_array'"
+    if named or sys.platform in ("win32", "darwin"):
+        return ""
+    return "there is no screen. Without one, render_mode='rgb_array' gives pictures and `vslam run` a video"
 
 
 class Window:

@@ -65,6 +65,9 @@ def test_import_and_validate(tmp_path: Path) -> None:
     [
         (["validate", "castle"], "world: expected one of 'office'"),
         (["validate", "fig5", "--robots", "40"], "num_robots"),
+        (["validate", "fig5", "--robots", "40", "--first-seed", "4"], "world seed 4, after 0 sound ones"),
+        (["validate", "fig5", "--first-seed", "-1"], "first_seed: expected an int >= 0"),
+        (["preview", "fig5", "--out", "worlds.txt"], "out: expected a name that ends in .png, got 'worlds.txt'"),
         (["validate", "fig5", "--seeds", "0"], "seeds: expected an int >= 1"),
         (["list", "--seeds", "0"], "seeds: expected an int >= 1"),
         (["import", "PLAN", "plan.txt"], "out: expected a name that ends in .json"),
