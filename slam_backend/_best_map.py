@@ -56,10 +56,14 @@ def _gather(
 @jit
 def _outline(
     ids: Any, row_of: Any, map_of: Any, maps: Any, values: Any, counts: Any, m: int, min_count: int, lanes: int,
-    means: Any, variances: Any, times: Any, names: Any,
+    means: Any, variances: Any, times: Any, names: Any, n: int,
 ) -> tuple[int, bool]:  # fmt: skip
-    """Write what particle m holds with at least so many measurements; return how many, and whether ids ascend."""
-    n, last, ascending, padded = 0, -1, True, counts.shape[1]
+    """Write from row n on what particle m holds with at least so many measurements.
+
+    Returns:
+        The row after the last, and whether ids ascend.
+    """
+    last, ascending, padded = -1, True, counts.shape[1]
     for slot in range(len(ids)):
         if ids[slot] >= 0:
             row, place = row_of[slot], maps[map_of[slot], m] if map_of[slot] > 0 else m
@@ -75,19 +79,27 @@ def _outline(
     return n, ascending
 
 
-def best_outline(maps: ParticleMaps, m: int, min_count: int) -> MapOutline:
-    """Return the outline of `best_map`, which takes the same: the same landmarks in the same order. Fresh arrays."""
-    room = len(maps.ids)
-    means, variances = np.empty((room, 3)), np.empty(room)
-    times, names = np.empty(room, np.int64), np.empty(room, np.int64)
-    n, ascending = _outline(
-        maps.ids, maps.row_of, maps.map_of, maps.maps, maps.values, maps.counts, m, min_count, LANES,
-        means, variances, times, names,
-    )  # fmt: skip
-    if ascending:
-        return MapOutline(means[:n], variances[:n], times[:n], names[:n])
-    order = np.argsort(names[:n])
-    return MapOutline(means[order], variances[order], times[order], names[order])
+def write_outline(maps: ParticleMaps, m: int, min_count: int, rows: MapOutline, first: int) -> int:
+    """Write the outline of `best_map`, which takes the same: the same landmarks in the same order.
+
+    Args:
+        maps: Of all particles.
+        m: Which of them.
+        min_count: What it measured fewer times, 1 at least, is left out.
+        rows: Written to; at most as many of them as `maps` has slots.
+        first: From this row on.
+
+    Returns:
+        The row after the last.
+    """
+    last, ascending = _outline(
+        maps.ids, maps.row_of, maps.map_of, maps.maps, maps.values, maps.counts, m, min_count, LANES, *rows, first
+    )
+    if not ascending:
+        order = first + np.argsort(rows.ids[first:last])
+        for column in rows:
+            column[first:last] = column[order]
+    return last
 
 
 def slots_held(maps: ParticleMaps, m: int, min_count: int) -> IntArray:

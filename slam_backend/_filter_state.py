@@ -9,7 +9,7 @@ import numpy as np
 from slam_backend._existence_step import ExistenceStep
 from slam_backend._frame_buffers import FrameBuffers, Frames
 from slam_backend._map_store import aligned
-from slam_backend._mixtures import pose_mixture
+from slam_backend._mixtures import pose_mixtures
 from slam_backend._particle_maps import ParticleMaps
 from slam_backend._rejuvenated_maps import write_maps
 from slam_backend._rejuvenation_step import RejuvenationStep
@@ -17,7 +17,7 @@ from slam_backend._turns import Assumed
 from slam_backend.errors import IntArray, bad_argument, check_int, check_seed
 from slam_backend.filter_options import FilterOptions
 from slam_backend.input_log import RobotInput
-from slam_backend.reports import PoseEstimate, StepReport
+from slam_backend.reports import PoseEstimates, StepReport
 from slam_backend.run_log import RobotLog
 from slam_backend.smoothing.holding import add_share
 from slam_backend.smoothing.rejuvenation import Particles
@@ -45,7 +45,7 @@ class FilterState:
         _log_weights: (M,) since the last resampling, normalised; `_weights` (M,) as the last step left them.
         _path_log_weights: (M,) accumulated along the ancestral line (Eq. 12).
         _maps: The landmarks of all particles.
-        _estimates: Per robot its pose over all particles, as of the last step.
+        _estimates: The poses of all robots over all particles, as of the last step; never written to afterwards.
         _logs: Per robot what it did and measured, and which landmarks that was taken for.
         _steps: Number of the next step.
         _rng: The filter's own random stream.
@@ -77,7 +77,7 @@ class FilterState:
         self._steps = 0
         self._logs = [RobotLog() for _ in range(k)]
         self._buffers = FrameBuffers(k, padded)
-        self._estimates = [self._mixture(robot) for robot in range(k)]
+        self._estimates = self._mixtures()
 
     @property
     def best_particle(self) -> int:
@@ -94,15 +94,14 @@ class FilterState:
         """M."""
         return self._maps.num_particles
 
-    def _mixture(self, robot: int) -> PoseEstimate:
-        """Return a robot's pose over all particles, map frame."""
-        return pose_mixture(self._means[robot], self._covariances[robot], self._weights)
+    def _mixtures(self) -> PoseEstimates:
+        """Return the robots' poses over all particles, map frame. Fresh arrays."""
+        return pose_mixtures(self._means, self._covariances, self._weights)
 
     def _widen(self) -> None:
         """Give the estimates of the poses, as the particles show them, their share of what these do not show."""
         if self._frame.item(0) or self._frame.item(-1):
-            for estimate in self._estimates:
-                add_share(self._frame, estimate.mean[None], estimate.covariance[None])
+            add_share(self._frame, *self._estimates)
 
     def _look_at_starts(self) -> None:
         """Take note of whether all robots start at the origin of the map frame; asked for when that was written."""
@@ -135,7 +134,7 @@ class FilterState:
         self._blind.fill(False)
         self._log_weights[:], self._path_log_weights[:] = new.log_weights, new.log_densities
         self._weights[:] = np.exp(new.log_weights)
-        self._estimates = [PoseEstimate(*of_robot) for of_robot in zip(new.means, new.covariances, strict=True)]
+        self._estimates = PoseEstimates(new.means, new.covariances)
 
     def reorder(self, order: IntArray) -> None:
         """Renumber the robots: robot i becomes the one that was `order[i]`; (K,) a permutation."""
@@ -144,7 +143,7 @@ class FilterState:
             array[:] = array[order]
         self._blind = self._blind[order]
         self._logs = [self._logs[robot] for robot in order]
-        self._estimates = [self._estimates[robot] for robot in order]
+        self._estimates = PoseEstimates(*(of_all[order] for of_all in self._estimates))
         if self._rejuvenation is not None:
             self._rejuvenation.reorder(order)
 
@@ -164,7 +163,7 @@ class FilterState:
                     buffers.noises[first:last] if size and buffers.given[robot] else None,
                 )  # fmt: skip
                 if smoother is not None:
-                    smoother.note(robot, step, self._estimates[robot], exact is not None)
+                    smoother.note(robot, step, self._estimates.means[robot], exact is not None)
                     if names is None and frame is not None and report.num_rejected:
                         smoother.note_refused(robot, step, ids, frame.descriptors)
             first = last
@@ -174,8 +173,7 @@ class FilterState:
     def get_state(self) -> dict[str, Any]:
         """Return all that decides how the filter goes on, its random stream included. Shares nothing with it."""
         state: dict[str, Any] = {name: getattr(self, name).copy() for name in KEPT}
-        estimates = tuple(map(copied, self._estimates))
-        state |= {"steps": self._steps, "estimates": estimates, "maps": self._maps.get_state()}
+        state |= {"steps": self._steps, "estimates": self._estimates.copy(), "maps": self._maps.get_state()}
         state["logs"] = tuple(log.get_state() for log in self._logs)
         if self._rejuvenation is not None:
             state["rejuvenation"] = self._rejuvenation.get_state()
@@ -202,12 +200,7 @@ class FilterState:
             log.set_state(logged)
         if self._rejuvenation is not None:
             self._rejuvenation.set_state(state["rejuvenation"])
-        self._steps, self._estimates = state["steps"], list(map(copied, state["estimates"]))
+        self._steps, self._estimates = state["steps"], state["estimates"].copy()
         # A stream of its own: the old one may be the caller's, or of another kind.
         self._rng = np.random.Generator(getattr(np.random, state["rng"]["bit_generator"])(0))
         self._rng.bit_generator.state = state["rng"]
-
-
-def copied(estimate: PoseEstimate) -> PoseEstimate:
-    """Return the same estimate in arrays of its own."""
-    return PoseEstimate(estimate.mean.copy(), estimate.covariance.copy())

@@ -53,7 +53,7 @@ def _join_poses(
 def finish(joint: FastSlam, a: FastSlam, b: FastSlam, renamed: IntArray) -> None:
     """Give a joint filter, whose map is loaded, its step count, estimates and logs; `renamed` as of `merge_filters`."""
     joint._steps = max(a._steps, b._steps)
-    joint._estimates = [joint._mixture(robot) for robot in range(joint.num_robots)]
+    joint._estimates = joint._mixtures()
     joint._widen()
     joint._logs = [log.copy() for log in a._logs] + [log.renamed(renamed[:, 0], renamed[:, 1]) for log in b._logs]
     if joint._rejuvenation is not None and a._rejuvenation is not None and b._rejuvenation is not None:

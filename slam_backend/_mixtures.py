@@ -10,23 +10,24 @@ from slam_backend._jit import any_order, jit
 from slam_backend._kernels.layout import SHIFT
 from slam_backend._particle_maps import ParticleMaps
 from slam_backend.errors import FloatArray, IntArray
-from slam_backend.reports import PoseEstimate
+from slam_backend.reports import PoseEstimates
 
 
-def pose_mixture(means: FloatArray, covariances: FloatArray, weights: FloatArray) -> PoseEstimate:
-    """Return mean and covariance of a weighted mixture of Gaussian poses; headings are averaged on the circle.
+def pose_mixtures(means: FloatArray, covariances: FloatArray, weights: FloatArray) -> PoseEstimates:
+    """Return means and covariances of weighted mixtures of Gaussian poses; headings are averaged on the circle.
 
     Args:
-        means: (3, P) float64 [m, m, rad], P >= M whole blocks of lanes.
-        covariances: (6, P) float64: xx, xy, xt, yy, yt, tt of each.
+        means: (K, 3, P) float64 [m, m, rad], P >= M whole blocks of lanes.
+        covariances: (K, 6, P) float64: xx, xy, xt, yy, yt, tt of each.
         weights: (M,) float64, summing to 1; lanes beyond M mean nothing.
 
     Returns:
-        Both in the frame of `means`.
+        All in the frame of `means`. Fresh arrays.
     """
-    mean, covariance = np.empty(3), np.empty((3, 3))
-    _kernels.mixture(means, covariances, weights, mean, covariance)
-    return PoseEstimate(mean, covariance)
+    mixed = PoseEstimates(np.empty((len(means), 3)), np.empty((len(means), 3, 3)))
+    for robot in range(len(means)):
+        _kernels.mixture(means[robot], covariances[robot], weights, mixed.means[robot], mixed.covariances[robot])
+    return mixed
 
 
 @any_order

@@ -15,7 +15,6 @@ from slam_backend.errors import FloatArray, IntArray
 from slam_backend.filter_options import FilterOptions
 from slam_backend.geometry import compose
 from slam_backend.log_arrays import LogArrays
-from slam_backend.reports import PoseEstimate
 from slam_backend.run_log import RobotLog
 from slam_backend.smoothing.extending import first_rows
 from slam_backend.smoothing.graph import PathGraph
@@ -60,15 +59,15 @@ class RejuvenationStep:
 
     # ------------------------------------------------------------------ in each step
 
-    def note(self, robot: int, step: int, estimate: PoseEstimate, exact: bool) -> None:
-        """Remember where a robot that read something was thought to be, or that it was told so."""
+    def note(self, robot: int, step: int, pose: FloatArray, exact: bool) -> None:
+        """Remember where a robot that read something was thought to be (3,), or that it was told so."""
         if exact:
             self._exact = True
             for guesses, refused in zip(self._guesses, self._refused, strict=True):
                 guesses.clear()
                 refused.clear()
         if not self._exact:
-            self._guesses[robot][step] = estimate.mean
+            self._guesses[robot][step] = pose
 
     def note_refused(self, robot: int, step: int, ids: IntArray, descriptors: NDArray[np.float32]) -> None:
         """Remember what was neither matched nor new of all that a robot measured without names: ids (n,), looks."""

@@ -14,7 +14,7 @@ from slam_backend._particle_maps import ParticleMaps
 from slam_backend.errors import BoolArray, FloatArray, IntArray
 from slam_backend.filter_options import FilterOptions
 from slam_backend.geometry import compose
-from slam_backend.reports import PoseEstimate, StepReport
+from slam_backend.reports import PoseEstimates, StepReport
 
 
 class Assumed(NamedTuple):
@@ -119,8 +119,8 @@ def conclude(
     weights: tuple[FloatArray, FloatArray, FloatArray],
     believed: tuple[FloatArray, FloatArray],
     threshold: float,
-) -> tuple[StepReport, list[PoseEstimate]]:
-    """Weigh the particles after all turns, and return the report of the step and each robot's pose.
+) -> tuple[StepReport, PoseEstimates]:
+    """Weigh the particles after all turns, and return the report of the step and the robots' poses.
 
     Args:
         frames: What the robots saw.
@@ -141,10 +141,10 @@ def conclude(
     nis = squares / judged if judged else math.nan
     rest = (num_new, num_matched, given - num_new - num_matched, ess, nis, used > 0 and ess <= threshold)
     if robots == 1:
-        return StepReport((associations,), (created,), *rest), [PoseEstimate(means[0], covariances[0])]
+        return StepReport((associations,), (created,), *rest), PoseEstimates(means, covariances)
     ends = list(accumulate(frames.sizes))
     report = StepReport(tuple(_split(associations, ends)), tuple(_split(created, ends)), *rest)
-    return report, list(map(PoseEstimate, means, covariances))
+    return report, PoseEstimates(means, covariances)
 
 
 def _split(values: IntArray, ends: Sequence[int]) -> list[IntArray]:

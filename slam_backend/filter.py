@@ -112,7 +112,7 @@ class FastSlam(FilterKnowledge):
             self._poses[:, 2] = wrap_angle(self._poses[:, 2])
             self._starts[:] = self._means[:] = self._poses
             self._look_at_starts()
-            self._estimates = [self._mixture(robot) for robot in range(num_robots)]
+            self._estimates = self._mixtures()
 
     @classmethod
     def from_options(

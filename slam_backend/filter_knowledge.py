@@ -1,23 +1,23 @@
 """What a filter knows: poses, particles, maps, logs. `FastSlam` adds what changes them."""
 
-from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend import _kernels
-from slam_backend._best_map import best_map, best_outline, slots_held
-from slam_backend._filter_state import FilterState, copied
+from slam_backend._best_map import best_map, slots_held, write_outline
+from slam_backend._filter_state import FilterState
 from slam_backend._mixtures import map_mixture
 from slam_backend.errors import FloatArray, IntArray, bad_argument, check_choice
-from slam_backend.geometry import between, inverse
+from slam_backend.geometry import between
 from slam_backend.landmark_map import LandmarkMap, MapOutline
 from slam_backend.reports import PoseEstimate
 from slam_backend.run_log import RobotLog
 from slam_backend.smoothing.holding import of_points
+from slam_backend.standpoints import Standpoints, filter_rows
 
-FROM_ORIGIN = inverse(np.zeros((1, 3)))  # the motion to a start frame that is the map frame
+NO_WEIGHTS = np.empty(0)  # nobody asks for them where all particles start at the same place
 
 
 class FilterKnowledge(FilterState):
@@ -33,6 +33,11 @@ class FilterKnowledge(FilterState):
         """Landmarks that the most probable particle holds: the length of `map()`."""
         slots = np.flatnonzero(self._maps.ids >= 0)
         return int(np.count_nonzero(self._maps.of_particle(self.best_particle, slots)[1]))
+
+    @property
+    def map_room(self) -> int:
+        """Landmarks for which there is room: no particle holds more."""
+        return len(self._maps.ids)
 
     @property
     def descriptor_size(self) -> int:
@@ -59,7 +64,7 @@ class FilterKnowledge(FilterState):
 
         They are those of the mixture of N(x^, P^) before sampling, which scatters less than the samples.
         """
-        return copied(self._estimates[self._check_robot(robot)])
+        return self._estimates.of(self._check_robot(robot))
 
     def particles(self, robot: int = 0) -> tuple[FloatArray, FloatArray]:
         """Return a robot's poses (M, 3) [m, m, rad], map frame, and the normalised log-weights (M,). Copies."""
@@ -75,22 +80,16 @@ class FilterKnowledge(FilterState):
         Each particle's pose is seen from where the robot started in that particle, so that what the filter does not
         know of the start, after a merge, does not blur it.
         """
-        return copied(self._own_frames()[0][self._check_robot(robot)])
+        index, every = self._check_robot(robot), tuple(range(self.num_robots))
+        points = Standpoints.unwritten(len(every))
+        self._stand(every, every, 1.0, points)
+        return PoseEstimate(points.own[index], points.covariances[index])
 
-    def _own_frames(self) -> tuple[Sequence[PoseEstimate], FloatArray]:
-        """Return what `pose_from_start` does for each robot, and the motions (K, 3) from the map frame to the starts.
-
-        The latter [m, m, rad] are those of the most probable particle. The estimates may be the filter's own.
-        """
-        robots = self.num_robots
-        if self._from_origin:  # the map frame is their own start frame
-            return self._estimates, np.repeat(FROM_ORIGIN, robots, axis=0)
-        poses, spreads, frames = np.empty((robots, 3)), np.empty((robots, 3, 3)), np.empty((robots, 3))
-        for robot, estimate in enumerate(self._estimates):
-            poses[robot], spreads[robot] = estimate
-        of_particles = (self._starts, self._means, self._covariances, self.weights, self.best_particle)
-        _kernels.own_frames(*of_particles, poses, spreads, frames)
-        return list(map(PoseEstimate, poses, spreads)), frames
+    def _stand(self, names: tuple[int, ...], live: tuple[int, ...], ess: float, points: Standpoints) -> None:
+        """Write where the robots stand, which the team calls by these names, of those that are live; `ess` as it is."""
+        weights = NO_WEIGHTS if self._from_origin else self.weights
+        of_particles = self._starts, self._means, self._covariances, weights, self.best_particle, self._from_origin
+        _kernels.stand(*of_particles, *self._estimates, *filter_rows(names, live), ess, *points)
 
     def particles_from_start(self, robot: int = 0) -> FloatArray:
         """Return a robot's poses (M, 3) [m, m, rad], each seen from where it started in that particle."""
@@ -128,8 +127,13 @@ class FilterKnowledge(FilterState):
         return np.asarray(self._maps.descriptors[slots_held(self._maps, self.best_particle, 1)])
 
     def outline(self, min_count: int = 1) -> MapOutline:
-        """Return the outline of `map(min_count=min_count)`, much faster."""
-        return best_outline(self._maps, self.best_particle, max(min_count, 1))
+        """Return the outline of `map(min_count=min_count)`, much faster. Fresh arrays."""
+        rows = MapOutline.unwritten(len(self._maps.ids))
+        return rows.part(0, self._outline(min_count, rows, 0))
+
+    def _outline(self, min_count: int, rows: MapOutline, first: int) -> int:
+        """Write `outline` from this row on; return the row after the last."""
+        return write_outline(self._maps, self.best_particle, max(min_count, 1), rows, first)
 
     def existence(self) -> tuple[IntArray, FloatArray]:
         """Return the ids (n,) of the landmarks of `map()`, ascending, and the probability (n,) that each exists.

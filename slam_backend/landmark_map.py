@@ -2,6 +2,7 @@
 
 import zipfile
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, Self
@@ -33,6 +34,39 @@ class MapOutline(NamedTuple):
     variances: FloatArray
     counts: IntArray
     ids: IntArray
+
+    @classmethod
+    def unwritten(cls, room: int) -> Self:
+        """Return room for so many landmarks."""
+        return cls(np.empty((room, 3)), np.empty(room), np.empty(room, np.int64), np.empty(room, np.int64))
+
+    def part(self, first: int, last: int) -> Self:
+        """Return these landmarks alone; it shares memory with this."""
+        own = slice(first, last)
+        return type(self)(self.means[own], self.variances[own], self.counts[own], self.ids[own])
+
+
+class TeamOutlines(NamedTuple):
+    """The outlines of the maps that the robots of a team go by, one after the other in arrays of one piece.
+
+    Attributes:
+        rows: The landmarks of all maps; those in no part mean nothing.
+        parts: (K, 2) int64. Where each robot's map begins in `rows`, and where it ends; robots of one filter share one.
+    """
+
+    rows: MapOutline
+    parts: IntArray
+
+    @classmethod
+    def joined(cls, outlines: Sequence[MapOutline]) -> Self:
+        """Return these, one for each robot, behind one another."""
+        ends = np.cumsum([len(outline.ids) for outline in outlines])
+        rows = MapOutline(*map(np.concatenate, zip(*outlines, strict=True)))
+        return cls(rows, np.column_stack([np.concatenate([[0], ends[:-1]]), ends]).astype(np.int64))
+
+    def of(self, robot: int) -> MapOutline:
+        """Return that of one robot; it shares memory with this."""
+        return self.rows.part(*self.parts[robot])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -21,6 +21,26 @@ class PoseEstimate(NamedTuple):
     covariance: FloatArray
 
 
+class PoseEstimates(NamedTuple):
+    """Gaussian summaries of the poses of several robots, all in one frame or each in its own.
+
+    Attributes:
+        means: (K, 3) float64 [m, m, rad].
+        covariances: (K, 3, 3) float64 [m, m, rad].
+    """
+
+    means: FloatArray
+    covariances: FloatArray
+
+    def copy(self) -> "PoseEstimates":
+        """Return the same in arrays of their own."""
+        return PoseEstimates(self.means.copy(), self.covariances.copy())
+
+    def of(self, robot: int) -> PoseEstimate:
+        """Return that of one robot. A copy."""
+        return PoseEstimate(self.means[robot].copy(), self.covariances[robot].copy())
+
+
 class StepReport(NamedTuple):
     """What one step of `FastSlam` did.
 

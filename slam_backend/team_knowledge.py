@@ -1,7 +1,6 @@
 """What a team of filters knows: groups, poses, maps, diagnostics. `TeamSlam` adds what changes them."""
 
-from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 
@@ -9,31 +8,10 @@ from slam_backend.branches import Branch, restored_filter
 from slam_backend.errors import FloatArray, IntArray, bad_argument
 from slam_backend.geometry import inverse
 from slam_backend.groups import Group
-from slam_backend.landmark_map import LandmarkMap, MapOutline
+from slam_backend.landmark_map import LandmarkMap, MapOutline, TeamOutlines
 from slam_backend.records import Records
 from slam_backend.reports import MergeEvent, PoseEstimate
-
-
-class Standpoint(NamedTuple):
-    """What a robot goes by, as the methods of `TeamKnowledge` tell it one by one.
-
-    Attributes:
-        members: See `members`.
-        mates: See `mates`.
-        number: Of its map, see `maps`.
-        poses: Of all members in the map frame, as its filter knows them.
-        own_pose: In its own start frame.
-        start_from_group: (3,) [m, m, rad]. See `start_from_group`.
-        ess: Effective sample size of its filter, as a share of M.
-    """
-
-    members: tuple[int, ...]
-    mates: tuple[int, ...]
-    number: int
-    poses: Sequence[PoseEstimate]
-    own_pose: PoseEstimate
-    start_from_group: FloatArray
-    ess: float
+from slam_backend.standpoints import Standpoints
 
 
 class TeamKnowledge:
@@ -74,8 +52,17 @@ class TeamKnowledge:
     @property
     def maps(self) -> tuple[int, ...]:
         """Per robot the number of the map that it goes by; see `TeamReport`."""
-        self._place(0)
-        return tuple([branch.number for _, branch, _ in self._places])
+        return tuple([branch.number for _, branch, _ in self._placed()])
+
+    @property
+    def all_members(self) -> list[tuple[int, ...]]:
+        """Per robot its `members`."""
+        return [branch.robots for _, branch, _ in self._placed()]
+
+    @property
+    def all_mates(self) -> list[tuple[int, ...]]:
+        """Per robot its `mates`."""
+        return [branch.live for _, branch, _ in self._placed()]
 
     @property
     def diagnostics(self) -> tuple[dict[str, float], ...]:
@@ -182,22 +169,27 @@ class TeamKnowledge:
         branch, index = self._find(robot)
         return inverse(branch.filter.start_pose(index))
 
-    def outline(self, robot: int, min_count: int = 1) -> MapOutline:
-        """Return the outline of `map(robot, min_count=min_count)`, much faster."""
-        return self._find(robot)[0].filter.outline(min_count)
+    def outlines(self, min_count: int = 1) -> TeamOutlines:
+        """Return the outlines of `map(robot, min_count=min_count)` of all robots, much faster. Fresh arrays."""
+        branches = [branch for group in self._groups for branch in group.branches]
+        rows = MapOutline.unwritten(sum([branch.filter.map_room for branch in branches]))
+        parts, first = np.empty((self._num_robots, 2), np.int64), 0
+        for branch in branches:
+            last = branch.filter._outline(min_count, rows, first)
+            for robot in branch.live:
+                parts[robot] = first, last
+            first = last
+        return TeamOutlines(rows, parts)
 
-    def standpoints(self) -> list[Standpoint]:
-        """Return where each robot stands, all at once."""
-        points: dict[int, Standpoint] = {}
+    def standpoints(self) -> Standpoints:
+        """Return where all robots stand: `pose_from_start`, `start_from_group`, `pose` at once. Fresh arrays."""
+        points = Standpoints.unwritten(self._num_robots)
         for group in self._groups:
             for branch in group.branches:
-                slam, report, robots, live = branch.filter, branch.report, branch.robots, branch.live
-                own_poses, frames = slam._own_frames()
+                slam, report = branch.filter, branch.report
                 ess = 1.0 if report is None else report.ess / slam.num_particles
-                for robot, own_pose, frame in zip(robots, own_poses, frames, strict=True):
-                    if robot in live:
-                        points[robot] = Standpoint(robots, live, branch.number, slam._estimates, own_pose, frame, ess)
-        return [points[robot] for robot in range(self._num_robots)]
+                slam._stand(branch.robots, branch.live, ess, points)
+        return points
 
     def _group_of(self, robot: int) -> Group:
         """Return the robot's group."""
@@ -207,14 +199,18 @@ class TeamKnowledge:
         """Return the branch that the robot goes by, and its place in it."""
         return self._place(robot)[1:]
 
-    def _place(self, robot: int) -> tuple[Group, Branch, int]:
-        """Return the robot's group, the branch that it goes by, and its place in that."""
+    def _placed(self) -> list[tuple[Group, Branch, int]]:
+        """Return each robot's group, the branch that it goes by, and its place in that."""
         if not self._places:
             branches = [(group, branch) for group in self._groups for branch in group.branches]
             places = {r: (group, branch, branch.robots.index(r)) for group, branch in branches for r in branch.live}
             self._places = [places[r] for r in range(self._num_robots)]
+        return self._places
+
+    def _place(self, robot: int) -> tuple[Group, Branch, int]:
+        """Return what `_placed` does of one robot."""
         if type(robot) is int and 0 <= robot < self._num_robots:
-            return self._places[robot]
+            return self._placed()[robot]
         if isinstance(robot, (int, np.integer)) and not isinstance(robot, bool) and 0 <= robot < self._num_robots:
-            return self._places[robot]
+            return self._placed()[robot]
         raise bad_argument("robot", f"an index from 0 to {self.num_robots - 1}", robot, "Count robots from 0.")

@@ -62,7 +62,7 @@ def warm_up() -> float:
         team = TeamSlam(2, num_particles=4, attempts=AttemptOptions(every=1), merging=MergeOptions(watch_every=1))
         for _ in range(STEPS):
             team.step([None, None], [plain, plain])
-        team.standpoints(), team.outline(1)
+        team.standpoints(), team.outlines()
         own = team.map(0)
         map_error(own.means, names, points)
         align_maps(own, own, "clique")

@@ -11,14 +11,13 @@ from slam_backend.alignment import Alignment
 from slam_backend.errors import FloatArray, IntArray, bad_argument
 from slam_backend.filter_options import FilterOptions
 from slam_backend.geometry import rotate_covariances
-from slam_backend.landmark_map import LandmarkMap, MapOutline
+from slam_backend.landmark_map import LandmarkMap, TeamOutlines
 from slam_backend.reports import MergeEvent, Renaming, TeamReport
 from slam_backend.team import TeamSlam
-from vslam_env.navigation import CandidateSlots, TeamGrids
+from vslam_env.navigation import TeamGrids, TeamSlots
 from vslam_env.readings import Readings
-from vslam_env.robot_belief import Belief, BeliefConfig, Body, Candidates, Glimpse, Teammate
+from vslam_env.robot_belief import Belief, BeliefConfig, Body, Candidates, Teammate, View
 from vslam_env.shared_grids import SharedGrids
-from vslam_env.team_poses import TeamPoses, position_sigmas
 
 __all__ = ["Belief", "BeliefConfig", "Body", "Candidates", "TeamBelief", "Teammate"]
 
@@ -56,12 +55,14 @@ class TeamBelief:
         self._team = TeamSlam(num_robots, config.alignment, seed, rhythm, merging, **options)
         self._decision_ticks = decision_ticks
         self._grids = SharedGrids(num_robots, body)
-        self._slots = [CandidateSlots() for _ in range(num_robots)]
+        self._candidates = TeamSlots(num_robots)
+        self._slots = self._candidates.slots
+        self._robots = np.arange(num_robots)
         self._tick = -1
         self._confirm_after = config.confirm_after
         self._beliefs: dict[int, Belief] = {}  # of this tick, made when asked for
         self._maps: dict[int, LandmarkMap] = {}  # of this tick, by the number of the map
-        self._outlines: dict[int, MapOutline] = {}  # likewise
+        self._outlines: TeamOutlines | None = None  # likewise
         self._look_up_poses()
 
     @property
@@ -87,12 +88,12 @@ class TeamBelief:
     @property
     def poses(self) -> FloatArray:
         """(K, 3) float64 [m, m, rad]. Where each robot believes to be, in its own start frame. A copy."""
-        return self._poses.own.copy()
+        return self._points.own.copy()
 
     @property
     def position_sigmas(self) -> FloatArray:
         """(K,) float64 [m]. One sigma of each robot's position in its own start frame, averaged over directions."""
-        return position_sigmas(self._poses.covariances)
+        return self._points.sigmas.diagonal().copy()
 
     def step(self, readings: Sequence[Readings]) -> TeamReport:
         """Take in one tick's readings of all K robots; the first ones are those of the reset.
@@ -113,12 +114,12 @@ class TeamBelief:
         self._tick += 1
         self._look_up_poses()
         self._grids.follow(self._tick, report.entries, report.renamings)
-        poses = self._poses
-        self._grids.meet(poses.mates, poses.starts)
-        self._grids.paint(self._tick, poses.mate_poses, readings)
+        points = self._points
+        self._grids.meet(self._team.all_mates, points.starts)
+        self._grids.paint(self._tick, points.poses, readings)
         for robot in range(self.num_robots):
             if self._candidates_are_due(robot):
-                self._slots[robot].update(self._grids[robot].cells, poses.own[robot], poses.others[robot].poses[:, :2])
+                self._slots[robot].update(self._grids[robot].cells, points.own[robot], self._mates_around(robot))
         return report
 
     def merge(self, robot_a: int, robot_b: int, alignment: Alignment, known: bool = False) -> Renaming:
@@ -126,12 +127,12 @@ class TeamBelief:
         renaming = self._team.merge(robot_a, robot_b, alignment, known)
         self._look_up_poses()
         self._grids.keep(self._tick + 1, renaming)
-        self._grids.meet(self._poses.mates, self._poses.starts)
+        self._grids.meet(self._team.all_mates, self._points.starts)
         return renaming
 
     def group(self, robot: int) -> tuple[int, ...]:
         """Return the robots that share a map with this one, as far as it knows, itself included."""
-        return self._poses.points[robot].members
+        return self._members[robot]
 
     def speaker(self, group: tuple[int, ...]) -> int:
         """Return the first robot of a group that goes by its joint filter, and so can merge it with another."""
@@ -143,22 +144,22 @@ class TeamBelief:
 
     def group_map(self, robot: int) -> LandmarkMap:
         """Return the confirmed landmarks of a robot's group, in the group's map frame."""
-        number = self._poses.points[robot].number
+        number = self._team.maps[robot]
         if number not in self._maps:
             self._maps[number] = self._team.map(robot, min_count=self._confirm_after)
         return self._maps[number]
 
-    def outline(self, robot: int) -> MapOutline:
-        """Return the outline of `group_map`, much faster."""
-        number = self._poses.points[robot].number
-        if number not in self._outlines:
-            self._outlines[number] = self._team.outline(robot, self._confirm_after)
-        return self._outlines[number]
+    @property
+    def outlines(self) -> TeamOutlines:
+        """The outlines of the `group_map` of all robots, much faster; to be looked at."""
+        if self._outlines is None:
+            self._outlines = self._team.outlines(self._confirm_after)
+        return self._outlines
 
     @property
     def starts_from_group(self) -> FloatArray:
-        """(K, 3) float64 [m, m, rad]. The motion from its group's map frame to each robot's own start frame. A copy."""
-        return self._poses.starts.copy()
+        """(K, 3) float64 [m, m, rad]. The motion from its group's map frame to each robot's own start frame."""
+        return self._points.starts
 
     @property
     def grids(self) -> TeamGrids:
@@ -175,25 +176,22 @@ class TeamBelief:
             self._beliefs[robot] = self._make_belief(robot)
         return self._beliefs[robot]
 
-    def glimpse(self, robot: int) -> Glimpse:
-        """Return the part of a robot's belief that its observation shows; it shares memory with the filters."""
-        point, others = self._poses.points[robot], self._poses.others[robot]
-        own = point.own_pose
-        features, valid = self._slots[robot].described(own.mean, others.poses)
-        return Glimpse(
-            robot=robot,
-            group_size=len(point.members),
-            pose=own.mean,
-            covariance=own.covariance,
-            ess=point.ess,
-            start_from_group=point.start_from_group,
-            outline=self.outline(robot),
-            cells=self._grids[robot].cells,
+    def view(self) -> View:
+        """Return what observations show of all robots' beliefs; it shares memory with the grids."""
+        points = self._points
+        features, valid = self._candidates.described(points.poses)
+        return View(
+            robots=self._robots,
+            poses=points.poses,
+            sigmas=points.sigmas,
+            own=points.own,
+            covariances=points.covariances,
+            starts=points.starts,
+            ess=points.ess,
+            outlines=self.outlines,
+            cells=self._grids.team.cells,
             features=features,
             valid=valid,
-            mates=others.robots,
-            mate_poses=others.poses,
-            mate_sigmas=others.sigmas,
         )
 
     def get_state(self) -> dict[str, Any]:
@@ -221,45 +219,52 @@ class TeamBelief:
     def _look_up_poses(self) -> None:
         """Take note of the groups and poses after a step or a merge, and forget what was derived from those before."""
         self._groups = self._team.groups
-        self._poses = TeamPoses(self._team.standpoints())
+        self._members = self._team.all_members
+        self._points = self._team.standpoints()
         self._beliefs.clear()
         self._maps.clear()
-        self._outlines.clear()
+        self._outlines = None
+
+    def _others(self, robot: int) -> list[int]:
+        """Return the other robots that a robot knows of, ascending."""
+        return [mate for mate in self._members[robot] if mate != robot]
+
+    def _mates_around(self, robot: int) -> FloatArray:
+        """Return where a robot believes these to be (n, 2) [m], in its own start frame."""
+        return self._points.poses[robot, self._others(robot), :2]
 
     def _teammates(self, robot: int) -> tuple[Teammate, ...]:
         """Return the other robots that a robot knows of; one out of contact is where it was when contact was lost."""
-        point, others = self._poses.points[robot], self._poses.others[robot]
-        covariances = [
-            rotate_covariances(point.start_from_group[2], estimate.covariance)
-            for mate, estimate in zip(point.members, point.poses, strict=True)
-            if mate != robot
-        ]
-        return tuple(map(Teammate, others.robots.tolist(), others.poses, covariances))
+        points, team = self._points, self._team
+        turn = float(points.starts[robot, 2])
+        return tuple(
+            Teammate(mate, points.poses[robot, mate], rotate_covariances(turn, team.pose(mate, robot).covariance))
+            for mate in self._others(robot)
+        )
 
     def _make_belief(self, robot: int) -> Belief:
         """Put together what `belief` returns."""
-        point, slots = self._poses.points[robot], self._slots[robot]
-        own, group = point.own_pose, point.members
+        points, slots, group = self._points, self._slots[robot], self._members[robot]
         return Belief(
             robot=robot,
             tick=self._tick,
             frame=group[0],
             group=group,
-            pose=own.mean,
-            covariance=own.covariance,
+            pose=points.own[robot],
+            covariance=points.covariances[robot],
             particles=self._team.particles_from_start(robot),
             log_weights=self._team.particles(robot)[1],
-            ess=point.ess,
+            ess=float(points.ess[robot]),
             grid=self._grids[robot].frozen(),
             candidates=Candidates(
                 goals=slots.goals,
                 headings=slots.headings,
                 lengths=slots.lengths,
                 valid=slots.valid,
-                features=slots.features(own.mean, self._poses.others[robot].poses[:, :2]),
+                features=slots.features(points.own[robot], self._mates_around(robot)),
             ),
             teammates=self._teammates(robot),
-            start_from_group=point.start_from_group,
+            start_from_group=points.starts[robot],
             group_map=self.group_map(robot),
         )
 

@@ -122,9 +122,7 @@ class Episode:
     def standing(self) -> Standing:
         """Return how the team stands now: its maps and poses are scored."""
         belief, poses = self.belief, self._simulator.poses
-        outlines = [belief.outline(robot) for robot in range(len(poses))]
-        placed = compose(self.true_starts, belief.starts_from_group)  # where its own estimates put each map
-        maps = self.ledger.scores(outlines, placed)
+        maps = self.ledger.scores(belief.outlines, belief.starts_from_group, self.true_starts)
         distances, turns = pose_errors(self.true_starts, self.estimated_path[-1], poses)
         coverage, found = self._coverage.update(belief.grids, poses)
         return Standing(

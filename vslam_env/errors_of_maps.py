@@ -6,9 +6,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from slam_backend._jit import jit
+from slam_backend._jit import inlined, jit
 from slam_backend.errors import FloatArray, IntArray, check_float
-from slam_backend.landmark_map import LandmarkMap, MapOutline
+from slam_backend.landmark_map import TeamOutlines
 from slam_backend.reports import LandmarksCreated, MapCopied, MapDropped, Renaming, TeamReport
 
 FALSE, UNCOUNTED = -1, -2
@@ -34,41 +34,33 @@ class MapScores(NamedTuple):
     placed: FloatArray
 
 
-@jit
+@inlined
 def _score(
-    robot: int,
-    means: FloatArray,
-    ids: IntArray,
-    book: IntArray,
-    poses: FloatArray,
-    truths: FloatArray,
-    cutoff: float,
-    scores: FloatArray,
-) -> None:
-    """Write a robot's column of scores (5, K), the rows of which are `MapScores`.
+    means: FloatArray, claims: IntArray, x0: float, y0: float, turn: float, truths: FloatArray, least: FloatArray,
+    cutoff: float, scores: FloatArray,
+) -> None:  # fmt: skip
+    """Write a robot's scores (5,), in the order of `MapScores`.
 
     Args:
-        robot: Its index.
         means: (n, 3) [m]. Of the landmarks of its map.
-        ids: (n,) int64. Theirs.
-        book: What landmark i claims stands at `book[ids[i]]`.
-        poses: (K, 3) [m, m, rad]. Robot by robot, what moves its means to the frame of the truths.
+        claims: (n,) int64. What these claim.
+        x0, y0, turn: The motion [m, m, rad] of its means to the frame of the truths.
         truths: (N, 3) [m], N >= 1.
+        least: (N,) overwritten: the squared distance of the nearest landmark that claims each, else infinite.
         cutoff: c of the map error [m].
         scores: Written to.
     """
-    least = np.full(len(truths), np.inf)
-    pose = poses[robot]
-    c, s = math.cos(pose[2]), math.sin(pose[2])
+    least[:] = np.inf
+    c, s = math.cos(turn), math.sin(turn)
     estimated = surplus = 0
     for i in range(len(means)):
-        claim = book[ids[i]]
+        claim = claims[i]
         estimated += claim != UNCOUNTED
         if claim == FALSE:
             surplus += 1
         elif claim >= 0:
-            x = pose[0] + c * means[i, 0] - s * means[i, 1] - truths[claim, 0]
-            y = pose[1] + s * means[i, 0] + c * means[i, 1] - truths[claim, 1]
+            x = x0 + c * means[i, 0] - s * means[i, 1] - truths[claim, 0]
+            y = y0 + s * means[i, 0] + c * means[i, 1] - truths[claim, 1]
             z = means[i, 2] - truths[claim, 2]
             surplus += least[claim] < np.inf
             least[claim] = min(least[claim], x * x + y * y + z * z)
@@ -84,11 +76,35 @@ def _score(
         else:
             total += 0.5 * cutoff * cutoff
     count = len(truths)
-    scores[0, robot] = math.sqrt(total / count)
-    scores[1, robot] = math.sqrt(squares / matched) if matched else cutoff
-    scores[2, robot] = matched / count
-    scores[3, robot] = matched / max(estimated, 1)
-    scores[4, robot] = placed / count
+    scores[0] = math.sqrt(total / count)
+    scores[1] = math.sqrt(squares / matched) if matched else cutoff
+    scores[2] = matched / count
+    scores[3] = matched / max(estimated, 1)
+    scores[4] = placed / count
+
+
+@jit
+def _score_all(
+    means: FloatArray, claims: IntArray, parts: IntArray, starts: FloatArray, true_starts: FloatArray,
+    truths: FloatArray, cutoff: float, scores: FloatArray,
+) -> None:  # fmt: skip
+    """Write the scores (5, K) of all robots.
+
+    Args:
+        means, claims, parts: (N, 3), (N,), (K, 2). Of `TeamOutlines`, with what each landmark claims.
+        starts, true_starts: As `ClaimLedger.scores` takes them.
+        truths, cutoff: As in `_score`.
+        scores: Written to.
+    """
+    least, own_scores = np.empty(len(truths)), np.empty(len(scores))
+    for robot in range(len(starts)):
+        own = slice(parts[robot, 0], parts[robot, 1])
+        x, y, theta = starts[robot]
+        c, s = math.cos(true_starts[robot, 2]), math.sin(true_starts[robot, 2])
+        x0 = true_starts[robot, 0] + c * x - s * y
+        y0 = true_starts[robot, 1] + s * x + c * y
+        _score(means[own], claims[own], x0, y0, true_starts[robot, 2] + theta, truths, least, cutoff, own_scores)
+        scores[:, robot] = own_scores
 
 
 class ClaimLedger:
@@ -151,17 +167,20 @@ class ClaimLedger:
         """Return the claims (n,) int64 of landmarks of a robot's map: index of the true one, -1 false, -2 no matter."""
         return self._claims[self._map_of[robot]][ids]
 
-    def scores(self, maps: Sequence[LandmarkMap | MapOutline], world_from_group: FloatArray) -> MapScores:
-        """Score the robots' maps.
+    def scores(self, outlines: TeamOutlines, starts: FloatArray, true_starts: FloatArray) -> MapScores:
+        """Score the robots' maps where their own estimates put them.
 
         Args:
-            maps: Of each of the K robots, or the outline of it, in its map frame.
-            world_from_group: (K, 3) [m, m, rad]. Through the robot's own start frame and its true start pose.
+            outlines: Of the maps of the K robots, in their map frames.
+            starts: (K, 3) [m, m, rad]. The motion from its map frame to each robot's own start frame, as it believes.
+            true_starts: (K, 3) [m, m, rad]. The true start poses, in the frame of the true positions.
         """
-        scores = np.empty((len(MapScores._fields), len(maps)))
-        for robot, (held, number) in enumerate(zip(maps, self._map_of, strict=True)):
-            book = self._claims[number]
-            _score(robot, held.means, held.ids, book, world_from_group, self.true_positions, self.cutoff, scores)
+        (means, _, _, ids), parts = outlines
+        claims = np.empty(len(ids), np.int64)
+        for number, first, last in set(zip(self._map_of, *parts.T.tolist(), strict=True)):
+            claims[first:last] = self._claims[number][ids[first:last]]
+        scores = np.empty((len(MapScores._fields), len(starts)))
+        _score_all(means, claims, parts, starts, true_starts, self.true_positions, self.cutoff, scores)
         return MapScores(*scores)
 
     def get_state(self) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""The picture of its surroundings that a robot observes: 48 x 48 cells around it, turned so that ahead is up."""
+"""The pictures of their surroundings that robots observe: 48 x 48 cells around each, turned so that ahead is up."""
 
 import math
 from typing import Any
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from slam_backend._jit import jit
 from vslam_env.navigation import CELL, FREE, GRID_SIZE, OCCUPIED, UNKNOWN
-from vslam_env.robot_belief import Glimpse
+from vslam_env.robot_belief import View
 
 SIZE = 48
 CHANNELS = ("free", "occupied", "landmarks")
@@ -67,13 +67,21 @@ def _paint(cells: Any, pose: Any, start_from_group: Any, means: Any, local: Any)
             local[2, row, col] = MARK
 
 
-def local_grid(glimpse: Glimpse) -> NDArray[np.uint8]:
-    """Return the robot's surroundings as it believes them to be.
+@jit
+def _paint_all(cells: Any, poses: Any, starts: Any, means: Any, parts: Any, local: Any) -> None:
+    """Write what `local_grids` returns; the arguments are named as in `View`."""
+    for k in range(len(poses)):
+        _paint(cells[k], poses[k], starts[k], means[parts[k, 0] : parts[k, 1]], local[k])
+
+
+def local_grids(view: View) -> NDArray[np.uint8]:
+    """Return the robots' surroundings as they believe them to be.
 
     Returns:
-        (3, 48, 48) uint8, robot frame, cells of 0.2 m that are 0 or 255. Channels free, occupied, landmarks. Rows go
-        from 4.8 m ahead to 4.8 m behind, columns from 4.8 m to the left to 4.8 m to the right. A fresh array.
+        (n, 3, 48, 48) uint8, robot frames, cells of 0.2 m that are 0 or 255. Channels free, occupied, landmarks. Rows
+        go from 4.8 m ahead to 4.8 m behind, columns from 4.8 m to the left to 4.8 m to the right. A fresh array.
     """
-    local = np.empty((len(CHANNELS), SIZE, SIZE), np.uint8)
-    _paint(glimpse.cells, glimpse.pose, glimpse.start_from_group, glimpse.outline.means, local)
+    local = np.empty((len(view.own), len(CHANNELS), SIZE, SIZE), np.uint8)
+    rows, parts = view.outlines
+    _paint_all(view.cells, view.own, view.starts, rows.means, parts, local)
     return local

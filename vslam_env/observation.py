@@ -5,7 +5,7 @@
 | `pose` | (3,) | x, y [m], theta [rad], start frame | +-30, pi |
 | `pose_std` | (3,) | one sigma of each [m, m, rad] | 30, pi |
 | `map_stats` | (6,) | landmarks; mean and largest one sigma [m]; mean count; ESS / M; group size | `MAP_STATS_LIMIT` |
-| `local_grid` | (3, 48, 48) uint8 | see `local_grid` | 0, 255 |
+| `local_grid` | (3, 48, 48) uint8 | see `local_grids` | 0, 255 |
 | `scan` | (R,) | ranges from right to left [m] | range of the scan |
 | `candidates` | (16, 5) | see `CandidateSlots.features` [m] | +-90 |
 | `teammates` | (7, 5) | x, y [m], cos and sin of the heading, robot frame; one sigma of the position [m] | +-90 |
@@ -25,9 +25,9 @@ from numpy.typing import NDArray
 
 from slam_backend._jit import jit
 from slam_backend.errors import FloatArray
-from vslam_env.local_grid import CHANNELS, MARK, SIZE, local_grid
+from vslam_env.local_grid import CHANNELS, MARK, SIZE, local_grids
 from vslam_env.navigation.candidate_slots import NUM_SLOTS
-from vslam_env.robot_belief import Belief, Glimpse
+from vslam_env.robot_belief import Belief, View
 
 MOST_TEAMMATES = 7
 NUM_ACTIONS = 1 + NUM_SLOTS
@@ -49,42 +49,46 @@ def observe(belief: Belief, scan: FloatArray, goal_actions: bool) -> Observation
     Returns:
         Fresh arrays by name, as the table of this module says.
     """
-    return observe_glimpse(Glimpse.of(belief), scan, goal_actions)
+    return observed(View.of(belief), scan[None], goal_actions)[0]
 
 
-def observe_glimpse(glimpse: Glimpse, scan: FloatArray, goal_actions: bool) -> Observation:
-    """Return what `observe` returns, from the part of the belief that it shows."""
-    numbers, candidates = np.empty(12, np.float32), glimpse.features
-    teammates, present = np.zeros((MOST_TEAMMATES, 5), np.float32), np.zeros(MOST_TEAMMATES, np.int8)
+def observed(view: View, scans: FloatArray, goal_actions: bool) -> list[Observation]:
+    """Return the observations of some robots.
+
+    Args:
+        view: What they show of the robots' beliefs.
+        scans: (n, R) float64 [m]. The robots' last scans.
+        goal_actions: Whether actions are candidates, and are masked.
+
+    Returns:
+        Per robot what `observe` returns, in memory that nothing else uses.
+    """
+    count = len(view.robots)
+    numbers, candidates = np.empty((count, 12), np.float32), view.features
+    teammates, present = np.zeros((count, MOST_TEAMMATES, 5), np.float32), np.zeros((count, MOST_TEAMMATES), np.int8)
+    rows, parts = view.outlines
     _fill(
-        glimpse.pose,
-        glimpse.covariance,
-        glimpse.outline.variances,
-        glimpse.outline.counts,
-        glimpse.ess,
-        glimpse.group_size,
-        glimpse.robot,
-        glimpse.mates,
-        glimpse.mate_poses,
-        glimpse.mate_sigmas,
-        numbers,
-        candidates,
-        teammates,
-        present,
-    )
-    observation: Observation = {
-        "pose": numbers[:3],
-        "pose_std": numbers[3:6],
-        "map_stats": numbers[6:],
-        "local_grid": local_grid(glimpse),
-        "scan": scan.astype(np.float32),
-        "candidates": candidates,
-        "teammates": teammates,
-        "teammates_mask": present,
-    }
+        view.robots, view.poses, view.sigmas, view.own, view.covariances, view.ess, rows.variances, rows.counts, parts,
+        numbers, candidates, teammates, present,
+    )  # fmt: skip
+    pictures, ranges = local_grids(view), scans.astype(np.float32)
+    observations: list[Observation] = [
+        {
+            "pose": numbers[k, :3],
+            "pose_std": numbers[k, 3:6],
+            "map_stats": numbers[k, 6:],
+            "local_grid": pictures[k],
+            "scan": ranges[k],
+            "candidates": candidates[k],
+            "teammates": teammates[k],
+            "teammates_mask": present[k],
+        }
+        for k in range(count)
+    ]
     if goal_actions:
-        observation["action_mask"] = action_mask(glimpse.valid)
-    return observation
+        for observation, valid in zip(observations, view.valid, strict=True):
+            observation["action_mask"] = action_mask(valid)
+    return observations
 
 
 def action_mask(valid: NDArray[np.int8]) -> NDArray[np.int8]:
@@ -143,66 +147,51 @@ def _clip(value: float, low: float, high: float) -> Any:
 
 @jit
 def _fill(
-    pose: Any,
-    covariance: Any,
-    variances: Any,
-    counts: Any,
-    ess: float,
-    group_size: int,
-    robot: int,
-    mates: Any,
-    mate_poses: Any,
-    mate_sigmas: Any,
-    numbers: Any,
-    candidates: Any,
-    teammates: Any,
-    present: Any,
-) -> None:
-    """Write the parts of an observation that are neither a picture nor a scan.
+    robots: Any, poses: Any, sigmas: Any, own: Any, covariances: Any, ess: Any, variances: Any, counts: Any, parts: Any,
+    numbers: Any, candidates: Any, teammates: Any, present: Any,
+) -> None:  # fmt: skip
+    """Write the parts of observations that are neither pictures nor scans.
 
     Args:
-        pose: As in `Glimpse`, like all up to `mate_sigmas`.
-        covariance: The same.
-        variances: (N,) float64 [m^2]. Traces of the landmarks' covariances.
-        counts: (N,) int64.
-        ess: The same.
-        group_size: The same.
-        robot: The same.
-        mates: The same.
-        mate_poses: The same.
-        mate_sigmas: The same.
-        numbers: (12,) float32: `pose`, `pose_std`, `map_stats`. Written to, as all that follow.
-        candidates: (16, 5) float32, as they are without bounds.
-        teammates: (7, 5) float32, zeros before.
-        present: (7,) int8, zeros before.
+        robots, poses, sigmas, own, covariances, ess: As in `View`.
+        variances, counts, parts: (N,) float64 [m^2], (N,) int64, (n, 2) int64. Of its outlines.
+        numbers: (n, 12) float32: `pose`, `pose_std`, `map_stats`. Written to, as all that follow.
+        candidates: (n, 16, 5) float32, as they are without bounds.
+        teammates: (n, 7, 5) float32, zeros before.
+        present: (n, 7) int8, zeros before.
     """
-    for i in range(3):
-        numbers[i] = _clip(pose[i], -POSE_LIMIT[i], POSE_LIMIT[i])
-        numbers[3 + i] = _clip(math.sqrt(covariance[i, i]), 0.0, POSE_LIMIT[i])
-    mean = largest = seen = 0.0
-    for k in range(len(counts)):
-        sigma = math.sqrt(variances[k] / 3.0)
-        mean += sigma / len(counts)
-        largest = max(largest, sigma)
-        seen += counts[k] / len(counts)
-    numbers[6] = _clip(len(counts), 0.0, MAP_STATS_LIMIT[0])
-    numbers[7] = _clip(mean, 0.0, MAP_STATS_LIMIT[1])
-    numbers[8] = _clip(largest, 0.0, MAP_STATS_LIMIT[2])
-    numbers[9] = _clip(seen, 0.0, MAP_STATS_LIMIT[3])
-    numbers[10] = _clip(ess, 0.0, MAP_STATS_LIMIT[4])
-    numbers[11] = _clip(group_size, 0.0, MAP_STATS_LIMIT[5])
-    for i in range(len(candidates)):
-        for j in range(5):
-            candidates[i, j] = _clip(candidates[i, j], -FAR, FAR)
-    c, s = math.cos(pose[2]), math.sin(pose[2])
-    for m in range(len(mates)):
-        row = mates[m] - (mates[m] > robot)
-        dx, dy = mate_poses[m, 0] - pose[0], mate_poses[m, 1] - pose[1]
-        turn = mate_poses[m, 2] - pose[2]
-        teammates[row, 0], teammates[row, 1] = _clip(c * dx + s * dy, -FAR, FAR), _clip(c * dy - s * dx, -FAR, FAR)
-        teammates[row, 2], teammates[row, 3] = np.float32(math.cos(turn)), np.float32(math.sin(turn))
-        teammates[row, 4] = _clip(mate_sigmas[m], -FAR, FAR)
-        present[row] = 1
+    for k in range(len(robots)):
+        row, pose = numbers[k], own[k]
+        for i in range(3):
+            row[i] = _clip(pose[i], -POSE_LIMIT[i], POSE_LIMIT[i])
+            row[3 + i] = _clip(math.sqrt(covariances[k, i, i]), 0.0, POSE_LIMIT[i])
+        first, last = parts[k]
+        mean = largest = seen = 0.0
+        for landmark in range(first, last):
+            sigma = math.sqrt(variances[landmark] / 3.0)
+            mean += sigma / (last - first)
+            largest = max(largest, sigma)
+            seen += counts[landmark] / (last - first)
+        c, s = math.cos(pose[2]), math.sin(pose[2])
+        group_size = 1
+        for mate in range(poses.shape[1]):
+            if mate != robots[k] and not np.isnan(poses[k, mate, 0]):
+                group_size += 1
+                to, place = teammates[k, mate - (mate > robots[k])], poses[k, mate]
+                dx, dy, turn = place[0] - pose[0], place[1] - pose[1], place[2] - pose[2]
+                to[0], to[1] = _clip(c * dx + s * dy, -FAR, FAR), _clip(c * dy - s * dx, -FAR, FAR)
+                to[2], to[3] = np.float32(math.cos(turn)), np.float32(math.sin(turn))
+                to[4] = _clip(sigmas[k, mate], -FAR, FAR)
+                present[k, mate - (mate > robots[k])] = 1
+        row[6] = _clip(last - first, 0.0, MAP_STATS_LIMIT[0])
+        row[7] = _clip(mean, 0.0, MAP_STATS_LIMIT[1])
+        row[8] = _clip(largest, 0.0, MAP_STATS_LIMIT[2])
+        row[9] = _clip(seen, 0.0, MAP_STATS_LIMIT[3])
+        row[10] = _clip(ess[k], 0.0, MAP_STATS_LIMIT[4])
+        row[11] = _clip(group_size, 0.0, MAP_STATS_LIMIT[5])
+        for i in range(candidates.shape[1]):
+            for j in range(candidates.shape[2]):
+                candidates[k, i, j] = _clip(candidates[k, i, j], -FAR, FAR)
 
 
 def _box(low: FloatArray, high: FloatArray) -> spaces.Box:

@@ -3,9 +3,11 @@
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+
 from vslam_env.config import EnvConfig
 from vslam_env.episode import Episode
-from vslam_env.observation import flatten, observe_glimpse
+from vslam_env.observation import flatten, observed
 
 
 def observations_of(agents: Sequence[str], episode: Episode, config: EnvConfig) -> dict[str, Any]:
@@ -22,8 +24,9 @@ def observations_of(agents: Sequence[str], episode: Episode, config: EnvConfig) 
     """
     goal, flat = config.action_type == "goal", config.observation_type == "flat"
     observations: dict[str, Any] = {}
-    for robot, (agent, reading) in enumerate(zip(agents, episode.readings, strict=True)):
-        observation = observe_glimpse(episode.belief.glimpse(robot), reading.scan, goal)
+    scans = np.array([reading.scan for reading in episode.readings])
+    shown = observed(episode.belief.view(), scans, goal)
+    for agent, reading, observation in zip(agents, episode.readings, shown, strict=True):
         if reading.image is not None:
             observation["image"] = reading.image[:, :, None].copy()
         if not flat:

@@ -13,7 +13,7 @@ from slam_backend.attempts import AttemptOptions
 from slam_backend.camera import StereoCamera
 from slam_backend.errors import BoolArray, FloatArray, IntArray, check_int
 from slam_backend.filter_options import FilterOptions
-from slam_backend.landmark_map import LandmarkMap, MapOutline
+from slam_backend.landmark_map import LandmarkMap, TeamOutlines
 from slam_backend.merge_options import MergeOptions
 from slam_backend.smoothing.options import SmoothingOptions
 from vslam_env.navigation import SeenGrid
@@ -93,7 +93,7 @@ class Teammate:
     @property
     def position_sigma(self) -> float:
         """One sigma of its position [m], averaged over directions."""
-        return math.sqrt(0.5 * (self.covariance[0, 0] + self.covariance[1, 1]))
+        return position_sigma(self.covariance)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -165,58 +165,62 @@ class Belief:
         return self.group_map.moved(self.start_from_group)
 
 
-class Glimpse(NamedTuple):
-    """The part of a belief that an observation shows, gathered without copies: read it before the next step.
+class View(NamedTuple):
+    """The part of some robots' beliefs that observations show, gathered without copies: read it before the next step.
 
     Attributes:
-        robot: Its index.
-        group_size: Robots that share the map, itself included.
-        pose: (3,) float64 [m, m, rad], start frame.
-        covariance: (3, 3) float64 [m, m, rad].
-        ess: Effective sample size, as a share of M.
-        start_from_group: (3,) float64 [m, m, rad]. Moves the group's map frame to the own start frame.
-        outline: Of the confirmed landmarks in the group's frame.
-        cells: (300, 300) uint8. Of the seen grid.
-        features: (16, 5) float32 [m], robot frame. Of the candidates; the reader's own.
-        valid: (16,) int8. Which candidates there are.
-        mates: (m,) int64. The other robots of the group.
-        mate_poses: (m, 3) float64 [m, m, rad], start frame.
-        mate_sigmas: (m,) float64 [m]. One sigma of their positions, averaged over directions.
+        robots: (n,) int64. Their indices.
+        poses: (n, k, 3) float64 [m, m, rad], start frame. Where each believes robot j < k of the team to be; NaN where
+            it does not know.
+        sigmas: (n, k) float64 [m]. One sigma of these positions, averaged over directions; likewise.
+        own: (n, 3) float64 [m, m, rad], start frame. Where each believes itself to be.
+        covariances: (n, 3, 3) float64 [m, m, rad]. Of these.
+        starts: (n, 3) float64 [m, m, rad]. The motion from its map frame to its own start frame.
+        ess: (n,) float64. Effective sample size, as a share of M.
+        outlines: Of the confirmed landmarks in the map frames.
+        cells: (n, 300, 300) uint8. Of the seen grids.
+        features: (n, 16, 5) float32 [m], robot frames. Of the candidates; the reader's own.
+        valid: (n, 16) int8. Which candidates there are.
     """
 
-    robot: int
-    group_size: int
-    pose: FloatArray
-    covariance: FloatArray
-    ess: float
-    start_from_group: FloatArray
-    outline: MapOutline
+    robots: IntArray
+    poses: FloatArray
+    sigmas: FloatArray
+    own: FloatArray
+    covariances: FloatArray
+    starts: FloatArray
+    ess: FloatArray
+    outlines: TeamOutlines
     cells: NDArray[np.uint8]
     features: NDArray[np.float32]
     valid: NDArray[np.int8]
-    mates: IntArray
-    mate_poses: FloatArray
-    mate_sigmas: FloatArray
 
     @classmethod
-    def of(cls, belief: Belief) -> "Glimpse":
-        """Return what an observation shows of a belief."""
-        mates = belief.teammates
+    def of(cls, belief: Belief) -> "View":
+        """Return what an observation shows of one belief."""
+        known = {mate.robot: (mate.pose, mate.position_sigma) for mate in belief.teammates}
+        known[belief.robot] = belief.pose, position_sigma(belief.covariance)
+        poses, sigmas = np.full((1, max(known) + 1, 3), np.nan), np.full((1, max(known) + 1), np.nan)
+        for robot, (pose, sigma) in known.items():
+            poses[0, robot], sigmas[0, robot] = pose, sigma
         return cls(
-            robot=belief.robot,
-            group_size=len(belief.group),
-            pose=belief.pose,
-            covariance=belief.covariance,
-            ess=belief.ess,
-            start_from_group=belief.start_from_group,
-            outline=belief.group_map.outline,
-            cells=belief.grid.cells,
-            features=belief.candidates.features.copy(),
-            valid=belief.candidates.valid.astype(np.int8),
-            mates=np.array([mate.robot for mate in mates], np.int64),
-            mate_poses=np.array([mate.pose for mate in mates]).reshape(-1, 3),
-            mate_sigmas=np.array([mate.position_sigma for mate in mates]),
+            robots=np.array([belief.robot]),
+            poses=poses,
+            sigmas=sigmas,
+            own=belief.pose[None].copy(),
+            covariances=belief.covariance[None].copy(),
+            starts=belief.start_from_group[None].copy(),
+            ess=np.array([belief.ess]),
+            outlines=TeamOutlines.joined([belief.group_map.outline]),
+            cells=belief.grid.cells[None],
+            features=belief.candidates.features[None].copy(),
+            valid=belief.candidates.valid[None].astype(np.int8),
         )
+
+
+def position_sigma(covariance: FloatArray) -> float:
+    """Return one sigma of the position [m], averaged over directions, of a pose's covariance (3, 3) [m, m, rad]."""
+    return math.sqrt(0.5 * (covariance[0, 0] + covariance[1, 1]))
 
 
 def _freeze_arrays(record: Any) -> None:

@@ -163,13 +163,13 @@ class SharedGrids:
         pairs = [(owner, robot) for owner, group in enumerate(mates) for robot in group]
         self._owners, self._robots = np.array(pairs).T.copy()
 
-    def paint(self, tick: int, mate_poses: Sequence[FloatArray], readings: Sequence[Readings]) -> None:
+    def paint(self, tick: int, poses: FloatArray, readings: Sequence[Readings]) -> None:
         """Paint what each robot scans into the grids of all that go by its filter.
 
         Args:
             tick: Of the readings.
-            mate_poses: Per robot (n, 3) [m, m, rad], its start frame. Where its mates, as `meet` was told of them, and
-                itself are believed to be.
+            poses: (K, K, 3) [m, m, rad]. Where robot i believes robot j to be, in i's start frame; asked for those that
+                go by the same filter, as `meet` was told of them.
             readings: (K,) of this tick.
 
         Raises:
@@ -182,7 +182,7 @@ class SharedGrids:
                 "scans", f"arrays of shape ({len(self._body.ray_angles)},)", f"shape {scans.shape}", cure
             )
         bumps = np.array([reading.bump for reading in readings], np.bool_)
-        strokes = Strokes(tick, self._owners, self._robots, np.concatenate(mate_poses), scans, bumps)
+        strokes = Strokes(tick, self._owners, self._robots, poses[self._owners, self._robots], scans, bumps)
         self._draw(strokes)
         if self._kept:
             self._strokes.append(strokes)

@@ -25,11 +25,11 @@ from slam_backend._kernels.landmark_updates import YOUNG
 from slam_backend._kernels.layout import CANDIDATE_ROWS, FAR, LANES, MIN_DEPTH, WORK_ROWS
 from slam_backend._kernels.places import carry_odds, refresh
 from slam_backend._kernels.resampling import resample
-from slam_backend._kernels.start_frames import own_frames
+from slam_backend._kernels.start_frames import stand
 from slam_backend._kernels.turns import IDLE, MOVED, PLACED, STOOD, take_turns, write_sigmas
 from slam_backend._kernels.weights import conclude, mixture
 
 __all__ = [
     "CANDIDATE_ROWS", "FAR", "IDLE", "LANES", "MIN_DEPTH", "MOVED", "PLACED", "STOOD", "WORK_ROWS", "YOUNG",
-    "carry_odds", "conclude", "extent", "mixture", "own_frames", "refresh", "resample", "take_turns", "write_sigmas",
+    "carry_odds", "conclude", "extent", "mixture", "refresh", "resample", "stand", "take_turns", "write_sigmas",
 ]  # fmt: skip

@@ -6,7 +6,7 @@ import numpy as np
 
 from slam_backend._jit import inlined, jit
 from slam_backend._kernels.weights import mixture
-from slam_backend.errors import FloatArray
+from slam_backend.errors import BoolArray, FloatArray, IntArray
 
 AT_ORIGIN, KNOWN, SPREAD = 0, 1, 2  # what starts of particles can be
 
@@ -55,45 +55,76 @@ def see_from_starts(
         _see(starts[:, m], means[:, m], covariances[:, m], seen[:, m], spread[:, m])
 
 
-@jit
-def own_frames(
-    starts: FloatArray, means: FloatArray, covariances: FloatArray, weights: FloatArray, best: int,
-    poses: FloatArray, spreads: FloatArray, frames: FloatArray,
+@inlined
+def _see_own(
+    starts: FloatArray, means: FloatArray, covariances: FloatArray, weights: FloatArray, best: int, kind: int,
+    pose: FloatArray, spread: FloatArray,
 ) -> None:  # fmt: skip
-    """Move the estimates of robots' poses from the map frame to their own start frames.
+    """Move a robot's estimate (3,), (3, 3), in place, from the map frame to its start frame; the rest as in `stand`."""
+    if kind == SPREAD:
+        padded = starts.shape[1]
+        seen, seen_spread = np.zeros((3, padded)), np.zeros((6, padded))
+        see_from_starts(starts, means, covariances, len(weights), seen, seen_spread)
+        mixture(seen, seen_spread, weights, pose, spread)
+    elif kind == KNOWN:
+        packed, seen_packed, from_map = np.empty(6), np.empty(6), pose.copy()
+        entry = 0
+        for j in range(3):
+            for k in range(j, 3):
+                packed[entry] = spread[j, k]
+                entry += 1
+        _see(starts[:, best], from_map, packed, pose, seen_packed)
+        entry = 0
+        for j in range(3):
+            for k in range(j, 3):
+                spread[j, k] = spread[k, j] = seen_packed[entry]
+                entry += 1
+
+
+@jit
+def stand(
+    starts: FloatArray, means: FloatArray, covariances: FloatArray, weights: FloatArray, best: int, at_origin: bool,
+    estimates: FloatArray, spreads: FloatArray, names: IntArray, live: BoolArray, ess: float,
+    poses: FloatArray, sigmas: FloatArray, own_poses: FloatArray, own_spreads: FloatArray, frames: FloatArray,
+    shares: FloatArray,
+) -> None:  # fmt: skip
+    """Write where the robots of a filter stand, and where they see each other, in their own start frames.
 
     Each particle's pose is seen from where the robot started in that particle, so that what is not known of the start
     does not blur it.
 
     Args:
-        starts, means, covariances: (K, 3, P), (K, 3, P), (K, 6, P) of all robots and particles, map frame.
+        starts, means, covariances: (n, 3, P), (n, 3, P), (n, 6, P) of its robots and all particles, map frame.
         weights: (M,) summing to 1.
         best: The most probable particle.
-        poses, spreads: (K, 3), (K, 3, 3) [m, m, rad] the estimates, replaced.
-        frames: (K, 3) [m, m, rad], written: the motion from the map frame to each start frame in particle `best`.
+        at_origin: Whether all robots started at the origin in all particles.
+        estimates, spreads: (n, 3), (n, 3, 3) [m, m, rad] the robots' poses over all particles, map frame.
+        names: (n,) int64. Which robots of the team they are.
+        live: (n,) bool. Which of them go by this filter; only their rows are written.
+        ess: Effective sample size of the filter, as a share of M.
+        poses, sigmas, own_poses, own_spreads, frames, shares: `Standpoints` of all robots of the team; written.
     """
-    count, padded = len(weights), starts.shape[2]
-    packed, seen_packed, pose = np.empty(6), np.empty(6), np.empty(3)
-    for robot in range(len(starts)):
-        x, y, theta = starts[robot, 0, best], starts[robot, 1, best], starts[robot, 2, best]
+    for i in range(len(names)):
+        if not live[i]:
+            continue
+        own = names[i]
+        poses[own], sigmas[own] = np.nan, np.nan
+        x, y, theta = starts[i, 0, best], starts[i, 1, best], starts[i, 2, best]
         c, s = math.cos(theta), math.sin(theta)
-        frames[robot, 0], frames[robot, 1] = -c * x - s * y, s * x - c * y
-        frames[robot, 2] = (math.pi - theta) % (2.0 * math.pi) - math.pi
-        kind = start_kind(starts[robot], count)
-        if kind == SPREAD:
-            seen, spread = np.zeros((3, padded)), np.zeros((6, padded))
-            see_from_starts(starts[robot], means[robot], covariances[robot], count, seen, spread)
-            mixture(seen, spread, weights, poses[robot], spreads[robot])
-        elif kind == KNOWN:
-            entry = 0
-            for j in range(3):
-                for k in range(j, 3):
-                    packed[entry] = spreads[robot, j, k]
-                    entry += 1
-            pose[:] = poses[robot]
-            _see(starts[robot, :, best], pose, packed, poses[robot], seen_packed)
-            entry = 0
-            for j in range(3):
-                for k in range(j, 3):
-                    spreads[robot, j, k] = spreads[robot, k, j] = seen_packed[entry]
-                    entry += 1
+        frame = frames[own]
+        frame[0], frame[1] = -c * x - s * y, s * x - c * y
+        frame[2] = (math.pi - theta) % (2.0 * math.pi) - math.pi
+        own_poses[own], own_spreads[own], shares[own] = estimates[i], spreads[i], ess
+        if not at_origin:
+            kind = start_kind(starts[i], len(weights))
+            _see_own(starts[i], means[i], covariances[i], weights, best, kind, own_poses[own], own_spreads[own])
+        poses[own, own] = own_poses[own]
+        sigmas[own, own] = math.sqrt(0.5 * (own_spreads[own, 0, 0] + own_spreads[own, 1, 1]))
+        c, s = math.cos(frame[2]), math.sin(frame[2])
+        for j in range(len(names)):
+            if j != i:
+                pose = poses[own, names[j]]
+                pose[0] = frame[0] + c * estimates[j, 0] - s * estimates[j, 1]
+                pose[1] = frame[1] + s * estimates[j, 0] + c * estimates[j, 1]
+                pose[2] = (frame[2] + estimates[j, 2] + math.pi) % (2.0 * math.pi) - math.pi
+                sigmas[own, names[j]] = math.sqrt(0.5 * (spreads[j, 0, 0] + spreads[j, 1, 1]))

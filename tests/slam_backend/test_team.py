@@ -13,6 +13,7 @@ from slam_backend.attempts import AttemptOptions
 from slam_backend.filter import FastSlam
 from slam_backend.filter_options import FilterOptions
 from slam_backend.geometry import between, compose, inverse, transform_points, wrap_angle
+from slam_backend.reports import PoseEstimate
 from slam_backend.team import TeamSlam
 
 ALONE = np.eye(3, dtype=bool)
@@ -103,14 +104,24 @@ def test_where_robots_stand_is_told_at_once_as_one_by_one() -> None:
             simulation.run(team, 30, apart if stage == 3 else None)
         if stage == 2:
             team.merge(0, 1, align_maps(team.map(0, "mixture"), team.map(1, "mixture")))
-        for robot, point in enumerate(team.standpoints()):
-            assert_same(point.members, team.members(robot))
-            assert_same(point.mates, team.mates(robot))
-            assert_same(point.number, team.maps[robot])
-            assert_same(tuple(point.poses), tuple(team.pose(mate, robot) for mate in point.members))
-            assert_same(point.own_pose, team.pose_from_start(robot))
-            np.testing.assert_allclose(point.start_from_group, team.start_from_group(robot), atol=1e-15)
-            assert point.ess == team.ess(robot) / 20
+        points, outlines = team.standpoints(), team.outlines(2)
+        for robot in range(3):
+            assert_same(team.all_members[robot], team.members(robot))
+            assert_same(team.all_mates[robot], team.mates(robot))
+            assert_same(points.poses[robot, robot], points.own[robot])
+            assert_same(PoseEstimate(points.own[robot], points.covariances[robot]), team.pose_from_start(robot))
+            np.testing.assert_allclose(points.starts[robot], team.start_from_group(robot), atol=1e-15)
+            assert points.ess[robot] == team.ess(robot) / 20
+            known = np.flatnonzero(~np.isnan(points.poses[robot, :, 0]))
+            assert_same(tuple(known.tolist()), team.members(robot))
+            assert_same(np.flatnonzero(~np.isnan(points.sigmas[robot])), known)
+            for mate in known:
+                seen = team.pose_from_start(robot) if mate == robot else team.pose(int(mate), robot)
+                np.testing.assert_allclose(points.sigmas[robot, mate], np.sqrt(np.trace(seen.covariance[:2, :2]) / 2.0))
+                if mate != robot:
+                    np.testing.assert_array_equal(points.poses[robot, mate], compose(points.starts[robot], seen.mean))
+            for got, expected in zip(outlines.of(robot), team.map(robot, min_count=2).outline, strict=True):
+                np.testing.assert_array_equal(got, expected)
     assert len(team.mates(0)) == 1 < len(team.members(0))
 
 

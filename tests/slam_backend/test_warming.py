@@ -65,8 +65,7 @@ team = TeamSlam(2, num_particles=7, attempts=AttemptOptions(every=1))
 for size in (1, 3, 9, 30, 30, 30):
     team.step([None, None], [Measurements(points[:size], looks[:size])] * 2)
 assert len(team.groups) == 1
-for robot in range(2):
-    team.standpoints(), team.outline(robot)
+team.standpoints(), team.outlines()
 slices = SmoothingOptions(slice_steps=20, rigid_within=0.01, max_keys=12, further_keys=4, fresh_keys=6)
 for smoothing in (slices, SmoothingOptions()):
     simulation = SimulatedTeam(2, seed=100)

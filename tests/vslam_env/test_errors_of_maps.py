@@ -4,8 +4,8 @@ import numpy as np
 from small_env import MEETING, small_env, turning
 
 from slam_backend.errors import IntArray
-from slam_backend.geometry import inverse, transform_points
-from slam_backend.landmark_map import LandmarkMap
+from slam_backend.geometry import compose, inverse, transform_points
+from slam_backend.landmark_map import LandmarkMap, TeamOutlines
 from slam_backend.metrics import gospa, map_error, map_rmse
 from slam_backend.reports import LandmarksCreated, Renaming, TeamReport
 from vslam_env.coverage import Coverage, CoverageMeter
@@ -43,7 +43,9 @@ def _score(ledger: ClaimLedger, robot: int, held: LandmarkMap, world_from_group:
     robots = len(ledger.get_state()["map_of"])
     maps, poses = [LandmarkMap.empty(2)] * robots, np.zeros((robots, 3))
     maps[robot], poses[robot] = held, world_from_group
-    return SimpleNamespace(**{name: of_all[robot] for name, of_all in ledger.scores(maps, poses)._asdict().items()})
+    outlines = TeamOutlines.joined([each.outline for each in maps])
+    scores = ledger.scores(outlines, poses, np.zeros((robots, 3)))
+    return SimpleNamespace(**{name: of_all[robot] for name, of_all in scores._asdict().items()})
 
 
 def test_claims_follow_creation() -> None:
@@ -51,6 +53,28 @@ def test_claims_follow_creation() -> None:
     ledger = _ledger()
     assert ledger.claims(0, _ids(0, 1, 2)).tolist() == [0, 1, -1]
     assert ledger.claims(1, _ids(2, 1, 0)).tolist() == [-2, 2, 1]  # of the four that count, 3 is the third
+
+
+def test_maps_are_scored_where_robots_believe_them_to_be() -> None:
+    """From the true start on; whatever the order of the parts, and whether robots share one."""
+    rng = np.random.default_rng(100)
+    ledger = _ledger()
+    starts, true_starts = rng.uniform(-2.0, 2.0, (2, 2, 3))
+    held = [_map(rng.normal(TRUTHS[:3], 0.1), np.arange(3)), _map(rng.normal(TRUTHS[:2], 0.1), np.arange(2))]
+    there = inverse(compose(true_starts, starts))
+    outlines = [
+        each.outline._replace(means=transform_points(pose, each.means)) for each, pose in zip(held, there, strict=True)
+    ]
+    rows, parts = TeamOutlines.joined(outlines[::-1])
+    scores = ledger.scores(TeamOutlines(rows, parts[::-1].copy()), starts, true_starts)
+    for robot in range(2):
+        for name, expected in vars(_score(ledger, robot, held[robot], np.zeros(3))).items():
+            np.testing.assert_allclose(getattr(scores, name)[robot], expected, atol=1e-12)
+    ledger.rename(Renaming((0,), (1,), np.array([[0, 1], [1, 3], [2, 4]]), (0, 1, 2)))
+    joint = TeamOutlines(rows, np.array([parts[1], parts[1]]))
+    scores = ledger.scores(joint, starts[[0, 0]], true_starts[[0, 0]])
+    for name, expected in vars(_score(ledger, 0, held[0], np.zeros(3))).items():
+        np.testing.assert_allclose(getattr(scores, name), [expected, expected], atol=1e-12)
 
 
 def test_claims_follow_a_merge() -> None:

@@ -6,7 +6,7 @@ from small_env import MEETING, small_env, turning
 
 from agents import make_policy
 from slam_backend.alignment import Alignment
-from slam_backend.landmark_map import LandmarkMap
+from slam_backend.landmark_map import LandmarkMap, TeamOutlines
 from slam_backend.reports import LandmarksCreated, TeamReport
 from vslam_env import ExplorationEnv, vslam_v0
 from vslam_env.errors_of_maps import ClaimLedger
@@ -139,7 +139,8 @@ def test_a_map_that_is_placed_wrong_has_no_recall() -> None:
     books.record(TeamReport(0, (ids,), (ids,), ((0,),), (), (), (0,), entries, 1), [ids])
     held = LandmarkMap(truths[:2], np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 2)), ids=ids)
     for shift, placed in ((0.0, 2 / 3), (0.4, 2 / 3), (0.6, 0.0)):
-        scores = books.scores([held], np.array([[shift, 0.0, 0.0]]))
+        outlines = TeamOutlines.joined([held.outline])
+        scores = books.scores(outlines, np.array([[shift, 0.0, 0.0]]), np.zeros((1, 3)))
         assert (scores.recalls[0], scores.placed[0]) == (2 / 3, placed)
 
 

@@ -1,6 +1,6 @@
 """What a robot does with the floor it has seen: grid, frontiers, paths. It knows no simulator, no sensor, no reward."""
 
-from vslam_env.navigation.candidate_slots import CandidateSlots
+from vslam_env.navigation.candidate_slots import CandidateSlots, TeamSlots
 from vslam_env.navigation.frontiers import Frontiers, find_frontiers
 from vslam_env.navigation.planning import DistanceMap, distance_map, follow_path, plan_path
 from vslam_env.navigation.seen_grid import (
@@ -26,6 +26,7 @@ __all__ = [
     "Frontiers",
     "SeenGrid",
     "TeamGrids",
+    "TeamSlots",
     "cell_of",
     "centre_of",
     "distance_map",

@@ -84,20 +84,28 @@ def _refill(costs: Any, slots: Any, sources: Any, found: Any, visits: Any) -> tu
 
 
 @jit
-def _describe(slots: Any, pose: Any, teammates: Any, features: Any, valid: Any) -> None:
-    """Write `CandidateSlots.features` (16, 5) and `valid` (16,) of the rows of the slots."""
-    c, s = math.cos(pose[2]), math.sin(pose[2])
-    for i in range(NUM_SLOTS):
-        valid[i] = not np.isnan(slots[i, 0])
-        if not valid[i]:
-            features[i] = 0.0
-            continue
-        u, v = slots[i, 0] - pose[0], slots[i, 1] - pose[1]
-        nearest = NO_TEAMMATE
-        for k in range(len(teammates)):
-            nearest = min(nearest, np.hypot(slots[i, 0] - teammates[k, 0], slots[i, 1] - teammates[k, 1]))
-        features[i, 0], features[i, 1] = c * u + s * v, c * v - s * u
-        features[i, 2], features[i, 3], features[i, 4] = slots[i, LENGTH], slots[i, SIZE], nearest
+def _describe(slots: Any, poses: Any, features: Any, valid: Any) -> None:
+    """Write `CandidateSlots.features` (K, 16, 5) and `valid` (K, 16) of the rows of all slots (K, 16, ...).
+
+    Poses (K, n, 3), n >= K, are as in `TeamSlots.described`.
+    """
+    for robot in range(len(slots)):
+        x, y, theta = poses[robot, robot]
+        c, s = math.cos(theta), math.sin(theta)
+        for i in range(NUM_SLOTS):
+            goal_x, goal_y = slots[robot, i, 0], slots[robot, i, 1]
+            valid[robot, i] = not np.isnan(goal_x)
+            if not valid[robot, i]:
+                features[robot, i] = 0.0
+                continue
+            u, v = goal_x - x, goal_y - y
+            nearest = NO_TEAMMATE
+            for mate in range(poses.shape[1]):
+                if mate != robot and not np.isnan(poses[robot, mate, 0]):
+                    nearest = min(nearest, np.hypot(goal_x - poses[robot, mate, 0], goal_y - poses[robot, mate, 1]))
+            features[robot, i, 0], features[robot, i, 1] = c * u + s * v, c * v - s * u
+            features[robot, i, 2], features[robot, i, 3] = slots[robot, i, LENGTH], slots[robot, i, SIZE]
+            features[robot, i, 4] = nearest
 
 
 class CandidateSlots:
@@ -112,7 +120,19 @@ class CandidateSlots:
     __slots__ = ("_given_up", "_rows", "_visits")
 
     def __init__(self) -> None:
-        self._rows: FloatArray = np.full((NUM_SLOTS, NUM_COLUMNS), np.nan)
+        self._settle(np.full((NUM_SLOTS, NUM_COLUMNS), np.nan))
+
+    @classmethod
+    def _of(cls, rows: FloatArray) -> "CandidateSlots":
+        """Return empty slots whose rows (16, ...) are these."""
+        self = cls.__new__(cls)
+        rows.fill(np.nan)
+        self._settle(rows)
+        return self
+
+    def _settle(self, rows: FloatArray) -> None:
+        """Begin with these rows, which are NaN."""
+        self._rows = rows
         self._visits = np.zeros(NUM_SLOTS, np.int64)
         self._given_up = np.zeros((GRID_SIZE, GRID_SIZE), np.bool_)
 
@@ -159,7 +179,7 @@ class CandidateSlots:
 
         costs = _costs(self._rows, found)
         slots, sources = linear_sum_assignment(costs)
-        self._rows, self._visits = _refill(costs, slots, sources, found, self._visits)
+        self._rows[:], self._visits = _refill(costs, slots, sources, found, self._visits)
 
     def _count_visits(self, x: float, y: float, theta: float, teammates: FloatArray) -> None:
         """Count who is at a goal, and give up what is unknown around goals where patience has run out."""
@@ -183,19 +203,10 @@ class CandidateSlots:
             size of the frontier, and distance from the goal to the nearest teammate, 60 if there is none. Zeros in
             empty slots.
         """
-        place = np.array(pose_floats(pose))
-        return self.described(place, positions_array(teammates, "teammates"))[0]
-
-    def described(self, pose: FloatArray, teammates: FloatArray) -> tuple[NDArray[np.float32], NDArray[np.int8]]:
-        """Return `features`, and as (16,) int8 which slots hold a candidate; for arrays that need no checks.
-
-        Args:
-            pose: (3,) float64 [m, m, rad], start frame.
-            teammates: (k, 2 or more) float64 [m], start frame.
-        """
-        features, valid = np.empty((NUM_SLOTS, 5), np.float32), np.empty(NUM_SLOTS, np.int8)
-        _describe(self._rows, pose, teammates, features, valid)
-        return features, valid
+        places = positions_array(teammates, "teammates")
+        poses = np.zeros((1, 1 + len(places), 3))
+        poses[0, 0], poses[0, 1:, :2] = pose_floats(pose), places
+        return np.asarray(_described(self._rows[None], poses)[0][0])
 
     def get_state(self) -> dict[str, Any]:
         """Return a copy of all that `set_state` needs to continue bit by bit."""
@@ -203,6 +214,40 @@ class CandidateSlots:
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Restore what `get_state` returned."""
-        self._rows = state["rows"].copy()
+        self._rows[:] = state["rows"]
         self._visits = state["visits"].copy()
         self._given_up = state["given_up"].copy()
+
+
+class TeamSlots:
+    """The slots of all robots of a team, whose rows lie in an array of one piece.
+
+    Args:
+        num_robots: K.
+
+    Attributes:
+        slots: Of the robots.
+    """
+
+    def __init__(self, num_robots: int) -> None:
+        self._rows = np.empty((num_robots, NUM_SLOTS, NUM_COLUMNS))
+        self.slots = list(map(CandidateSlots._of, self._rows))
+
+    def described(self, poses: FloatArray) -> tuple[NDArray[np.float32], NDArray[np.int8]]:
+        """Describe all robots' candidates to policies; nothing is checked.
+
+        Args:
+            poses: (K, K, 3) float64 [m, m, rad]. Where robot i believes robot j to be, in i's start frame; NaN: it
+                does not know.
+
+        Returns:
+            `CandidateSlots.features` (K, 16, 5), and as (K, 16) int8 which slots hold a candidate. Fresh arrays.
+        """
+        return _described(self._rows, poses)
+
+
+def _described(rows: FloatArray, poses: FloatArray) -> tuple[NDArray[np.float32], NDArray[np.int8]]:
+    """Return what `TeamSlots.described` does, of slots with these rows (K, 16, ...)."""
+    features, valid = np.empty((len(rows), NUM_SLOTS, 5), np.float32), np.empty((len(rows), NUM_SLOTS), np.int8)
+    _describe(rows, poses, features, valid)
+    return features, valid
