@@ -1,12 +1,13 @@
 import numpy as np
 
 from slam_backend._kernels import LANES
-from slam_backend._kernels.start_frames import AT_ORIGIN, KNOWN, SPREAD, own_frames, see_from_starts, start_kind
-from slam_backend._mixtures import pose_mixture
+from slam_backend._kernels.start_frames import AT_ORIGIN, KNOWN, SPREAD, see_from_starts, stand, start_kind
+from slam_backend._mixtures import pose_mixtures
 from slam_backend._packed import UNPACK
 from slam_backend.filter import FastSlam
 from slam_backend.geometry import between, compose, inverse, rotate_covariances, rotation, wrap_angle
 from slam_backend.measurements import Measurements
+from slam_backend.standpoints import Standpoints
 
 STARTS = np.array([[1.0, -2.0, 0.7], [4.0, 3.0, -2.0]])
 
@@ -81,7 +82,10 @@ def test_the_change_of_frame_is_that_of_matrices() -> None:
 
 
 def test_own_frames_are_the_plain_definition() -> None:
-    """Of robots that start at the origin, at a known place and at an unknown one; surplus lanes do not count."""
+    """Of robots that start at the origin, at a known place and at an unknown one; surplus lanes do not count.
+
+    The team calls them 3, 0 and 2; robot 1 goes by another filter, and so does one that this filter knows as 4.
+    """
     rng = np.random.default_rng(8)
     count, best = 9, 4
     starts, means = rng.uniform(-3.0, 3.0, (2, 3, 3, LANES))
@@ -90,16 +94,30 @@ def test_own_frames_are_the_plain_definition() -> None:
     matrices = roots @ roots.transpose(0, 1, 3, 2)
     covariances = np.ascontiguousarray(matrices[:, :, *np.triu_indices(3)].transpose(0, 2, 1))
     weights = rng.dirichlet(np.ones(count))
-    estimates = [pose_mixture(means[robot], covariances[robot], weights) for robot in range(3)]
-    poses, spreads = (np.array(parts) for parts in zip(*estimates, strict=True))
-    frames = np.empty((3, 3))
-    own_frames(starts, means, covariances, weights, best, poses, spreads, frames)
+    of_four = [np.concatenate([rows, rows[:1]]) for rows in (starts, means, covariances)]
+    estimates = pose_mixtures(*of_four[1:], weights)
+    names, live = np.array([3, 0, 2, 4]), np.array([True, True, True, False])
+    points = Standpoints(*(np.full_like(field, 7.0) for field in Standpoints.unwritten(5)))
+    stand(*of_four, weights, best, False, *estimates, names, live, 0.5, *points)
 
+    for field in points:
+        assert (field[[1, 4]] == 7.0).all()
+    poses, spreads, frames = points.own[names], points.covariances[names], points.starts[names[:3]]
     np.testing.assert_allclose(frames, inverse(starts[:, :, best]), atol=1e-15)
-    np.testing.assert_array_equal(poses[0], estimates[0].mean)
-    np.testing.assert_array_equal(spreads[0], estimates[0].covariance)
-    np.testing.assert_allclose(poses[1], between(STARTS[1], estimates[1].mean), atol=1e-12)
-    np.testing.assert_allclose(spreads[1], rotate_covariances(-STARTS[1, 2], estimates[1].covariance), atol=1e-12)
+    np.testing.assert_array_equal(poses[0], estimates.means[0])
+    np.testing.assert_array_equal(spreads[0], estimates.covariances[0])
+    np.testing.assert_allclose(poses[1], between(STARTS[1], estimates.means[1]), atol=1e-12)
+    np.testing.assert_allclose(spreads[1], rotate_covariances(-STARTS[1, 2], estimates.covariances[1]), atol=1e-12)
+    np.testing.assert_array_equal(points.ess[names[:3]], 0.5)
+    for i, viewer in enumerate(names[:3]):
+        for j, mate in enumerate(names):
+            pose, spread = (
+                (poses[i], spreads[i]) if i == j else (compose(frames[i], estimates.means[j]), estimates.covariances[j])
+            )
+            np.testing.assert_allclose(points.poses[viewer, mate], pose, atol=1e-12)
+            np.testing.assert_allclose(points.sigmas[viewer, mate], np.sqrt(np.trace(spread[:2, :2]) / 2.0), atol=1e-12)
+        assert np.isnan(points.poses[viewer, 1]).all()
+        assert np.isnan(points.sigmas[viewer, 1])
     seen = between(starts[2].T, means[2].T)[:count]
     turned = np.array([rotate_covariances(-starts[2, 2, m], matrices[2, m]) for m in range(count)])
     mean = np.append(weights @ seen[:, :2], np.angle(weights @ np.exp(1j * seen[:, 2])))
