@@ -78,15 +78,14 @@ class RejuvenationStep:
 
     def count(self, associations: Sequence[IntArray]) -> None:
         """Count a step, in which each robot saw these landmarks (n_i,)."""
-        self._count += 1
+        self._count = now = self._count + 1
         self._waited += 1
-        after, long_ago = self._options.smoothing.closure_after, 0
-        for ids in associations:
-            for name in ids.tolist():
-                if name >= 0:
-                    self._read += 1
-                    long_ago += self._count - self._last_seen.get(name, self._count) > after
-                    self._last_seen[name] = self._count
+        after, long_ago, last_seen = self._options.smoothing.closure_after, 0, self._last_seen
+        matched = [name for ids in associations for name in ids.tolist() if name >= 0]
+        for name in matched:
+            long_ago += now - last_seen.get(name, now) > after
+            last_seen[name] = now
+        self._read += len(matched)
         if after > 0 and long_ago >= CLOSURE:
             self._closed |= 2 * (self._count - self._last_closing) > after  # else it is the same one that goes on
             self._last_closing = self._count
@@ -166,7 +165,10 @@ class RejuvenationStep:
         """Return whether no slice is under way, and too little is new for another one: the rule."""
         if self._graph is None or self._draft is not None:
             return False
-        return most_waiting(logs, self._graph) < self._share(logs)
+        latest, share = self._graph.latest.tolist(), self._share(logs)
+        if all(log.last_step - step < share for log, step in zip(logs, latest, strict=True)):
+            return True  # there cannot be more of them, and to count costs more
+        return most_waiting(logs, self._graph) < share
 
     def _new(
         self, logs: Sequence[RobotLog], graph: PathGraph, maps: ParticleMaps, best: int

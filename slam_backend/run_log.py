@@ -167,6 +167,11 @@ class RobotLog:
         return sum(map(len, self._chunks)) + self._num_rows
 
     @property
+    def last_step(self) -> int:
+        """Index of the last step logged, -1 if there is none."""
+        return self._last
+
+    @property
     def num_measurements(self) -> int:
         """Measurements logged, rejected ones included."""
         return sum(len(chunk.ids) for chunk in self._chunks) + self._num_measurements

@@ -50,6 +50,10 @@ def checked_actions(actions: Any, agents: Sequence[str], action_type: str) -> li
 
 def _checked_pair(agent: str, action: Any) -> tuple[float, float]:
     """Return a continuous action as two floats in [-1, 1], or raise."""
+    if type(action) is np.ndarray and action.shape == (2,) and action.dtype.kind == "f":  # what nearly all send
+        ahead, turn = action.tolist()
+        if -1.0 <= ahead <= 1.0 and -1.0 <= turn <= 1.0:
+            return ahead, turn
     name, cure = "actions[%r]", "Give (speed, turn) in [-1, 1]."
     try:
         array = np.asarray(action)

@@ -17,7 +17,7 @@ from slam_backend.team import TeamSlam
 from vslam_env.navigation import TeamGrids, TeamSlots
 from vslam_env.readings import Readings
 from vslam_env.robot_belief import Belief, BeliefConfig, Body, Candidates, Teammate, View
-from vslam_env.shared_grids import SharedGrids
+from vslam_env.shared_grids import SharedGrids, scans_of
 
 __all__ = ["Belief", "BeliefConfig", "Body", "Candidates", "TeamBelief", "Teammate"]
 
@@ -54,6 +54,7 @@ class TeamBelief:
         merging = config.merging if attempts else replace(config.merging, watch_steps=0)
         self._team = TeamSlam(num_robots, config.alignment, seed, rhythm, merging, **options)
         self._decision_ticks = decision_ticks
+        self._body = body
         self._grids = SharedGrids(num_robots, body)
         self._candidates = TeamSlots(num_robots)
         self._slots = self._candidates.slots
@@ -103,7 +104,8 @@ class TeamBelief:
         """
         if len(readings) != self.num_robots:
             raise bad_argument("readings", f"{self.num_robots} of them", len(readings), "Give one for each robot.")
-        odometry, measurements, _, _, true_poses, identities, heard, _ = zip(*readings, strict=True)
+        scans = scans_of(readings, len(self._body.ray_angles))
+        odometry, measurements, _, bumps, true_poses, identities, heard, _ = zip(*readings, strict=True)
         report = self._team.step(
             odometry,
             measurements,
@@ -116,10 +118,9 @@ class TeamBelief:
         self._grids.follow(self._tick, report.entries, report.renamings)
         points = self._points
         self._grids.meet(self._team.all_mates, points.starts)
-        self._grids.paint(self._tick, points.poses, readings)
-        for robot in range(self.num_robots):
-            if self._candidates_are_due(robot):
-                self._slots[robot].update(self._grids[robot].cells, points.own[robot], self._mates_around(robot))
+        self._grids.paint(self._tick, points.poses, scans, np.array(bumps, np.bool_))
+        for robot in self._whose_candidates_are_due():
+            self._slots[robot].update(self._grids[robot].cells, points.own[robot], self._mates_around(robot))
         return report
 
     def merge(self, robot_a: int, robot_b: int, alignment: Alignment, known: bool = False) -> Renaming:
@@ -130,9 +131,10 @@ class TeamBelief:
         self._grids.meet(self._team.all_mates, self._points.starts)
         return renaming
 
-    def group(self, robot: int) -> tuple[int, ...]:
-        """Return the robots that share a map with this one, as far as it knows, itself included."""
-        return self._members[robot]
+    @property
+    def known_groups(self) -> Sequence[tuple[int, ...]]:
+        """Per robot those that share a map with it, as far as it knows, itself included."""
+        return self._members
 
     def speaker(self, group: tuple[int, ...]) -> int:
         """Return the first robot of a group that goes by its joint filter, and so can merge it with another."""
@@ -268,10 +270,12 @@ class TeamBelief:
             group_map=self.group_map(robot),
         )
 
-    def _candidates_are_due(self, robot: int) -> bool:
-        """Tell whether a robot's candidates are to be renewed in this tick."""
+    def _whose_candidates_are_due(self) -> Sequence[int]:
+        """Return the robots whose candidates are to be renewed in this tick."""
+        robots = range(self.num_robots)
         if self._tick == 0:
-            return True
+            return robots
         if self._decision_ticks is not None:
-            return self._tick % self._decision_ticks == 0
-        return (self._tick - robot * CANDIDATE_TICKS // self.num_robots) % CANDIDATE_TICKS == 0
+            return () if self._tick % self._decision_ticks else robots
+        now = self._tick % CANDIDATE_TICKS
+        return [robot for robot in robots if robot * CANDIDATE_TICKS // len(robots) == now]

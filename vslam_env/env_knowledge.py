@@ -60,7 +60,7 @@ class EnvKnowledge(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # Pe
         true, believed = episode.true_path[-1], episode.believed_poses()
         rows = [np.column_stack([poses[:, :2], np.cos(poses[:, 2]), np.sin(poses[:, 2])]) for poses in (true, believed)]
         standing = self._standing
-        frames = [episode.belief.group(robot)[0] for robot in range(len(true))]
+        frames = [group[0] for group in episode.belief.known_groups]
         scored = np.column_stack([standing.map_errors, standing.map_recalls, standing.heading_errors, frames])
         return np.concatenate([np.hstack([*rows, scored]).ravel(), [standing.coverage, standing.merges]]).astype(
             np.float32

@@ -255,8 +255,7 @@ class ExplorationEnv(EnvKnowledge):
 
     def _infos(self, terms: Mapping[str, FloatArray], invalid: list[int]) -> dict[AgentID, dict[str, Any]]:
         """Return each agent's figures after a step that paid `terms`."""
-        belief = self._running_episode("step").belief
-        groups = [belief.group(robot) for robot in range(len(self.agents))]
+        groups = self._running_episode("step").belief.known_groups
         return infos_of(self.agents, groups, self._standing, terms, invalid)
 
 

@@ -163,25 +163,19 @@ class SharedGrids:
         pairs = [(owner, robot) for owner, group in enumerate(mates) for robot in group]
         self._owners, self._robots = np.array(pairs).T.copy()
 
-    def paint(self, tick: int, poses: FloatArray, readings: Sequence[Readings]) -> None:
+    def paint(self, tick: int, poses: FloatArray, scans: FloatArray, bumps: BoolArray) -> None:
         """Paint what each robot scans into the grids of all that go by its filter.
 
         Args:
             tick: Of the readings.
             poses: (K, K, 3) [m, m, rad]. Where robot i believes robot j to be, in i's start frame; asked for those that
                 go by the same filter, as `meet` was told of them.
-            readings: (K,) of this tick.
+            scans: (K, R) [m]. Of this tick.
+            bumps: (K,) bool. Who bumped into something.
 
         Raises:
-            ValueError: If a scan is not (R,) or is ill-formed.
+            ValueError: If a range is out of its limits.
         """
-        scans = np.array([reading.scan for reading in readings], np.float64)
-        if scans.shape != (len(readings), len(self._body.ray_angles)):
-            cure = "Give a range for each ray of each robot."
-            raise bad_argument(
-                "scans", f"arrays of shape ({len(self._body.ray_angles)},)", f"shape {scans.shape}", cure
-            )
-        bumps = np.array([reading.bump for reading in readings], np.bool_)
         strokes = Strokes(tick, self._owners, self._robots, poses[self._owners, self._robots], scans, bumps)
         self._draw(strokes)
         if self._kept:
@@ -207,3 +201,17 @@ class SharedGrids:
             grid.set_state(seen)
         self._settle(state["mates"])
         self._kept, self._strokes = list(state["kept"]), deque(state["strokes"])
+
+
+def scans_of(readings: Sequence[Readings], num_rays: int) -> FloatArray:
+    """Return the scans (K, R) [m] of all readings.
+
+    Raises:
+        ValueError: If one has another number of rays.
+    """
+    scans = [reading.scan for reading in readings]
+    for robot, scan in enumerate(scans):
+        if np.shape(scan) != (num_rays,):
+            name, cure = f"readings[{robot}].scan", "Give a range for each ray."
+            raise bad_argument(name, f"an array of shape ({num_rays},)", f"shape {np.shape(scan)}", cure)
+    return np.array(scans, np.float64)

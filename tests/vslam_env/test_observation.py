@@ -51,6 +51,20 @@ def test_observations_are_rebuilt_from_readings_alone(action_type: str, steps: i
                 assert value.tobytes() == expected[name].tobytes(), (tick, agent, name)
 
 
+def test_a_scan_of_another_length_is_refused_before_anything_changes() -> None:
+    """Beliefs that refused readings go on with right ones as if they had never been given the wrong ones."""
+    env = small_env()
+    readings, _ = _record(env, 3)
+    episode = env.episode
+    whole, refusing = (TeamBelief(env.config.belief, 2, episode.belief_seed, episode.body) for _ in range(2))
+    for now in readings:
+        short = now[1]._replace(scan=now[1].scan[1:])
+        with pytest.raises(ValueError, match=r"readings\[1\].scan: .* shape \(32,\), got shape \(31,\)"):
+            refusing.step((now[0], short))
+        whole.step(now), refusing.step(now)
+        np.testing.assert_array_equal(refusing.poses, whole.poses)
+
+
 @pytest.mark.parametrize("observation_type", ["dict", "flat"])
 @pytest.mark.parametrize("action_type", ["continuous", "discrete", "goal"])
 def test_observations_are_inside_their_spaces(action_type: str, observation_type: str) -> None:
