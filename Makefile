@@ -10,7 +10,7 @@ demo: $(VENV)/.core  ## three robots explore an office, build maps and merge the
 	$(BIN)/vslam run --world office --robots 3 --policy frontier --seed 0
 
 test: lint  ## everything that must hold
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist worksteal
 
 lint: $(VENV)/.dev  ## style, types, and the direction of imports
 	$(BIN)/ruff check .
@@ -36,7 +36,7 @@ compat-%: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)-compat/$*
 	$(VENV)-compat/$*/bin/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[dev]"
 	$(VENV)-compat/$*/bin/python -m pip install --quiet --disable-pip-version-check $(OTHER)
-	$(VENV)-compat/$*/bin/python -m pytest
+	$(VENV)-compat/$*/bin/python -m pytest --numprocesses auto --maxprocesses 4 --dist worksteal
 
 $(VENV)/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit("vslam_env needs Python >= 3.11, but $(PYTHON) is " + sys.version.split()[0] + ": say make PYTHON=python3.11" if sys.version_info < (3, 11) else 0)'

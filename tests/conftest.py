@@ -4,6 +4,10 @@ import gc
 import os
 from pathlib import Path
 
+if worker := os.environ.get("PYTEST_XDIST_WORKER"):  # before numba: two processes cannot write to one cache safely
+    caches = Path(os.environ.get("NUMBA_CACHE_DIR", Path(__file__).parents[1] / ".pytest_cache" / "numba"))
+    os.environ["NUMBA_CACHE_DIR"] = str(caches / worker)
+
 import pytest
 from hypothesis import settings
 
