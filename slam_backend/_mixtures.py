@@ -7,7 +7,7 @@ import numpy as np
 from slam_backend import _kernels
 from slam_backend._best_map import slots_held
 from slam_backend._jit import any_order, jit
-from slam_backend._kernels.layout import SHIFT
+from slam_backend._kernels import LANES
 from slam_backend._particle_maps import ParticleMaps
 from slam_backend.errors import FloatArray, IntArray
 from slam_backend.reports import PoseEstimates
@@ -42,13 +42,13 @@ def _sum(weights: FloatArray, one: FloatArray, two: FloatArray, count: int) -> f
 @jit
 def _mix(
     slots: Any, row_of: Any, map_of: Any, maps: Any, values: Any, counts: Any, best: int, weights: FloatArray,
-    shift: int,
+    lanes: int,
 ) -> tuple[FloatArray, FloatArray, IntArray]:  # fmt: skip
     """Return means (n, 3), covariances (n, 3, 3) and counts (n,) of landmarks, see `map_mixture`.
 
-    The number of lanes is an argument, 2 to the `shift`: a compiled kernel would not notice a change in another file.
+    The number of lanes is an argument, for a compiled kernel would not notice that it changed in another file.
     """
-    padded, size, lanes = counts.shape[1], len(weights), 1 << shift
+    padded, size = counts.shape[1], len(weights)
     means, covariances = np.empty((len(slots), 3)), np.empty((len(slots), 3, 3))
     times = np.empty(len(slots), np.int64)
     shares, own, ones = np.empty(size), np.empty((9, size)), np.ones(size)
@@ -59,7 +59,7 @@ def _mix(
         for m in range(size):
             place = maps[ancestors, m] if ancestors > 0 else m
             if counts[row, place] > 0:
-                at = row * 9 * padded + (place >> shift) * 9 * lanes + (place & (lanes - 1))
+                at = row * 9 * padded + place // lanes * 9 * lanes + place % lanes
                 for c in range(9):
                     own[c, holders] = values[at + c * lanes]
                 shares[holders] = weights[m]
@@ -100,6 +100,6 @@ def map_mixture(
     """
     slots = slots_held(maps, best, min_count)
     means, covariances, times = _mix(
-        slots, maps.row_of, maps.map_of, maps.maps, maps.values, maps.counts, best, np.exp(log_weights), SHIFT
+        slots, maps.row_of, maps.map_of, maps.maps, maps.values, maps.counts, best, np.exp(log_weights), LANES
     )
     return means, covariances, maps.descriptors[slots], times, maps.ids[slots]

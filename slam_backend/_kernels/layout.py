@@ -4,7 +4,8 @@ import math
 
 import numpy as np
 
-LANES = 64
+# Whole vectors of four numbers; of the 50, 100, 200 or 1000 particles that people ask for no more than 4 % are surplus.
+LANES = 52
 REJECTED = -1
 MIN_DEPTH = 0.05  # [m]; nothing is predicted nearer to the camera plane than this
 FARTHEST = float(np.finfo(np.float64).max)  # the largest squared distance that is not infinite
@@ -34,5 +35,5 @@ QJ00, QJ01, QJ02, QJ11, QJ12, QJ22, QG0, QG1, QG2 = (LANES * k for k in range(9)
 Q_SQUARE, Q_DET, Q_DET_POSE, Q_DEPTH, Q_METRES2, Q_D, Q_FIRST_D, Q_HELD = (LANES * k for k in range(9, 17))
 CANDIDATE_ROWS = 17
 
-TILE = 9 * LANES
-SHIFT = LANES.bit_length() - 1  # particle m is lane m & (LANES - 1) of block m >> SHIFT
+TILE = 9 * LANES  # particle m is lane m % LANES of block m // LANES
+BLOCK = np.uint32(LANES)  # to divide by: unsigned numbers take half the instructions

@@ -3,7 +3,7 @@
 import numpy as np
 
 from slam_backend._jit import jit, lanes, lanes_inlined
-from slam_backend._kernels.layout import LANES, SHIFT, TILE
+from slam_backend._kernels.layout import BLOCK, LANES, TILE
 from slam_backend.errors import Float32Array, FloatArray, Int32Array, IntArray
 
 
@@ -30,8 +30,9 @@ def _copy_row(
     for m in range(len(ancestors)):
         ancestor = np.uint32(ancestors[m])  # unsigned: none counts from the end
         if ancestor != m:
-            at = (ancestor >> SHIFT) * TILE + (ancestor & (LANES - 1))
-            to = (m >> SHIFT) * TILE + (m & (LANES - 1))
+            own = np.uint32(m)
+            at = np.int64(ancestor // BLOCK) * TILE + np.int64(ancestor % BLOCK)
+            to = np.int64(own // BLOCK) * TILE + np.int64(own % BLOCK)
             seen[m] = before[ancestor]
             for c in range(9):
                 target[to + c * LANES] = source[at + c * LANES]

@@ -43,7 +43,7 @@ def holding(
     The fit of each particle is one of least squares, landmarks weighed by the inverse of how much they scatter.
 
     Args:
-        tiles: (l, P / 64, 9, 64) float64. Means and covariances of landmarks, by lanes.
+        tiles: (l, P / LANES, 9, LANES) float64. Means and covariances of landmarks, by lanes.
         seen: (n,) int64. Which of them are now seen.
         landmarks: (l, 3) float64 [m]. All of them in the most probable path.
         poses: (K, 3, M) float64 [m, m, rad], map frame. Newest poses of the particles.
@@ -93,7 +93,7 @@ def move_poses(poses: FloatArray, motions: FloatArray, chosen: IntArray) -> None
 
 
 def move_tiles(tiles: FloatArray, motions: FloatArray) -> None:
-    """Move landmarks (l, P / 64, 9, 64) of each particle, in place, by its motion (M, 3); surplus lanes stay."""
+    """Move landmarks (l, P / LANES, 9, LANES) of each particle, in place, by its motion (M, 3); surplus lanes stay."""
     blocks = tiles.shape[1]
     rows = np.zeros((4, blocks * LANES))
     rows[0], rows[1, : len(motions)] = 1.0, np.sin(motions[:, 2])

@@ -50,7 +50,7 @@ class Particles:
         log_densities: (M,) float64. Of the newest poses under the Gaussian about the mode, up to a constant: 0 for the
             first particle, whose path is the mode, unless more than M were drawn.
         ids: (l,) int64. Landmarks that have a sighting.
-        tiles: (l, P / 64, 9, 64) float64. Their means (3) and covariances (6), map frame, in blocks of lanes.
+        tiles: (l, P / LANES, 9, LANES) float64. Their means (3) and covariances (6), map frame, in blocks of lanes.
         counts: (l,) int64. Measurements of each.
         means, covariances: (K, 3), (K, 3, 3) float64. The newest poses under the Gaussian about the mode.
         frame: (3, 3) float64 [m, m, rad]. Covariance of the motion of the whole map that the particles do not show.

@@ -22,7 +22,7 @@ class Draws:
 
     Attributes:
         poses: (k, 3, M) float64 [m, m, rad], map frame.
-        tiles: (l, P / 64, 9, 64) float64. Means (3) and covariances (6) of the landmarks, map frame, by lanes.
+        tiles: (l, P / LANES, 9, LANES) float64. Means (3) and covariances (6) of the landmarks, map frame, by lanes.
         log_weights: (M,) float64. Importance weights, not normalised.
         spreads: (k,) float64 [m^2]. How far the motions from the keys before scatter, headings felt at `LEVER`.
     """
@@ -74,7 +74,7 @@ def draw_paths(graph: PathGraph, mode: Mode, num_particles: int, rng: np.random.
 
 
 def drawn_spreads(graph: PathGraph, mode: Mode, rng: np.random.Generator) -> FloatArray:
-    """Return how far the motions from the keys before scatter (k,) [m^2] over `LANES` paths, each to 12 % or so.
+    """Return how far the motions from the keys before scatter (k,) [m^2] over `LANES` paths, each to 14 % or so.
 
     Args:
         graph: Odometry and measurements.
@@ -101,7 +101,7 @@ def lane_rows(poses: FloatArray) -> FloatArray:
         poses: (k, 3, M) float64 [m, m, rad], map frame.
 
     Returns:
-        (P / 64, k, 5, 64) float64: x, y, cos, sin, heading.
+        (P / LANES, k, 5, LANES) float64: x, y, cos, sin, heading.
     """
     k, _, m = poses.shape
     rows = np.empty((-(-m // LANES), k, POSE_ROWS, LANES))
@@ -119,7 +119,7 @@ def replay(mode: Mode, rows: FloatArray, num_particles: int) -> tuple[FloatArray
         num_particles: M.
 
     Returns:
-        (l, P / 64, 9, 64) means and covariances in blocks of lanes, zeros where a landmark has no sighting; (M,).
+        (l, P / LANES, 9, LANES) means and covariances in blocks of lanes, zeros where a landmark has no sighting; (M,).
     """
     blocks, k = rows.shape[:2]
     seen = mode.sightings

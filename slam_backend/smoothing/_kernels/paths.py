@@ -6,7 +6,7 @@ from slam_backend._jit import jit, lanes
 from slam_backend.errors import FloatArray, IntArray
 from slam_backend.smoothing._kernels.equations import WEAK
 
-LANES = 64
+LANES = 52  # as in the filter, which takes over tiles as they are
 
 # Rows of a block of poses and of the workspace of `replay`.
 PX, PY, COS, SIN, HEADING = (LANES * k for k in range(5))
@@ -22,7 +22,7 @@ def to_lanes(poses: FloatArray, cosines: FloatArray, sines: FloatArray, rows: Fl
     Args:
         poses: (k, 3, M) float64 [m, m, rad].
         cosines, sines: (k, M) of the headings.
-        rows: (P / 64, k, 5, 64), result: x, y, cos, sin, heading.
+        rows: (P / LANES, k, 5, LANES), result: x, y, cos, sin, heading.
     """
     num_paths = poses.shape[2]
     for block in range(len(rows)):

@@ -74,7 +74,7 @@ def test_landmarks_are_moved_as_one_by_one():
     before = tiles.copy()
     move_tiles(tiles, motions)
     np.testing.assert_allclose(unlaned(tiles, 70), moved_plainly(values, motions), atol=1e-12)
-    np.testing.assert_array_equal(tiles[:, 1, :, 6:], before[:, 1, :, 6:])
+    np.testing.assert_array_equal(tiles[:, 1, :, 70 - LANES :], before[:, 1, :, 70 - LANES :])
 
 
 def test_a_scattered_frame_scatters_poses_and_points():
