@@ -67,8 +67,8 @@ class ExplorationEnv(EnvKnowledge):
         self.config = dataclasses.replace(config, reward={term.name: term.weight for term in self._terms})
         self.possible_agents = config.agents
         self.agents: list[AgentID] = []
-        goal, flat = config.action_type == "goal", config.observation_type == "flat"
-        self._observed = observation_space(config.scan.num_rays, config.scan.max_range, goal, flat)
+        self._shown_as = config.action_type == "goal", config.observation_type == "flat"
+        self._observed = observation_space(config.scan.num_rays, config.scan.max_range, *self._shown_as)
         if config.observe_images and isinstance(self._observed, spaces.Dict):
             shape = (config.stereo.camera.height, config.stereo.camera.width, 1)
             image = spaces.Box(0, 255, shape, np.uint8)
@@ -123,8 +123,7 @@ class ExplorationEnv(EnvKnowledge):
         self._drivers = Drivers(self.config)
         self._standing = self._episode.standing()
         nothing = dict.fromkeys((term.name for term in self._terms), self._nothing)
-        observations = observations_of(self.agents, self._episode, self.config)
-        return observations, self._infos(nothing, [0] * len(self.agents))
+        return self._observations(), self._infos(nothing, [0] * len(self.agents))
 
     def step(
         self, actions: Mapping[AgentID, Any]
@@ -163,7 +162,7 @@ class ExplorationEnv(EnvKnowledge):
         terminated = goal is not None and bool(self._standing.map_recalls.min() >= goal)
         truncated = not terminated and self._cycle >= self.max_cycles
         results = (
-            observations_of(agents, episode, self.config),
+            self._observations(),
             dict(zip(agents, rewards.tolist(), strict=True)),
             dict.fromkeys(agents, terminated),
             dict.fromkeys(agents, truncated),
@@ -252,6 +251,11 @@ class ExplorationEnv(EnvKnowledge):
         return _unpickled, (made_from, self.max_cycles, self.get_state())
 
     # ------------------------------------------------------------------ within
+
+    def _observations(self) -> dict[AgentID, Any]:
+        """Return each agent's observation after the last tick."""
+        episode = self._running_episode("step")
+        return observations_of(self.possible_agents, episode.belief, episode.readings, *self._shown_as)
 
     def _infos(self, terms: Mapping[str, FloatArray], invalid: list[int]) -> dict[AgentID, dict[str, Any]]:
         """Return each agent's figures after a step that paid `terms`."""

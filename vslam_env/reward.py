@@ -61,7 +61,7 @@ class RewardTerm(Protocol):
         """What the term is multiplied with."""
 
     def __call__(self, before: Standing, after: Standing) -> FloatArray:
-        """Return what each robot gains (K,) by a step, unweighted."""
+        """Return what each robot gains (K,) by a step, unweighted. Neither standing may be written to."""
 
 
 @dataclass(frozen=True, slots=True)

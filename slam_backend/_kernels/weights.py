@@ -50,7 +50,7 @@ def mixture(
     """Write mean (3,) and covariance (3, 3) of a weighted mixture of Gaussian poses.
 
     Args:
-        means: (3, P), headings averaged on the circle.
+        means: (3, P), P >= M whole blocks of lanes; headings averaged on the circle.
         covariances: (6, P), upper triangles.
         weights: (M,), summing to 1.
     """
