@@ -3,9 +3,11 @@ import pytest
 from scipy.stats import chi2
 from small_problems import TIGHT, camera_of, graph_of, small_run, upper
 
+from slam_backend._kernels import LANES as FILTER_LANES
 from slam_backend.errors import FloatArray
 from slam_backend.motion import OdometryModel
 from slam_backend.run_log import RobotLog
+from slam_backend.smoothing._kernels import LANES
 from slam_backend.smoothing.extending import extended
 from slam_backend.smoothing.graph import PathGraph
 from slam_backend.smoothing.sampling import draw_paths, drawn_spreads, lane_rows, replay, weigh_odometry
@@ -172,9 +174,14 @@ def test_lanes_are_filled_up_with_the_first_path():
     """Positions, cosine, sine and heading of each path lie lane by lane; the surplus is a copy."""
     poses = np.random.default_rng(9).normal(size=(4, 3, 70))
     rows = lane_rows(poses)
-    assert rows.shape == (2, 4, 5, 64)
-    lanes = rows.transpose(1, 2, 0, 3).reshape(4, 5, 128)
+    assert rows.shape == (2, 4, 5, LANES)
+    lanes = rows.transpose(1, 2, 0, 3).reshape(4, 5, 2 * LANES)
     np.testing.assert_array_equal(lanes[:, [0, 1, 4], :70], poses)
     np.testing.assert_allclose(lanes[:, 2, :70], np.cos(poses[:, 2]), rtol=1e-15)
     np.testing.assert_allclose(lanes[:, 3, :70], np.sin(poses[:, 2]), rtol=1e-15)
-    np.testing.assert_array_equal(lanes[:, :, 70:], np.repeat(lanes[:, :, :1], 58, axis=2))
+    np.testing.assert_array_equal(lanes[:, :, 70:], np.repeat(lanes[:, :, :1], 2 * LANES - 70, axis=2))
+
+
+def test_tiles_fit_the_filters_maps():
+    """The filter takes the smoother's tiles as they are, so both have as many lanes."""
+    assert LANES == FILTER_LANES
