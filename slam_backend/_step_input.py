@@ -74,7 +74,7 @@ def _check_move(robot: int, move: Any) -> FloatArray:
         x, y, turn = move.tolist()
         far = FARTHEST_MOVE
         if -far <= x <= far and -far <= y <= far and -far <= turn <= far:  # NaN is not
-            return np.array(move)
+            return np.asarray(move.copy())
     cure = "Give the motion (dx, dy, dtheta) in the previous robot frame, or None."
     checked = check_array(f"odometry[{robot}]", move, (3,), cure)
     if np.abs(checked).max() > FARTHEST_MOVE:

@@ -101,7 +101,8 @@ def merge_groups(
     if merging.watch_steps:
         new_ids = dict(renamed.tolist())
         older = [*(watch.copy() for watch in a.watches), *(watch.copy(new_ids) for watch in b.watches)]
-        sides, before = (Side(a.get_state()), Side(b.get_state())), (a.filter.map("mixture"), b.filter.map("mixture"))
+        sides = Side.of(a.get_state()), Side.of(b.get_state())
+        before = a.filter.map("mixture"), b.filter.map("mixture")
         fresh = begin_watch(number, alignment, sides, before, renamed, pairs)
         trunk.watches = [*sorted(older, key=lambda watch: watch.number), fresh]
     renaming = Renaming(a.robots, b.robots, renamed, (a.number, b.number, number))

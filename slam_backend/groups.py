@@ -134,13 +134,7 @@ def _oldest_unknown(branch: Branch, now: int) -> int:
     if not branch.watches and len(branch.live) == len(branch.robots):
         return now + 1
     held = [1 + last for robot, last in branch.known.items() if robot not in branch.live]
-    return min([now + 1, *held, *(_oldest_of(watch) for watch in branch.watches)])
-
-
-def _oldest_of(watch: Watch) -> int:
-    """Return the first step that an undo of a merge, or of earlier ones in its sides, would take in."""
-    own: list[int] = [1 + min(side.trunk["known"].values()) for side in watch.sides]
-    return min([*own, *(_oldest_of(older) for side in watch.sides for older in side.watches)])
+    return min([now + 1, *held, *(side.oldest for watch in branch.watches for side in watch.sides)])
 
 
 def _numbers(watch: Watch) -> set[int]:

@@ -1,5 +1,6 @@
 """What one robot's camera reports in one step: points, descriptors and, if the sensor knows them, covariances."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -62,6 +63,24 @@ class Measurements:
             object.__setattr__(self, name, array)
         object.__setattr__(self, "covariances", None)
         return self
+
+    @classmethod
+    def _trusted_frames(
+        cls, points: FloatArray, descriptors: NDArray[np.float32], counts: Sequence[int]
+    ) -> "list[Measurements]":
+        """Do the same for several robots, so many points (n_i) of each one after the other."""
+        points.setflags(write=False)  # and so all views of them
+        descriptors.setflags(write=False)
+        frames, begin, put = [], 0, object.__setattr__
+        for count in counts:
+            end = begin + count
+            frame = object.__new__(cls)
+            put(frame, "points", points[begin:end])
+            put(frame, "descriptors", descriptors[begin:end])
+            put(frame, "covariances", None)
+            frames.append(frame)
+            begin = end
+        return frames
 
     @classmethod
     def empty(cls, descriptor_size: int = 64) -> "Measurements":

@@ -92,6 +92,7 @@ class TeamSlam(TeamKnowledge):
         self._numbered: list[tuple[int, int]] = []  # what `_dropped` went by
         self._step = 0
         self._epoch = 0
+        self._size = 0  # of descriptors, as far as is known
 
     # ------------------------------------------------------------------ one step
 
@@ -272,8 +273,10 @@ class TeamSlam(TeamKnowledge):
         return [MapDropped(number) for number in gone]
 
     def _descriptor_size(self) -> int:
-        """Return the length of the descriptors in use, 0 before the first one."""
-        return max([branch.filter.descriptor_size for group in self._groups for branch in group.branches])
+        """Return the length of the descriptors in use, 0 before the first one; it stays the same from there on."""
+        if not self._size:
+            self._size = max([branch.filter.descriptor_size for group in self._groups for branch in group.branches])
+        return self._size
 
     # ------------------------------------------------------------------ snapshots
 
@@ -314,7 +317,7 @@ class TeamSlam(TeamKnowledge):
         self._events = list(state["events"])
         at_hand = {group.robots: group.trunk.filter for group in self._groups}  # filling is faster than building
         self._groups = [Group.from_state(group, at_hand) for group in state["groups"]]
-        self._places, self._numbered = [], []
+        self._places, self._numbered, self._size = [], [], 0
         self._numbers = set(state["numbers"])
         self._alignment, self._merging = state["alignment"], state["merging"]
         self._schedule.set_state(state["schedule"])

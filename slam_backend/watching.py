@@ -34,9 +34,17 @@ class Side:
 
     Attributes:
         trunk: State of its joint filter's branch, the watches of earlier merges among it.
+        oldest: The first step that an undo of the merge, or of earlier ones, would take in.
     """
 
     trunk: Mapping[str, Any]
+    oldest: int
+
+    @classmethod
+    def of(cls, trunk: Mapping[str, Any]) -> "Side":
+        """Return a side with this trunk."""
+        earlier = [side.oldest for watch in trunk["watches"] for side in watch.sides]
+        return cls(trunk, min([1 + min(trunk["known"].values()), *earlier]))
 
     @property
     def robots(self) -> tuple[int, ...]:
@@ -83,12 +91,14 @@ class Watch:
     def note(self, robots: Sequence[int], report: StepReport) -> None:
         """Note which side has found which landmarks, from a step of the joint filter of `robots`."""
         for robot, ids in zip(robots, report.created, strict=True):
-            if len(ids):
-                self.own[robot not in self.sides[0].robots].update(ids[ids >= 0].tolist())
+            names = [name for name in ids.tolist() if name >= 0]
+            if names:
+                self.own[robot not in self.sides[0].robots].update(names)
 
     def together(self, live: Sequence[int]) -> bool:
         """Tell whether robots of both sides are among those that go by the joint filter."""
-        return all(any(robot in side.robots for robot in live) for side in self.sides)
+        here = set(live)
+        return not (here.isdisjoint(self.sides[0].robots) or here.isdisjoint(self.sides[1].robots))
 
     def is_contradicted(self, joint: LandmarkMap, merging: MergeOptions, options: AlignmentOptions) -> bool:
         """Tell whether the joint map, with mixture covariances, contradicts the merge by its shape or by its places."""

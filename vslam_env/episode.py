@@ -209,7 +209,6 @@ class Episode:
         """Return what each robot reads in this tick, the truth only where an oracle tells it."""
         config, frames = self._config, self.frames
         nothing = [None] * config.num_robots
-        images = [frame.left for frame in frames if isinstance(frame, EyeFrame)]
         return tuple(
             map(
                 Readings,
@@ -220,7 +219,7 @@ class Episode:
                 between(self.true_starts, poses) if config.oracle_pose else nothing,
                 [frame.true_ids for frame in frames] if config.oracle_association else nothing,
                 nothing if heard is None else heard,
-                images if config.observe_images else nothing,
+                [frame.left for frame in frames if isinstance(frame, EyeFrame)] if config.observe_images else nothing,
             )
         )
 

@@ -209,9 +209,13 @@ def scans_of(readings: Sequence[Readings], num_rays: int) -> FloatArray:
     Raises:
         ValueError: If one has another number of rays.
     """
-    scans = [reading.scan for reading in readings]
-    for robot, scan in enumerate(scans):
-        if np.shape(scan) != (num_rays,):
-            name, cure = f"readings[{robot}].scan", "Give a range for each ray."
-            raise bad_argument(name, f"an array of shape ({num_rays},)", f"shape {np.shape(scan)}", cure)
-    return np.array(scans, np.float64)
+    try:
+        scans = np.array([reading.scan for reading in readings], np.float64)
+    except ValueError:  # they have several shapes
+        scans = np.empty(0)
+    if scans.shape == (len(readings), num_rays):
+        return scans
+    shapes = [np.shape(reading.scan) for reading in readings]
+    robot = next(robot for robot, shape in enumerate(shapes) if shape != (num_rays,))
+    name, cure = f"readings[{robot}].scan", "Give a range for each ray."
+    raise bad_argument(name, f"an array of shape ({num_rays},)", f"shape {shapes[robot]}", cure)

@@ -235,8 +235,8 @@ def test_a_refused_state_leaves_the_environment_alone() -> None:
         (lambda content: content[: len(content) // 2], "path: expected a whole file of a state, got a damaged file"),
         (lambda content: b"hello" + content, "path: expected the file of a state"),
         (
-            lambda content: content.replace(f"state {STATE_FORMAT}/".encode(), b"state 9/", 1),
-            r"expected a state of version .*got '9/",
+            lambda content: content.replace(f"state {STATE_FORMAT}/".encode(), b"state 999/", 1),
+            r"expected a state of version .*got '999/",
         ),
         (
             lambda content: content[: content.index(b"\n") + 1] + pickle.dumps(3),

@@ -1,6 +1,7 @@
 """The landmark sensor: true poses become noisy measurements of the landmarks that each camera sees."""
 
 from dataclasses import dataclass, field
+from itertools import accumulate
 
 import numpy as np
 
@@ -110,7 +111,9 @@ class LandmarkSensor:
         poses = np.ascontiguousarray(poses, dtype=np.float64)
         robots, most = len(poses), config.max_measurements
         visible = self.visible(poses)
-        num_false = np.minimum(rng.poisson(config.false_points, robots), most)
+        num_false = rng.poisson(config.false_points, robots)
+        if max(num_false.tolist()) > most:
+            num_false = np.minimum(num_false, most)
         keys = rng.random(visible.shape)
         ids, counts = np.empty(robots * most, np.int64), np.empty(robots, np.int64)
         total = kernels.choose(visible, keys, config.detection_probability, num_false, most, ids, counts)
@@ -131,12 +134,10 @@ class LandmarkSensor:
         if num_sharp < len(ids):
             counts = np.bincount(np.repeat(np.arange(robots), counts)[sharp], minlength=robots)
             ids, points, looks = ids[sharp], points[sharp], looks[sharp]
-        frames, begin = [], 0
-        for count in counts.tolist():
-            end = begin + count
-            frames.append(Frame(Measurements._trusted(points[begin:end], looks[begin:end]), ids[begin:end]))
-            begin = end
-        return frames
+        each = counts.tolist()
+        firsts = accumulate(each, initial=0)
+        own_ids = [ids[first : first + count] for first, count in zip(firsts, each, strict=False)]
+        return list(map(Frame, Measurements._trusted_frames(points, looks, each), own_ids))
 
     def _false_points(self, count: int, rng: np.random.Generator) -> FloatArray:
         """Draw points (count, 3) [m], camera frame, in the view: uniform in the image and in depth."""
