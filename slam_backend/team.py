@@ -8,29 +8,21 @@ team watches whether its maps contradict each other, and if they do it undoes th
 their group go on with a fork of the joint filter, which is told on their return what they have read meanwhile.
 """
 
-import copy
-from collections.abc import Mapping, Sequence
-from dataclasses import fields
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from slam_backend._step_input import check_step
-from slam_backend.alignment import Alignment, AlignmentOptions
-from slam_backend.attempts import AttemptOptions, AttemptSchedule
+from slam_backend.alignment import Alignment
 from slam_backend.branches import Branch, take_in
 from slam_backend.contacts import check_contacts, reach
-from slam_backend.errors import IntArray, bad_argument, check_int, check_seed
-from slam_backend.filter import FastSlam
-from slam_backend.filter_options import FilterOptions
+from slam_backend.errors import IntArray, bad_argument
 from slam_backend.group_changes import contradicted, merge_groups, undone
 from slam_backend.groups import Group
 from slam_backend.input_log import RobotInput
 from slam_backend.measurements import Measurements
-from slam_backend.merge_options import MergeOptions
 from slam_backend.merging import inverse_alignment
-from slam_backend.records import Records
 from slam_backend.reports import MapDropped, MergeEvent, RejuvenationReport, Renaming, TeamReport
 from slam_backend.team_knowledge import TeamKnowledge
 from slam_backend.trying import attempt, speakers
@@ -51,48 +43,6 @@ class TeamSlam(TeamKnowledge):
     Raises:
         ValueError: If an argument is unknown or out of its range; the text names it.
     """
-
-    def __init__(
-        self,
-        num_robots: int,
-        alignment: AlignmentOptions | None = None,
-        seed: int | np.random.SeedSequence = 0,
-        attempts: AttemptOptions | None = None,
-        merging: MergeOptions | None = None,
-        **fastslam_options: Any,
-    ) -> None:
-        count = check_int("num_robots", num_robots, 1, "A team has at least one robot.")
-        known = {field.name for field in fields(FilterOptions)}
-        for name in fastslam_options:
-            if name not in known:
-                cure = f"Options of the filters are {', '.join(sorted(known))}."
-                raise bad_argument(name, "a known argument", "a name that no option has", cure)
-        options = FilterOptions(**fastslam_options)
-        for name, value, kind in (
-            ("alignment", alignment, AlignmentOptions),
-            ("attempts", attempts, AttemptOptions),
-            ("merging", merging, MergeOptions),
-        ):
-            if value is not None and not isinstance(value, kind):
-                raise bad_argument(name, f"{kind.__name__} or None", value, f"Build one: {kind.__name__}(...).")
-        if isinstance(seed, np.random.Generator):
-            raise bad_argument("seed", "an int >= 0 or a SeedSequence", seed, "A team spawns a stream for each robot.")
-        sequence = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(check_seed(seed))
-        own, *streams, of_forks = sequence.spawn(2 + count)
-        self._rng = np.random.default_rng(own)
-        self._alignment = AlignmentOptions() if alignment is None else alignment
-        self._merging = MergeOptions() if merging is None else merging
-        self._schedule = AttemptSchedule(AttemptOptions() if attempts is None else attempts, self._alignment)
-        groups = [
-            Group(Branch((robot,), (robot,), FastSlam.from_options(1, options, rng), {robot: -1}, robot))
-            for robot, rng in enumerate(map(np.random.default_rng, streams))
-        ]
-        super().__init__(groups, Records(count, of_forks))
-        self._numbers = set(range(count))
-        self._numbered: list[tuple[int, int]] = []  # what `_dropped` went by
-        self._step = 0
-        self._epoch = 0
-        self._size = 0  # of descriptors, as far as is known
 
     # ------------------------------------------------------------------ one step
 
@@ -277,48 +227,3 @@ class TeamSlam(TeamKnowledge):
         if not self._size:
             self._size = max([branch.filter.descriptor_size for group in self._groups for branch in group.branches])
         return self._size
-
-    # ------------------------------------------------------------------ snapshots
-
-    _KEYS = ("step", "epoch", "rng", "events", "groups", "numbers", "alignment", "merging", "schedule", "records")
-
-    def get_state(self) -> dict[str, Any]:
-        """Return all that decides how the team goes on, random streams included.
-
-        What is never written to (snapshots kept for an undo, readings, reports) is shared, all else is copied.
-        """
-        return {
-            "step": self._step,
-            "epoch": self._epoch,
-            "rng": copy.deepcopy(self._rng.bit_generator.state),
-            "events": tuple(self._events),
-            "groups": [group.get_state() for group in self._groups],
-            "numbers": sorted(self._numbers),
-            "alignment": self._alignment,
-            "merging": self._merging,
-            "schedule": self._schedule.get_state(),
-            "records": self._records.get_state(),
-        }
-
-    def set_state(self, state: Mapping[str, Any]) -> None:
-        """Go on exactly as the team that gave `state`.
-
-        Raises:
-            ValueError: If `state` is not one of `get_state`, or of a team of another size.
-        """
-        missing = [key for key in self._KEYS if not isinstance(state, Mapping) or key not in state]
-        if missing:
-            raise bad_argument("state", "a dict from TeamSlam.get_state", f"no {missing[0]!r}", "Pass it unchanged.")
-        count = sum(len(group["branches"][0]["robots"]) for group in state["groups"])
-        if count != self.num_robots:
-            raise bad_argument("state", f"one of {self.num_robots} robots", count, "Build a team of the same size.")
-        self._step, self._epoch = state["step"], state["epoch"]
-        self._rng.bit_generator.state = copy.deepcopy(state["rng"])
-        self._events = list(state["events"])
-        at_hand = {group.robots: group.trunk.filter for group in self._groups}  # filling is faster than building
-        self._groups = [Group.from_state(group, at_hand) for group in state["groups"]]
-        self._places, self._numbered, self._size = [], [], 0
-        self._numbers = set(state["numbers"])
-        self._alignment, self._merging = state["alignment"], state["merging"]
-        self._schedule.set_state(state["schedule"])
-        self._records.set_state(state["records"])

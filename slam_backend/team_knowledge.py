@@ -4,30 +4,18 @@ from typing import Literal
 
 import numpy as np
 
+from slam_backend._team_state import TeamState
 from slam_backend.branches import Branch, restored_filter
 from slam_backend.errors import FloatArray, IntArray, bad_argument
 from slam_backend.geometry import inverse
 from slam_backend.groups import Group
 from slam_backend.landmark_map import LandmarkMap, MapOutline, TeamOutlines
-from slam_backend.records import Records
 from slam_backend.reports import MergeEvent, PoseEstimate
 from slam_backend.standpoints import Standpoints
 
 
-class TeamKnowledge:
-    """All that can be asked of a team.
-
-    Args:
-        groups: One for each robot, in their order.
-        records: Of the team.
-    """
-
-    def __init__(self, groups: list[Group], records: Records) -> None:
-        self._groups = groups
-        self._records = records
-        self._num_robots = len(groups)
-        self._events: list[MergeEvent] = []
-        self._places: list[tuple[Group, Branch, int]] = []  # of each robot; none while robots change theirs
+class TeamKnowledge(TeamState):
+    """All that can be asked of a team."""
 
     @property
     def num_robots(self) -> int:

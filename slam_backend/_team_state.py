@@ -1,0 +1,124 @@
+"""All that a team holds, from the groups to the random stream: begun, kept and restored."""
+
+import copy
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+
+from slam_backend.alignment import AlignmentOptions
+from slam_backend.attempts import AttemptOptions, AttemptSchedule
+from slam_backend.branches import Branch
+from slam_backend.errors import bad_argument, check_int, check_seed
+from slam_backend.filter import FastSlam
+from slam_backend.filter_options import FilterOptions
+from slam_backend.groups import Group
+from slam_backend.merge_options import MergeOptions
+from slam_backend.records import Records
+from slam_backend.reports import MergeEvent
+
+KEYS = ("step", "epoch", "rng", "events", "groups", "numbers", "alignment", "merging", "schedule", "records")
+
+
+class TeamState:
+    """What a team of K robots holds; the arguments are those of `TeamSlam`.
+
+    Attributes:
+        _groups: By ascending first robot.
+        _records: What they write down in common.
+        _events: All attempts, merges and undos so far, in order.
+        _places: Of each robot its group, the branch that it goes by, and its place in that; none while robots change
+            theirs.
+        _numbers: Of all maps that are in use, and `_numbered`: the branches and their watches as that was found.
+        _step: Number of the next step.
+        _epoch: How many merges and undos there were.
+        _size: Length of the descriptors, 0 before it is known.
+    """
+
+    def __init__(
+        self,
+        num_robots: int,
+        alignment: AlignmentOptions | None = None,
+        seed: int | np.random.SeedSequence = 0,
+        attempts: AttemptOptions | None = None,
+        merging: MergeOptions | None = None,
+        **fastslam_options: Any,
+    ) -> None:
+        count = check_int("num_robots", num_robots, 1, "A team has at least one robot.")
+        known = {field.name for field in fields(FilterOptions)}
+        for name in fastslam_options:
+            if name not in known:
+                cure = f"Options of the filters are {', '.join(sorted(known))}."
+                raise bad_argument(name, "a known argument", "a name that no option has", cure)
+        options = FilterOptions(**fastslam_options)
+        for name, value, kind in (
+            ("alignment", alignment, AlignmentOptions),
+            ("attempts", attempts, AttemptOptions),
+            ("merging", merging, MergeOptions),
+        ):
+            if value is not None and not isinstance(value, kind):
+                raise bad_argument(name, f"{kind.__name__} or None", value, f"Build one: {kind.__name__}(...).")
+        if isinstance(seed, np.random.Generator):
+            raise bad_argument("seed", "an int >= 0 or a SeedSequence", seed, "A team spawns a stream for each robot.")
+        sequence = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(check_seed(seed))
+        own, *streams, of_forks = sequence.spawn(2 + count)
+        self._rng = np.random.default_rng(own)
+        self._alignment = AlignmentOptions() if alignment is None else alignment
+        self._merging = MergeOptions() if merging is None else merging
+        self._schedule = AttemptSchedule(AttemptOptions() if attempts is None else attempts, self._alignment)
+        groups = [
+            Group(Branch((robot,), (robot,), FastSlam.from_options(1, options, rng), {robot: -1}, robot))
+            for robot, rng in enumerate(map(np.random.default_rng, streams))
+        ]
+        self._groups, self._records, self._num_robots = groups, Records(count, of_forks), count
+        self._events: list[MergeEvent] = []
+        self._places: list[tuple[Group, Branch, int]] = []
+        self._numbers = set(range(count))
+        self._numbered: list[tuple[int, int]] = []
+        self._step = 0
+        self._epoch = 0
+        self._size = 0
+
+    # ------------------------------------------------------------------ snapshots
+
+    def get_state(self) -> dict[str, Any]:
+        """Return all that decides how the team goes on, random streams included.
+
+        What is never written to (snapshots kept for an undo, readings, reports) is shared, all else is copied.
+        """
+        return {
+            "step": self._step,
+            "epoch": self._epoch,
+            "rng": copy.deepcopy(self._rng.bit_generator.state),
+            "events": tuple(self._events),
+            "groups": [group.get_state() for group in self._groups],
+            "numbers": sorted(self._numbers),
+            "alignment": self._alignment,
+            "merging": self._merging,
+            "schedule": self._schedule.get_state(),
+            "records": self._records.get_state(),
+        }
+
+    def set_state(self, state: Mapping[str, Any]) -> None:
+        """Go on exactly as the team that gave `state`.
+
+        Raises:
+            ValueError: If `state` is not one of `get_state`, or of a team of another size.
+        """
+        missing = [key for key in KEYS if not isinstance(state, Mapping) or key not in state]
+        if missing:
+            raise bad_argument("state", "a dict from TeamSlam.get_state", f"no {missing[0]!r}", "Pass it unchanged.")
+        count = sum(len(group["branches"][0]["robots"]) for group in state["groups"])
+        if count != self._num_robots:
+            raise bad_argument("state", f"one of {self._num_robots} robots", count, "Build a team of the same size.")
+        self._step, self._epoch = state["step"], state["epoch"]
+        self._rng.bit_generator.state = copy.deepcopy(state["rng"])
+        self._events = list(state["events"])
+        at_hand = {group.robots: group.trunk.filter for group in self._groups}  # filling is faster than building
+        self._groups = [Group.from_state(group, at_hand) for group in state["groups"]]
+        self._places, self._numbered, self._size = [], [], 0
+        self._numbers = set(state["numbers"])
+        self._alignment, self._merging = state["alignment"], state["merging"]
+        self._schedule.set_state(state["schedule"])
+        self._records.set_state(state["records"])
