@@ -7,7 +7,8 @@ from training.env_timing import PEER, StepTimes
 from training.text_tables import console_table
 from training.timed_bench import print_caveats, print_goals
 
-TIMES = ("median", "mean", "99 %", "least", "undisturbed", "per s", "by mean")  # undisturbed: median over best repeats
+# "Undisturbed": the median over each call's best repeat. "Per s": by the median, then by the mean.
+TIMES = ("median", "mean", "99 %", "least", "undis-\nturbed", "per s", "by mean")
 
 
 def print_env_result(console: Console, result: EnvBenchResult, asked_peer: bool) -> None:
@@ -29,6 +30,9 @@ def print_env_result(console: Console, result: EnvBenchResult, asked_peer: bool)
     }
     beside = [(name, *_times(times)) for name, times in others.items() if times is not None]
     console.print(console_table(f"Beside [us]; {PEER} has neither walls nor SLAM", ("", *TIMES), beside))
+    if result.rows and result.peer is not None:
+        ratio = result.rows[0].times.undisturbed_us / result.peer.undisturbed_us
+        console.print(f"Undisturbed, the first row takes {ratio:.2f} times what simple_spread does.", highlight=False)
     if asked_peer and result.peer is None and result.complete:
         console.print(f"{PEER} is not installed: no peer was timed (pip install {PEER}).", highlight=False)
     print_goals(console, result.goals())
