@@ -172,6 +172,10 @@ class TeamBelief:
         """Return the cells (300, 300) uint8 of a robot's seen grid; a read-only view that follows its changes."""
         return self._grids[robot].cells
 
+    def candidate(self, robot: int, slot: int) -> tuple[FloatArray, float] | None:
+        """Return the goal (2,) [m] of a robot's slot and where to look from there [rad]; None if it is empty."""
+        return self._slots[robot].candidate(slot)
+
     def belief(self, robot: int) -> Belief:
         """Return what a robot believes after the last tick."""
         if robot not in self._beliefs:

@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 
 from slam_backend.errors import FloatArray
 from vslam_env.actions import MAX_SPEED, MAX_TURN, command_of
-from vslam_env.belief import Belief
 from vslam_env.config import EnvConfig
 from vslam_env.episode import Episode
 from vslam_env.navigation import follow_path, plan_path
@@ -25,20 +24,18 @@ class GoalDriver:
         self._heading = 0.0
         self._path: FloatArray | None = None
 
-    def choose(self, belief: Belief, action: int) -> bool:
-        """Head for the candidate of slot `action` - 1, or stay with 0.
+    def choose(self, candidate: tuple[FloatArray, float] | None, pose: FloatArray, cells: NDArray[np.uint8]) -> None:
+        """Head for a goal (2,) [m], start frame, and look in a direction [rad] there; or stay with None.
 
-        Returns:
-            Whether the action was valid; a masked one acts as 0.
+        Args:
+            candidate: Goal and direction.
+            pose, cells: As of `command`.
         """
-        candidates = belief.candidates
-        valid = action == 0 or bool(candidates.valid[action - 1])
-        if action == 0 or not valid:
+        if candidate is None:
             self._goal = None
         else:
-            self._goal, self._heading = candidates.goals[action - 1], float(candidates.headings[action - 1])
-            self._path = plan_path(belief.grid.cells, belief.pose[:2], self._goal)
-        return valid
+            self._goal, self._heading = candidate
+            self._path = plan_path(cells, pose[:2], self._goal)
 
     def command(self, pose: FloatArray, cells: NDArray[np.uint8], bumped: bool) -> FloatArray:
         """Return the velocity command (2,) [m/s, rad/s] for the next tick.
@@ -92,10 +89,10 @@ class Drivers:
                 episode.advance(commands)
             return [0] * len(chosen)
         beliefs = episode.belief
-        valid = [
-            driver.choose(beliefs.belief(robot), action)
-            for robot, (driver, action) in enumerate(zip(self._drivers, chosen, strict=True))
-        ]
+        candidates = [beliefs.candidate(robot, action - 1) if action else None for robot, action in enumerate(chosen)]
+        poses = beliefs.poses
+        for robot, (driver, candidate) in enumerate(zip(self._drivers, candidates, strict=True)):
+            driver.choose(candidate, poses[robot], beliefs.cells(robot))
         for _ in range(self._ticks):
             poses, readings = beliefs.poses, episode.readings
             episode.advance(
@@ -104,7 +101,7 @@ class Drivers:
                     for robot, driver in enumerate(self._drivers)
                 ]
             )
-        return [int(not ok) for ok in valid]
+        return [int(action != 0 and found is None) for action, found in zip(chosen, candidates, strict=True)]
 
     def get_state(self) -> list[dict[str, Any]]:
         """Return where each robot is heading."""

@@ -161,6 +161,11 @@ class CandidateSlots:
         """How long the robot's paths to the goals were at the last update, (16,) float64 [m]; NaN in empty slots."""
         return self._rows[:, LENGTH].copy()
 
+    def candidate(self, slot: int) -> tuple[FloatArray, float] | None:
+        """Return the goal (2,) [m] of a slot and where to look from there [rad], start frame; None if it is empty."""
+        row = self._rows[slot]
+        return None if math.isnan(row[0]) else (row[XY].copy(), float(row[HEADING]))
+
     def update(self, cells: NDArray[np.uint8], pose: ArrayLike, teammates: ArrayLike = ()) -> None:
         """Bring the candidates up to date; meant to be called once a second.
 
