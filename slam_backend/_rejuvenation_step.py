@@ -21,13 +21,13 @@ from slam_backend.smoothing.graph import PathGraph
 from slam_backend.smoothing.reassociation import Refused, taken_up
 from slam_backend.smoothing.rejuvenation import Rejuvenation, rejuvenate
 from slam_backend.smoothing.slices import Draft, Smoother
+from slam_backend.smoothing.solving import NO_POSE
 
 CLOSURE = 3  # landmarks not seen for long that are matched in one step: a loop is closed
 SOONEST = 5  # after a fifth of the usual time at the earliest
 LEAST_ROWS = 8  # of each log in a slice, so that no more of them come while it is worked through
 PATIENCE = 2  # descents that fail in a row, where all is done at once, before something is given up
-NOTHING_TO_DO = ("no pose to seek", "odometry without noise", "poses that were given as exact")
-SCHEDULE = ("_asked", "_waited", "_read", "_closed", "_held", "_failures", "_exact", "_last_closing", "_count")
+SCHEDULE = ("_asked", "_waited", "_read", "_closed", "_failures", "_exact", "_last_closing", "_count")
 
 
 class RejuvenationStep:
@@ -42,13 +42,13 @@ class RejuvenationStep:
         assert options.rejuvenate_every is not None
         self._options = options
         self._every = options.rejuvenate_every
+        self._noiseless = options.motion.is_exact
         self._graph: PathGraph | None = None  # at its mode
         self._draft: Draft | None = None  # the same and a little more, on its way there
         self._asked = False  # for new particles now, whatever has been read since
         self._waited = 0  # steps since the last time
         self._read = 0  # measurements since then
         self._closed = False
-        self._held = False  # no slices until it is due: there is nothing to smooth
         self._failures = 0  # descents in a row
         self._exact = False  # a pose was given as exact: there never will be
         self._last_closing = 0  # step in which landmarks not seen for long were matched
@@ -66,13 +66,13 @@ class RejuvenationStep:
             for guesses, refused in zip(self._guesses, self._refused, strict=True):
                 guesses.clear()
                 refused.clear()
-        if not self._exact:
+        if not self._never:
             self._guesses[robot][step] = pose
 
     def note_refused(self, robot: int, step: int, ids: IntArray, descriptors: NDArray[np.float32]) -> None:
         """Remember what was neither matched nor new of all that a robot measured without names: ids (n,), looks."""
         refused = [row for row, name in enumerate(ids.tolist()) if name < 0]
-        if refused and not self._exact:
+        if refused and not self._never:
             rows = np.array(refused)
             self._refused[robot][step] = Refused(rows, descriptors[rows])
 
@@ -98,6 +98,13 @@ class RejuvenationStep:
     def asked(self) -> bool:
         """Whether it was told to `hasten`, and nothing has come of it yet."""
         return self._asked
+
+    @property
+    def _never(self) -> str:
+        """Why there never will be new particles; "" if there may be."""
+        if self._exact:
+            return "poses that were given as exact"
+        return "odometry without noise" if self._noiseless else ""
 
     @property
     def due(self) -> bool:
@@ -127,17 +134,18 @@ class RejuvenationStep:
         """
         due, options = self.due, self._options
         whole = options.smoothing.slice_steps is None
-        if not due and (whole or self._held or self._exact or self._rests(logs)):
+        if not due and (whole or self._never or self._rests(logs)):
             return None
         graph = PathGraph.at_uncertain_starts(starts) if self._graph is None else self._graph
         if self._exact or (self._graph is None and any(log.has_exact_poses for log in logs)):
             self._exact = True  # nobody may have noted it: a filter that is never rejuvenated is asked to, by a merge
+        if reason := self._never:
             self._rest()
-            return _told(graph, "poses that were given as exact")
+            return _told(graph, reason)
         smoother = Smoother(options.motion, camera, options.smoothing, rng)
         if whole:
             return self._whole(graph, self._new(logs, graph, maps, best), smoother, maps, best)
-        self._graph, self._held = graph, False
+        self._graph = graph
         if (draft := self._draft) is not None:
             outcome = smoother.descend(draft)
             return self._after(draft.graph, outcome, lambda: since(logs, graph, draft.graph), smoother)
@@ -218,9 +226,9 @@ class RejuvenationStep:
             self._guesses, looks_of(maps, self._options.descriptor_gate), places_of(maps, best),
         )  # fmt: skip
         self._rest()
-        if np.isfinite(result.ess):
+        if np.isfinite(result.ess) or result.reason == NO_POSE:
             self._keep(result.graph)
-        elif result.reason not in NOTHING_TO_DO:
+        else:
             self._failures += 1
             if self._failures == PATIENCE:
                 return self._lost(graph, graph, logs, smoother, result.reason)
@@ -237,13 +245,8 @@ class RejuvenationStep:
             self._keep(outcome)
         elif isinstance(outcome, Draft):
             self._draft = outcome
-        elif outcome not in NOTHING_TO_DO:
-            return self._lost(self._graph, tried, logs(), smoother, outcome)
-        elif self.due:
-            self._rest()
-            return _told(self._graph, outcome)
         else:
-            self._held = True
+            return self._lost(self._graph, tried, logs(), smoother, outcome)
         return None
 
     def _lost(

@@ -35,6 +35,12 @@ class OdometryModel:
         for name in ("sigma_along", "sigma_across", "sigma_heading", "sigma_turn", "floor_position", "floor_heading"):
             check_float(f"motion.{name}", getattr(self, name), "Give a standard deviation.", at_least=0.0)
 
+    @property
+    def is_exact(self) -> bool:
+        """Whether no odometry has any noise."""
+        of_motion = self.sigma_along, self.sigma_across, self.sigma_heading, self.sigma_turn
+        return not any((*of_motion, self.floor_position, self.floor_heading))
+
     def sigmas(self, odometry: FloatArray) -> FloatArray:
         """Return the standard deviations (3,) [m, m, rad] of an odometry reading (3,) [m, m, rad]."""
         dx, dy, turn = odometry.tolist()

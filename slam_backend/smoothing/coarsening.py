@@ -1,8 +1,8 @@
 """Fewer key poses: what is known best of a path becomes rigid, so that a long run needs no more room than a short one.
 
-Where the newest keys end, measurements are condensed once for all. If there are still more keys than allowed, those
-neighbours become one whose relative pose is known best: the second then stands rigidly to the first, what was measured
-from it is moved there, and the odometry between them is spent.
+Where the newest keys end, measurements are condensed once for all; where a robot waits, sooner. If there are still more
+keys than allowed, those neighbours become one whose relative pose is known best: the second then stands rigidly to the
+first, what was measured from it is moved there, and the odometry between them is spent.
 """
 
 from dataclasses import replace
@@ -16,6 +16,7 @@ from slam_backend.smoothing.options import SmoothingOptions
 from slam_backend.smoothing.sightings import Sightings
 from slam_backend.smoothing.solving import Mode
 
+MOST_FRAMES = 100  # of a fresh key whose measurements stay raw: a robot that waits takes frames without end
 CONTRADICTION = 2.0  # times the kernel's squared distance: measurements farther off are dropped for good
 OF_POINTS = ("points", "point_noises", "given", "point_frames", "point_landmarks")
 
@@ -23,8 +24,9 @@ OF_POINTS = ("points", "point_noises", "given", "point_frames", "point_landmarks
 def coarsened(graph: PathGraph, camera: FloatArray, options: SmoothingOptions) -> PathGraph:
     """Return the graph with old keys condensed and at most `most_keys` of them, if the fresh ones allow.
 
-    Odometry is chained over old keys from which nothing was measured; they go if they have a successor. Landmarks and
-    frames that nothing is left of go as well.
+    A fresh key's measurements stay raw unless more than `MOST_FRAMES` frames stand to it. Odometry is chained over old
+    keys from which nothing was measured; they go if they have a successor. Landmarks and frames that nothing is left of
+    go as well.
 
     Args:
         graph: At its mode, with what is known there of its spreads; see `at_mode`.
@@ -32,8 +34,9 @@ def coarsened(graph: PathGraph, camera: FloatArray, options: SmoothingOptions) -
         options: How many keys, and how many of them fresh, of all robots together.
     """
     fresh = _fresh(graph, options)
-    graph, seen = _consistent(graph, fresh, camera, options)
-    rows = np.flatnonzero(seen.frozen | ~fresh[seen.keys])  # what is frozen from now on
+    raw = fresh & (np.bincount(graph.frame_keys, minlength=graph.num_keys) <= MOST_FRAMES)
+    graph, seen = _consistent(graph, raw, camera, options)
+    rows = np.flatnonzero(seen.frozen | ~raw[seen.keys])  # what is frozen from now on
     k, sighted = graph.num_keys, np.zeros(graph.num_keys, dtype=np.bool_)
     sighted[seen.keys[rows]] = True
     previous, motions, noises = graph.previous.copy(), graph.motions.copy(), graph.noises.copy()
@@ -60,7 +63,7 @@ def coarsened(graph: PathGraph, camera: FloatArray, options: SmoothingOptions) -
         spreads=graph.spreads[kept],
         slack=slack[kept],
         frame_keys=numbers[graph.frame_keys],
-        **_of_points(graph, fresh[graph.frame_keys[graph.point_frames]]),
+        **_of_points(graph, raw[graph.frame_keys[graph.point_frames]]),
         frozen_keys=numbers[frozen_keys[:num]],
         frozen_landmarks=frozen_landmarks[:num],
         centres=centres[:num],
@@ -96,7 +99,7 @@ def compacted(graph: PathGraph) -> PathGraph:
 
 
 def _fresh(graph: PathGraph, options: SmoothingOptions) -> BoolArray:
-    """Return (k,) which keys are each robot's newest, which keep their raw measurements."""
+    """Return (k,) which keys are each robot's newest."""
     share = max(1, options.fresh_keys // len(graph.tips))
     fresh = np.zeros(graph.num_keys, dtype=np.bool_)
     for robot in range(len(graph.tips)):
@@ -105,13 +108,13 @@ def _fresh(graph: PathGraph, options: SmoothingOptions) -> BoolArray:
 
 
 def _consistent(
-    graph: PathGraph, fresh: BoolArray, camera: FloatArray, options: SmoothingOptions
+    graph: PathGraph, raw: BoolArray, camera: FloatArray, options: SmoothingOptions
 ) -> tuple[PathGraph, Sightings]:
     """Return the graph without old measurements that the smoothed path contradicts, and its sightings, linearised."""
     seen = _linearised(graph, camera, options)
     if options.kernel:
         lost = seen.squares > CONTRADICTION * options.kernel
-        if lost.any() and (lost := lost & ~fresh[graph.frame_keys[graph.point_frames]]).any():
+        if lost.any() and (lost := lost & ~raw[graph.frame_keys[graph.point_frames]]).any():
             graph = replace(graph, **_of_points(graph, ~lost))
             seen = _linearised(graph, camera, options)
     return graph, seen

@@ -13,6 +13,8 @@ from slam_backend.motion import OdometryModel
 from slam_backend.smoothing._walking import choose, mostly_new, place, walk
 from slam_backend.smoothing.graph import LEVER, PathGraph
 
+LEAST_NOISE = 1e-5  # [m, rad] of odometry in one step: where a part has none, as with no floors, nothing is singular
+
 
 class Places(NamedTuple):
     """Where a filter holds landmarks to be.
@@ -180,6 +182,9 @@ def _part(
     n = len(log)
     where = [guesses.get(step) for step in log.steps.tolist()] if guesses else [None] * n
     guessed = np.array([pose is not None for pose in where], dtype=np.bool_)
+    variances = motion.variances(log.motions)
+    if not motion.is_exact:
+        variances = np.maximum(variances, LEAST_NOISE**2)
     supposed = np.zeros((n, 3))
     if guessed.any():
         supposed[guessed] = [pose for pose in where if pose is not None]
@@ -188,7 +193,7 @@ def _part(
     poses, motions, offsets = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3))
     noises, slack, frame_keys = np.empty((n, 3, 3)), np.empty(n + 1), np.empty(n, dtype=np.int64)
     keys, frames = walk(
-        log.kinds, log.motions, motion.variances(log.motions), counts, guessed, supposed,
+        log.kinds, log.motions, variances, counts, guessed, supposed,
         graph.poses[graph.tips[robot]], rigid_within, LEVER, poses, motions, noises, slack, frame_keys, offsets,
     )  # fmt: skip
     return _Part(

@@ -19,7 +19,7 @@ from slam_backend.smoothing.graph import PathGraph
 from slam_backend.smoothing.holding import holding, move_poses, move_tiles
 from slam_backend.smoothing.options import SmoothingOptions
 from slam_backend.smoothing.sampling import Draws, draw_paths, drawn_spreads
-from slam_backend.smoothing.solving import Mode, find_mode
+from slam_backend.smoothing.solving import NO_POSE, Mode, find_mode
 
 NEAR = 10.0  # times the tolerance: a descent that is not followed by draws may end so much sooner
 
@@ -130,12 +130,28 @@ def rejuvenate(
         first = [first_rows(log, share) for log in rest]
         grown = extended(graph, first, motion, camera[4:], guesses, options.rigid_within, places)
         mode = find_mode(grown, camera, options if last else near)
-        if mode.reason:
+        if mode.reason == NO_POSE:
+            unmoved = at_given_poses(grown, camera, options)
+            if last:
+                return unmoved
+            graph = unmoved.graph
+        elif mode.reason:
             return Rejuvenation(graph, mode.reason, float("nan"), mode.iterations, None)
-        if last:
+        elif last:
             return drawn(grown, mode, camera, num_particles, rng, options, looks)
-        graph = settled(grown, mode, camera, options, rng)
+        else:
+            graph = settled(grown, mode, camera, options, rng)
         rest = [log.since(int(graph.latest[i]) + 1) for i, log in enumerate(rest)]
+
+
+def at_given_poses(graph: PathGraph, camera: FloatArray, options: SmoothingOptions) -> Rejuvenation:
+    """Tell that there is no pose to seek yet; all that was measured is kept, for robots may move later.
+
+    Args:
+        graph: With all that the logs hold; its landmarks are where the filter has them, which knows the poses as well.
+        camera, options: As of `rejuvenate`.
+    """
+    return Rejuvenation(coarsened(graph, camera, options), NO_POSE, float("nan"), 0, None)
 
 
 def settled(

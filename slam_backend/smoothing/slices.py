@@ -18,8 +18,8 @@ from slam_backend.smoothing.coarsening import at_mode
 from slam_backend.smoothing.extending import Places, extended
 from slam_backend.smoothing.graph import PathGraph
 from slam_backend.smoothing.options import SmoothingOptions
-from slam_backend.smoothing.rejuvenation import Looks, Rejuvenation, drawn, settled
-from slam_backend.smoothing.solving import Mode, find_mode
+from slam_backend.smoothing.rejuvenation import Looks, Rejuvenation, at_given_poses, drawn, settled
+from slam_backend.smoothing.solving import NO_POSE, Mode, find_mode
 
 NEAR = 100.0  # times the tolerance: slices that do not draw need not end a descent that the next one goes on with
 STEPS = 2  # of Gauss and Newton in a slice: the second as a rule tells that the first has ended the descent
@@ -112,6 +112,8 @@ class Smoother:
         mode = find_mode(grown, self.camera, self.options, LAST_STEPS)
         if not mode.reason:
             return drawn(grown, mode, self.camera, num_particles, self.rng, self.options, looks)
+        if mode.reason == NO_POSE:
+            return at_given_poses(grown, self.camera, self.options)
         return self._after(draft, mode)
 
     def without_measurements(self, graph: PathGraph, logs: Sequence[LogArrays]) -> PathGraph:
@@ -123,6 +125,8 @@ class Smoother:
         """Return what a step came to, as of `descend`."""
         if not mode.reason:
             return settled(draft.graph, mode, self.camera, self.options, self.rng)
+        if mode.reason == NO_POSE:
+            return at_given_poses(draft.graph, self.camera, self.options).graph
         steps = draft.steps + mode.iterations
         if not mode.unfinished:
             return mode.reason

@@ -15,6 +15,7 @@ from slam_backend.smoothing.sightings import Sightings
 FIRST_DAMPING, MOST_DAMPING = 1e-4, 1e8
 LARGEST_STEP = 1e3  # [m, rad]; nothing is sought so far away
 LONG_COLUMNS = 16  # blocks in a mean column, longer ones counting more: then draws are cheaper than the inverse
+NO_POSE = "no pose to seek"  # the reason where all poses are given
 CREEP = 10.0  # times the tolerance: so far from its end a descent may be that has used up the options' iterations
 
 
@@ -115,7 +116,7 @@ def find_mode(
         return Mode(poses, landmarks, columns, sightings, informations, cost, iterations, damping, reason)
 
     if not size:
-        return given_up("no pose to seek")
+        return given_up(NO_POSE)
     noises = graph.noises[sought]
     if not _kernels.invert(noises, of_sought := np.empty_like(noises)):
         return given_up("odometry without noise")
