@@ -18,4 +18,4 @@ def check_common(
     if duration is not None:
         check_float("duration", duration, "Give seconds, or leave it away.", above=0.0)
     if rejuvenate_every is not None:
-        check_int("rejuvenate_every", rejuvenate_every, 1, "Give a number, or leave it away for never.")
+        check_int("rejuvenate_every", rejuvenate_every, 0, "Give a number of steps, or 0 for never.")

@@ -56,7 +56,7 @@ class ImagesConfig(PlainConfig):
         particles: Of the filter.
         estimator: Its proposal.
         rejuvenate_every: Steps of the log after which particles are drawn anew from smoothed paths, as `FilterOptions`
-            has it; None: never.
+            has it; None or 0: never.
         seed: Of all random draws.
         descriptor: "usurf", "sift" or "orb".
         max_range: Points farther than this are dropped [m].
@@ -129,7 +129,7 @@ def replay_images(
         camera=config.camera(log, config.sigma_px, config.sigma_disparity_px),
         motion=ODOMETRY,
         proposal=config.estimator,
-        rejuvenate_every=config.rejuvenate_every,
+        rejuvenate_every=config.rejuvenate_every or None,
         position_gate=PLANAR_GATE,
         descriptor_gate=KINDS[config.descriptor].gate,
         # A street repeats itself: many look-alikes at once would be taken for a lost pose.

@@ -39,7 +39,7 @@ class KittiConfig(PlainConfig):
         particles: Of the filter.
         estimator: Its proposal.
         rejuvenate_every: Steps of the log after which particles are drawn anew from smoothed paths, as `FilterOptions`
-            has it; None: never.
+            has it; None or 0: never.
         seed: Of all random draws.
         sigma_px: Assumed standard deviation of a feature's column [px]: features creep along while they are tracked.
         sigma_disparity_px: Assumed standard deviation of its disparity [px]. The rows of both images, which should
@@ -102,7 +102,7 @@ def replay(log: KittiLog, config: KittiConfig, on_step: Callable[[float], None] 
         camera=camera,
         motion=motion_noise(log),
         proposal=config.estimator,
-        rejuvenate_every=config.rejuvenate_every,
+        rejuvenate_every=config.rejuvenate_every or None,
         position_gate=PLANAR_GATE,
         dead_zone=DEAD_ZONE,
         recovery_position=RECOVERY_POSITION,

@@ -18,6 +18,7 @@ from slam_backend.readers.mrclam_steps import Drive, SightingNoise, steps
 from slam_backend.reports import MergeEvent, TeamReport
 from slam_backend.team import TeamSlam
 from training.plain_config import PlainConfig
+from training.rejuvenation_count import RejuvenationCount
 from training.replay_config import check_common
 from training.replay_one import PLANAR_GATE
 from vslam_env.errors_of_maps import ClaimLedger
@@ -68,7 +69,7 @@ class ReplayConfig(PlainConfig):
         particles: Per filter; None: 100 for each robot that may come to share it.
         estimator: Proposal of the filters.
         rejuvenate_every: Steps of the log after which particles are drawn anew from smoothed paths, as `FilterOptions`
-            has it; None: never.
+            has it; None or 0: never.
         dt: Time between steps [s].
         seed: Of all random draws.
         drive: How robots are taken to follow their commands, the same for all.
@@ -138,6 +139,7 @@ class Replay:
         groups: Robots, counted from 0, that share a map at the end.
         merges: In order.
         attempts: How often two maps were compared.
+        rejuvenations: What came of drawing particles anew, all filters together, see `RejuvenationCount.to_mapping`.
         seconds: What the filters took to live through the log [s].
     """
 
@@ -150,6 +152,7 @@ class Replay:
     groups: tuple[tuple[int, ...], ...]
     merges: tuple[Merge, ...]
     attempts: int
+    rejuvenations: dict[str, Any]
     seconds: float
 
 
@@ -174,7 +177,7 @@ def replay(
     ledger = ClaimLedger(len(robots), flat, np.ones(len(flat), dtype=np.bool_), cutoff=1.0)
     paths = np.zeros((len(robots), num_steps, 3))
     merges: list[Merge] = []
-    attempts, seconds = 0, 0.0
+    attempts, seconds, rejuvenations = 0, 0.0, RejuvenationCount()
     for step in range(num_steps):
         seen = [own.measurements[step] for own in readings.robots]
         told = seen if config.identities == "given" else [_alike(frame) for frame in seen]
@@ -183,6 +186,8 @@ def replay(
         started = time.perf_counter()
         report = team.step([own.odometry[step] if step else None for own in readings.robots], told, contacts)
         seconds += time.perf_counter() - started
+        for _, told_of in report.rejuvenations:
+            rejuvenations.add(told_of)
         for event in report.events:
             attempts += event.kind == "attempt"
             if event.kind == "merge":
@@ -210,6 +215,7 @@ def replay(
         groups=team.groups,
         merges=tuple(merges),
         attempts=attempts,
+        rejuvenations=rejuvenations.to_mapping(),
         seconds=seconds,
     )
 
@@ -230,7 +236,7 @@ def _make_team(log: MrclamLog, config: ReplayConfig) -> TeamSlam:
         num_particles=particles,
         motion=config.motion,
         proposal=config.estimator,
-        rejuvenate_every=config.rejuvenate_every,
+        rejuvenate_every=config.rejuvenate_every or None,
         **GATES[config.identities],
     )
 

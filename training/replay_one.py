@@ -15,6 +15,7 @@ from slam_backend.measurements import Measurements
 from slam_backend.metrics import align_se2
 from slam_backend.reports import StepReport
 from slam_backend.trajectory import dead_reckoning
+from training.rejuvenation_count import RejuvenationCount
 
 # Of what moves in the plane a measurement fixes two coordinates: 99.9 % of right matches have a smaller squared
 # Mahalanobis distance.
@@ -33,6 +34,7 @@ class OneReplay:
         matched: Measurements that the most probable particle matched.
         created: Landmarks that it made.
         rejected: Measurements of which it made nothing.
+        rejuvenations: What came of drawing particles anew, see `RejuvenationCount.to_mapping`.
         seconds: What the filter took to live through the log [s].
     """
 
@@ -43,6 +45,7 @@ class OneReplay:
     matched: int
     created: int
     rejected: int
+    rejuvenations: Mapping[str, Any]
     seconds: float
 
     @property
@@ -89,6 +92,7 @@ def replay_one(
     """
     path, odometry = np.zeros((len(times), 3)), np.zeros((len(times), 3))
     matched, created, rejected, seconds = 0, 0, 0, 0.0
+    rejuvenations = RejuvenationCount()
     for step, (move, frame) in enumerate(steps):
         odometry[step] = move if step else 0.0
         started = time.perf_counter()
@@ -99,6 +103,7 @@ def replay_one(
         matched += report.num_matched
         created += report.num_new
         rejected += report.num_rejected
+        rejuvenations.add(report.rejuvenation)
         on_report(report)
         on_step((step + 1) / len(times))
     return OneReplay(
@@ -109,6 +114,7 @@ def replay_one(
         matched=matched,
         created=created,
         rejected=rejected,
+        rejuvenations=rejuvenations.to_mapping(),
         seconds=seconds,
     )
 
@@ -169,6 +175,7 @@ def metrics_of(
         "landmarks": len(result.landmarks),
         **more,
         "measurements": {"matched": result.matched, "created": result.created, "rejected": result.rejected},
+        "rejuvenations": result.rejuvenations,
         "merges": [],
         "groups": [[1]],
         "coverage": nan,

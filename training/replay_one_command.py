@@ -11,6 +11,7 @@ from rich.table import Table
 from training.command_folder import begin, choose, finish, gather
 from training.command_options import Config, Duration, Estimator, Json, Out, Particles, RejuvenateEvery, Seed
 from training.command_progress import share_shown
+from training.rejuvenation_count import sentence_of
 from training.replay_images_command import replay_folder_of_images
 
 if TYPE_CHECKING:  # what computes is imported when the command runs, so that --help answers at once
@@ -154,7 +155,7 @@ def finish_one(
 
     shown = plain(metrics)
     print_table(console, shown, result)
-    for line in told:
+    for line in filter(None, [*told, sentence_of(metrics["rejuvenations"])]):
         console.print(line, highlight=False)
     flat = tuple(path[:, :2] for path in paths)
     draw_one(

@@ -166,7 +166,7 @@ def summarise(replay: Replay, log: MrclamLog, paths: Sequence[PathScore | None])
     duration = float(replay.times[-1] - replay.times[0])
     return {
         "robots": robots, "merges": merges, "groups": named, "coverage": nan,
-        "attempts": replay.attempts, "duration_s": duration,
+        "attempts": replay.attempts, "rejuvenations": replay.rejuvenations, "duration_s": duration,
     }  # fmt: skip
 
 

@@ -56,7 +56,7 @@ class VictoriaConfig(PlainConfig):
         particles: Of the filter.
         estimator: Its proposal.
         rejuvenate_every: Steps of the log after which particles are drawn anew from smoothed paths, as `FilterOptions`
-            has it; None: never.
+            has it; None or 0: never.
         seed: Of all random draws.
         motion: Assumed noise of the odometry.
         sensor: Assumed noise of the trees' readings.
@@ -108,7 +108,7 @@ def replay(log: VictoriaLog, config: VictoriaConfig, on_step: Callable[[float], 
         camera=StereoCamera(mount=SENSOR),
         motion=config.motion,
         proposal=config.estimator,
-        rejuvenate_every=config.rejuvenate_every,
+        rejuvenate_every=config.rejuvenate_every or None,
         position_gate=PLANAR_GATE,
         dead_zone=DEAD_ZONE,
         dead_radius=DEAD_RADIUS,

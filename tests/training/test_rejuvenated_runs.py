@@ -60,6 +60,14 @@ def test_a_replay_is_rejuvenated_and_repeats_itself(
     assert vslam(*options, "--rejuvenate-every", "8", "--out", str(one)).status == 0
     assert reasons.count("") > 0.5 * len(reasons) > 0.0
     assert vslam("replay", command, "--config", str(one), "--out", str(two)).status == 0
+    counts = json.loads((one / "metrics.json").read_text())["rejuvenations"]
+    assert counts["drawn"] == reasons.count("") // 2  # of two runs
+    assert sum(counts["refused"].values()) == (len(reasons) - reasons.count("")) // 2
+    off = tmp_path / "off"
+    never = ("--config", str(one), "--rejuvenate-every", "0", "--out", str(off))
+    assert vslam("replay", command, *never).status == 0
+    assert json.loads((off / "metrics.json").read_text())["rejuvenations"] == {"drawn": 0, "refused": {}}
+    assert estimates(off) == estimates(plain)
     assert "rejuvenate_every = 8" in (one / "config.toml").read_text()
     assert "rejuvenate_every" not in (plain / "config.toml").read_text()
     assert estimates(one) == estimates(two)
@@ -101,16 +109,16 @@ def test_a_run_is_rejuvenated_and_repeats_itself(vslam: Any, tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("kind", WRITERS)
-def test_no_steps_between_are_refused(kind: str, refusal: Any, tmp_path: Path) -> None:
-    """Every zero steps is no interval: one line, status 2."""
+def test_less_than_no_steps_between_are_refused(kind: str, refusal: Any, tmp_path: Path) -> None:
+    """A negative interval is none: one line, status 2."""
     WRITERS[kind](tmp_path)
-    shown = refusal("replay", kind, "--path", str(tmp_path), "--rejuvenate-every", "0")
-    assert shown.startswith("error rejuvenate_every: expected an int >= 1, got 0. Give a number,")
+    shown = refusal("replay", kind, "--path", str(tmp_path), "--rejuvenate-every", "-1")
+    assert shown.startswith("error rejuvenate_every: expected an int >= 0, got -1. Give a number of steps,")
 
 
 def test_a_replay_of_images_takes_it_too() -> None:
     """A folder of images is replayed by the same command, so its configuration holds the interval as well."""
     config = ImagesConfig(path="drive", rejuvenate_every=6)
     assert ImagesConfig.from_mapping(config.to_mapping()) == config
-    with pytest.raises(ValueError, match="rejuvenate_every: expected an int >= 1, got 0"):
-        ImagesConfig(path="drive", rejuvenate_every=0)
+    with pytest.raises(ValueError, match="rejuvenate_every: expected an int >= 0, got -1"):
+        ImagesConfig(path="drive", rejuvenate_every=-1)
