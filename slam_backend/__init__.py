@@ -3,11 +3,13 @@
 `FastSlam` is the filter, `TeamSlam` a team of them that merges maps; `align_maps` and `fuse_maps` work on any two maps.
 """
 
+from slam_backend.adaptation import AdaptiveParticles
 from slam_backend.alignment import Alignment, AlignmentOptions, align_maps
 from slam_backend.attempts import AttemptOptions
 from slam_backend.camera import StereoCamera
 from slam_backend.compilation import log_compilation
 from slam_backend.duplicates import DuplicateOptions, find_duplicates, fuse_duplicates
+from slam_backend.existence import ExistenceModel
 from slam_backend.filter import FastSlam
 from slam_backend.filter_options import FilterOptions
 from slam_backend.fusion import fuse_landmarks, fuse_maps
@@ -15,16 +17,19 @@ from slam_backend.landmark_map import LandmarkMap
 from slam_backend.measurements import Measurements
 from slam_backend.merge_options import MergeOptions
 from slam_backend.motion import OdometryModel
-from slam_backend.reports import MergeEvent, PoseEstimate, Renaming, StepReport, TeamReport
+from slam_backend.reports import MergeEvent, PoseEstimate, RejuvenationReport, Renaming, StepReport, TeamReport
+from slam_backend.smoothing.options import SmoothingOptions
 from slam_backend.team import TeamSlam
 from slam_backend.trajectory import Trajectory
 from slam_backend.warming import warm_up
 
 __all__ = [
+    "AdaptiveParticles",
     "Alignment",
     "AlignmentOptions",
     "AttemptOptions",
     "DuplicateOptions",
+    "ExistenceModel",
     "FastSlam",
     "FilterOptions",
     "LandmarkMap",
@@ -33,7 +38,9 @@ __all__ = [
     "MergeOptions",
     "OdometryModel",
     "PoseEstimate",
+    "RejuvenationReport",
     "Renaming",
+    "SmoothingOptions",
     "StepReport",
     "StereoCamera",
     "TeamReport",
