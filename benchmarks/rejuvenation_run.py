@@ -3,7 +3,7 @@
     python benchmarks/rejuvenation_run.py --length 400 --seed 0 --figure rejuvenation.png --json rejuvenation.json
 
 The two filters take the same readings of a simulated stereo run (good stereo, known association, M = 100). The figure
-shows, against the distance driven, the map's RMS error and the NEES of the pose, each beside what is ideal.
+shows, against the distance driven, the map's RMS error and the NEES of the pose, the latter beside what is ideal.
 """
 
 import os
@@ -31,6 +31,7 @@ from training.run_folder import check_writable
 from training.stereo_runs import STEP, RunSpec, StereoRun, simulate_run
 
 SMOOTH = 40  # steps over which the median of the NEES is drawn
+IDEAL = 2.366  # median of chi-squared of 3 degrees of freedom
 EVERY = 10  # steps between looks at the map
 COLOURS = {"plain": "#0072B2", "rejuvenated": "#E69F00"}
 
@@ -81,7 +82,7 @@ def draw(file: Path, found: dict[str, dict[str, Any]]) -> None:
             values = np.array(row["nees"])[: len(row["nees"]) // SMOOTH * SMOOTH].reshape(-1, SMOOTH)
             at = STEP * SMOOTH * (np.arange(len(values)) + 0.5)
             below.plot(at, np.median(values, axis=1), color=COLOURS[name], label=name)
-        below.axhline(3.0, color="#7f7f7f", linestyle=":", label="ideal")
+        below.axhline(IDEAL, color="#7f7f7f", linestyle=":", label="ideal")
         for ax, label in ((above, "map error, RMS [m]"), (below, f"NEES, median of {SMOOTH} steps")):
             ax.set_yscale("log")
             ax.set_ylabel(label)
