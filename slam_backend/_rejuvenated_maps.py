@@ -36,4 +36,4 @@ def write_maps(maps: ParticleMaps, best: int, particles: Particles, walk: float)
         maps.ids[slots], maps.identities[slots], maps.next_id, odds, rows,
     )  # fmt: skip
     for row in DIAGONAL:
-        maps.blocks[: len(rows), :, row] += walk
+        maps.blocks[: len(rows), :, row] += walk  # (7) of docs/smoothing.md

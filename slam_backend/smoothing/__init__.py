@@ -1,1 +1,1 @@
-"""Rejuvenation: particles drawn anew from the posterior of whole paths, see docs/smoothing.md."""
+"""Rejuvenation: particles drawn anew from the posterior of whole paths; docs/smoothing.md has the equations (n)."""

@@ -53,7 +53,7 @@ def bend(mode: FloatArray, previous: IntArray, offsets: FloatArray) -> FloatArra
                 own_ahead = ahead + c * ox + s * oy + left * offsets[a, 2, i]
                 own_left = left + c * oy - s * ox - ahead * offsets[a, 2, i]
                 cos, sin = math.cos(paths[a, 2, i]), math.sin(paths[a, 2, i])
-                paths[b, 0, i] = paths[a, 0, i] + cos * own_ahead - sin * own_left
-                paths[b, 1, i] = paths[a, 1, i] + sin * own_ahead + cos * own_left
+                paths[b, 0, i] = paths[a, 0, i] + cos * own_ahead - sin * own_left  # (8), x
+                paths[b, 1, i] = paths[a, 1, i] + sin * own_ahead + cos * own_left  # (8), y
                 paths[b, 2, i] = paths[a, 2, i] + turn + offsets[b, 2, i] - offsets[a, 2, i]
     return paths

@@ -65,7 +65,7 @@ def holding(
     if not _scatter(moved, means, weights) < _scatter(poses, means, weights):
         return None
     back = inverse(motions)
-    return Held(motions, np.asarray(np.einsum("m,mi,mj->ij", weights, back, back)))
+    return Held(motions, np.asarray(np.einsum("m,mi,mj->ij", weights, back, back)))  # (9)
 
 
 def _fitted(points: FloatArray, targets: FloatArray, weights: FloatArray) -> FloatArray:

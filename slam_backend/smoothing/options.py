@@ -17,7 +17,7 @@ class SmoothingOptions:
             each time.
         kernel: Squared Mahalanobis distance of a measurement (3 degrees of freedom) above which it loses weight; 0:
             none does.
-        noise_scale: Factor on the covariance of all measurements.
+        noise_scale: Factor on the covariance of all measurements, in the smoother alone.
         closure_after: A loop is closed where three landmarks are matched at a time that were not seen for more steps
             than this, and that had not happened for half as many steps; the filter is then rejuvenated a fifth of
             `rejuvenate_every` after the last time. 0: never for that.
@@ -35,7 +35,8 @@ class SmoothingOptions:
             the steps between than this (the root of the mean square of position and of heading at 3 m); 0: each step
             that measured something is a key.
         max_iterations: Of Gauss and Newton.
-        tolerance: The descent ends when the cost is expected to fall by less than this (half a squared distance).
+        tolerance: The descent ends when the cost is expected to fall by less than this (half a squared distance). In
+            slices particles are drawn only where three iterations reach it: below 0.001 they may come late, or seldom.
     """
 
     max_keys: int = 120

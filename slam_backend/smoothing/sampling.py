@@ -91,7 +91,7 @@ def _weighed(graph: PathGraph, mode: Mode, poses: FloatArray, log_proposals: Flo
     rows = lane_rows(poses)
     tiles, log_likelihood = replay(mode, rows, num_paths)
     log_odometry, spreads = weigh_odometry(graph, mode, rows, num_paths)
-    return Draws(poses, tiles, log_likelihood + log_odometry - log_proposals, spreads)
+    return Draws(poses, tiles, log_likelihood + log_odometry - log_proposals, spreads)  # (2)
 
 
 def lane_rows(poses: FloatArray) -> FloatArray:

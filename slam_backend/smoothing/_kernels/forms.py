@@ -92,7 +92,7 @@ def linearise(
     x0, x1, x2 = (e[0], e[1], e[2]) if ahead else (point[0], point[1], point[2])
     k = x0 / point[0] if ahead else 1.0
     for i in range(3):
-        y[i] = e[i] + k * (point[i] - e[i]) if ahead else point[i]
+        y[i] = e[i] + k * (point[i] - e[i]) if ahead else point[i]  # (3)
     pixel = (camera[0] / (camera[2] * x0)) ** 2
     disparity = (camera[0] * camera[1] / (camera[3] * x0 * x0)) ** 2
     across, up = x1 / x0, x2 / x0

@@ -83,7 +83,7 @@ def replay(
                     l0 = n0 * u0 + n1 * u1 + n2 * u2
                     l1 = n1 * u0 + n3 * u1 + n4 * u2
                     l2 = n2 * u0 + n4 * u1 + n5 * u2
-                    work[ENERGY + i] += u0 * (0.5 * l0 - g0) + u1 * (0.5 * l1 - g1) + u2 * (0.5 * l2 - g2)
+                    work[ENERGY + i] += u0 * (0.5 * l0 - g0) + u1 * (0.5 * l1 - g1) + u2 * (0.5 * l2 - g2)  # (4)
                     e0, e1 = l0 - g0, l1 - g1
                     work[B0 + i] += c * e0 - s * e1
                     work[B1 + i] += s * e0 + c * e1
@@ -117,7 +117,7 @@ def replay(
                 work[ENERGY + i] = 0.5 * (b0 * m0 + b1 * m1 + b2 * m2) - work[ENERGY + i]
                 work[A00 + i] = det
             for i in range(LANES):
-                out[i] += work[ENERGY + i] - 0.5 * math.log(work[A00 + i])
+                out[i] += work[ENERGY + i] - 0.5 * math.log(work[A00 + i])  # (6)
 
 
 @lanes
