@@ -1,0 +1,132 @@
+"""How long `env.step` takes in two or more checkouts of this repository, timed in turn: what a change gained.
+
+    python benchmarks/steps_in_turn.py ../before . --config '{"num_robots": 6}'
+
+Each checkout plays the same episode with the same actions in a process of its own, and only one of them runs at a time,
+in bursts of 20 steps. So a machine whose speed changes from one second to the next changes it for all of them. Two
+checkouts of the same arithmetic play the same episode; others drift apart by what rounding grows to.
+"""
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+
+from slam_backend.errors import FloatArray, bad_argument, check_int
+
+BURST = 20  # steps
+WARM_UP = 60  # steps of each episode that do not count
+PLAYER = """
+import json, os, pickle, sys, time
+root, overrides, path, count = sys.argv[1], json.loads(sys.argv[2]), sys.argv[3], int(sys.argv[4])
+sys.path.insert(0, root)
+import slam_backend
+assert slam_backend.__file__.startswith(root), slam_backend.__file__
+from training.env_timing import record_actions
+from vslam_env import vslam_v0
+from vslam_env.config import EnvConfig
+env = vslam_v0.parallel_env(config=EnvConfig().replace(**overrides))
+if not os.path.exists(path):
+    with open(path, "wb") as file:
+        pickle.dump(record_actions(env, 100, count), file)
+with open(path, "rb") as file:
+    actions = pickle.load(file)
+env.max_cycles = count + 1
+for line in sys.stdin:
+    first, last = json.loads(line)
+    if first == 0:
+        env.reset(seed=100)
+    micros = []
+    for action in actions[first:last]:
+        begin = time.perf_counter_ns()
+        env.step(action)
+        micros.append((time.perf_counter_ns() - begin) / 1e3)
+    print(json.dumps(micros), flush=True)
+"""
+
+
+class Player:
+    """A process that plays episodes of one checkout.
+
+    Args:
+        root: Of the checkout.
+        overrides: JSON of what the environment's configuration is changed by.
+        actions: File of the actions; the first player records them.
+        count: Of these.
+    """
+
+    def __init__(self, root: Path, overrides: str, actions: Path, count: int) -> None:
+        command = [sys.executable, "-c", PLAYER, str(root), overrides, str(actions), str(count)]
+        environment = os.environ | {"PYTHONPATH": str(root), "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+        self._process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment, cwd=root
+        )
+
+    def play(self, first: int, last: int) -> list[float]:
+        """Play steps `first` to `last` - 1 of the episode, from its reset if `first` is 0; return their times [us]."""
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._process.stdin.write(json.dumps([first, last]) + "\n")
+        self._process.stdin.flush()
+        answer = self._process.stdout.readline()
+        if not answer:
+            raise RuntimeError(f"{self._process.args!r} ended: see above.")
+        micros: list[float] = json.loads(answer)
+        return micros
+
+    def close(self) -> None:
+        """End the process."""
+        self._process.kill()
+        self._process.wait()
+
+
+def times_in_turn(players: list[Player], steps: int, plays: int) -> FloatArray:
+    """Return the times (players, plays, steps) [us] of all steps after the warm-up; one more play is thrown away."""
+    times: list[Any] = []
+    for play in range(plays + 1):
+        rows: list[list[float]] = [[] for _ in players]
+        for burst, first in enumerate(range(0, WARM_UP + steps, BURST)):
+            order = list(range(len(players)))[:: 1 if (burst + play) % 2 else -1]
+            for player in order:
+                rows[player] += players[player].play(first, min(first + BURST, WARM_UP + steps))
+        times.append([row[WARM_UP:] for row in rows])
+    return np.array(times[1:]).transpose(1, 0, 2)
+
+
+def main(
+    roots: Annotated[list[Path], typer.Argument(help="Checkouts; the first is what the others are compared with.")],
+    config: Annotated[str, typer.Option(help="JSON: what EnvConfig is changed by.")] = "{}",
+    plays: Annotated[int, typer.Option(help="Of the episode; of each step the best counts.")] = 4,
+    steps: Annotated[int, typer.Option(help="That are timed.")] = 600,
+) -> None:
+    """Print medians, means and 99th percentiles of each checkout, and their ratios to the first."""
+    check_int("plays", plays, 1, "Play at least once.")
+    check_int("steps", steps, 1, "Time at least one.")
+    for root in roots:
+        if not (root / "vslam_env").is_dir():
+            raise bad_argument("roots", "checkouts of this repository", str(root), "Name folders with vslam_env.")
+    with tempfile.TemporaryDirectory() as folder:
+        players = []
+        try:
+            for root in roots:
+                players.append(Player(root.resolve(), config, Path(folder) / "actions", WARM_UP + steps))
+                players[-1].play(0, 1)
+            times = times_in_turn(players, steps, plays)
+        finally:
+            for player in players:
+                player.close()
+    best = times.min(axis=1)
+    for root, own in zip(roots, best, strict=True):
+        median, mean, high = np.median(own), own.mean(), np.quantile(own, 0.99)
+        ratios = f"{median / np.median(best[0]):.2f}, {mean / best[0].mean():.2f} of the first"
+        print(f"{root!s:20s} median {median:6.0f} us, mean {mean:6.0f} us, 99 % {high:6.0f} us: {ratios}")
+
+
+if __name__ == "__main__":
+    typer.run(main)
