@@ -184,21 +184,8 @@ class TeamBelief:
 
     def view(self) -> View:
         """Return what observations show of all robots' beliefs; it shares memory with the grids."""
-        points = self._points
-        features, valid = self._candidates.described(points.poses)
-        return View(
-            robots=self._robots,
-            poses=points.poses,
-            sigmas=points.sigmas,
-            own=points.own,
-            covariances=points.covariances,
-            starts=points.starts,
-            ess=points.ess,
-            outlines=self.outlines,
-            cells=self._grids.team.cells,
-            features=features,
-            valid=valid,
-        )
+        features, valid = self._candidates.described(self._points.poses)
+        return View(self._robots, self._points, self.outlines, self._grids.team.cells, features, valid)
 
     def get_state(self) -> dict[str, Any]:
         """Return all that decides how the beliefs go on; it shares nothing with them."""

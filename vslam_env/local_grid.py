@@ -69,7 +69,7 @@ def _paint(cells: Any, pose: Any, start_from_group: Any, means: Any, local: Any)
 
 @jit
 def _paint_all(cells: Any, poses: Any, starts: Any, means: Any, parts: Any, local: Any) -> None:
-    """Write what `local_grids` returns; the arguments are named as in `View`."""
+    """Write what `local_grids` returns; cells (n, 300, 300), poses and starts (n, 3), parts (n, 2) as in `View`."""
     for k in range(len(poses)):
         _paint(cells[k], poses[k], starts[k], means[parts[k, 0] : parts[k, 1]], local[k])
 
@@ -81,7 +81,7 @@ def local_grids(view: View) -> NDArray[np.uint8]:
         (n, 3, 48, 48) uint8, robot frames, cells of 0.2 m that are 0 or 255. Channels free, occupied, landmarks. Rows
         go from 4.8 m ahead to 4.8 m behind, columns from 4.8 m to the left to 4.8 m to the right. A fresh array.
     """
-    local = np.empty((len(view.own), len(CHANNELS), SIZE, SIZE), np.uint8)
-    rows, parts = view.outlines
-    _paint_all(view.cells, view.own, view.starts, rows.means, parts, local)
+    local = np.empty((len(view.robots), len(CHANNELS), SIZE, SIZE), np.uint8)
+    points, (rows, parts) = view.points, view.outlines
+    _paint_all(view.cells, points.own, points.starts, rows.means, parts, local)
     return local

@@ -66,10 +66,10 @@ def observed(view: View, scans: FloatArray, goal_actions: bool) -> list[Observat
     count = len(view.robots)
     numbers, candidates = np.empty((count, 12), np.float32), view.features
     teammates, present = np.zeros((count, MOST_TEAMMATES, 5), np.float32), np.zeros((count, MOST_TEAMMATES), np.int8)
-    rows, parts = view.outlines
+    points, (rows, parts) = view.points, view.outlines
     _fill(
-        view.robots, view.poses, view.sigmas, view.own, view.covariances, view.ess, rows.variances, rows.counts, parts,
-        numbers, candidates, teammates, present,
+        view.robots, points.poses, points.sigmas, points.own, points.covariances, points.ess,
+        rows.variances, rows.counts, parts, numbers, candidates, teammates, present,
     )  # fmt: skip
     pictures, ranges = local_grids(view), scans.astype(np.float32)
     observations: list[Observation] = [
@@ -153,7 +153,8 @@ def _fill(
     """Write the parts of observations that are neither pictures nor scans.
 
     Args:
-        robots, poses, sigmas, own, covariances, ess: As in `View`.
+        robots: As in `View`.
+        poses, sigmas, own, covariances, ess: Of its points.
         variances, counts, parts: (N,) float64 [m^2], (N,) int64, (n, 2) int64. Of its outlines.
         numbers: (n, 12) float32: `pose`, `pose_std`, `map_stats`. Written to, as all that follow.
         candidates: (n, 16, 5) float32, as they are without bounds.

@@ -16,6 +16,7 @@ from slam_backend.filter_options import FilterOptions
 from slam_backend.landmark_map import LandmarkMap, TeamOutlines
 from slam_backend.merge_options import MergeOptions
 from slam_backend.smoothing.options import SmoothingOptions
+from slam_backend.standpoints import Standpoints
 from vslam_env.navigation import SeenGrid
 
 
@@ -170,13 +171,7 @@ class View(NamedTuple):
 
     Attributes:
         robots: (n,) int64. Their indices.
-        poses: (n, k, 3) float64 [m, m, rad], start frame. Where each believes robot j < k of the team to be; NaN where
-            it does not know.
-        sigmas: (n, k) float64 [m]. One sigma of these positions, averaged over directions; likewise.
-        own: (n, 3) float64 [m, m, rad], start frame. Where each believes itself to be.
-        covariances: (n, 3, 3) float64 [m, m, rad]. Of these.
-        starts: (n, 3) float64 [m, m, rad]. The motion from its map frame to its own start frame.
-        ess: (n,) float64. Effective sample size, as a share of M.
+        points: Where they stand: their rows, and columns for all robots of the team up to the last one known.
         outlines: Of the confirmed landmarks in the map frames.
         cells: (n, 300, 300) uint8. Of the seen grids.
         features: (n, 16, 5) float32 [m], robot frames. Of the candidates; the reader's own.
@@ -184,12 +179,7 @@ class View(NamedTuple):
     """
 
     robots: IntArray
-    poses: FloatArray
-    sigmas: FloatArray
-    own: FloatArray
-    covariances: FloatArray
-    starts: FloatArray
-    ess: FloatArray
+    points: Standpoints
     outlines: TeamOutlines
     cells: NDArray[np.uint8]
     features: NDArray[np.float32]
@@ -203,14 +193,17 @@ class View(NamedTuple):
         poses, sigmas = np.full((1, max(known) + 1, 3), np.nan), np.full((1, max(known) + 1), np.nan)
         for robot, (pose, sigma) in known.items():
             poses[0, robot], sigmas[0, robot] = pose, sigma
-        return cls(
-            robots=np.array([belief.robot]),
+        points = Standpoints(
             poses=poses,
             sigmas=sigmas,
             own=belief.pose[None].copy(),
             covariances=belief.covariance[None].copy(),
             starts=belief.start_from_group[None].copy(),
             ess=np.array([belief.ess]),
+        )
+        return cls(
+            robots=np.array([belief.robot]),
+            points=points,
             outlines=TeamOutlines.joined([belief.group_map.outline]),
             cells=belief.grid.cells[None],
             features=belief.candidates.features[None].copy(),
