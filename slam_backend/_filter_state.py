@@ -44,6 +44,7 @@ class FilterState:
         _blind: (K,) bool. Whether that was propagated since the last sighting.
         _log_weights: (M,) since the last resampling, normalised; `_weights` (M,) as the last step left them.
         _path_log_weights: (M,) accumulated along the ancestral line (Eq. 12).
+        _best: Index of the largest of these.
         _maps: The landmarks of all particles.
         _estimates: The poses of all robots over all particles, as of the last step; never written to afterwards.
         _logs: Per robot what it did and measured, and which landmarks that was taken for.
@@ -73,6 +74,7 @@ class FilterState:
         self._blind = np.zeros(k, dtype=np.bool_)
         self._log_weights = np.full(m, -np.log(m))
         self._path_log_weights = np.zeros(m)
+        self._best = 0
         self._weights = np.full(m, 1.0 / m)
         self._steps = 0
         self._logs = [RobotLog() for _ in range(k)]
@@ -82,7 +84,7 @@ class FilterState:
     @property
     def best_particle(self) -> int:
         """Index of the most probable particle, by accumulated log-weight (Eq. 12)."""
-        return int(self._path_log_weights.argmax())
+        return self._best
 
     @property
     def num_robots(self) -> int:
@@ -107,6 +109,10 @@ class FilterState:
         """Take note of whether all robots start at the origin of the map frame; asked for when that was written."""
         self._from_origin = not self._starts[:, :, : self.num_particles].any()
 
+    def _look_at_weights(self) -> None:
+        """Take note of which particle is the most probable; asked for when the weights along paths were written."""
+        self._best = int(self._path_log_weights.argmax())
+
     # ------------------------------------------------------------------ other particles, other robots
 
     def _become(self, ancestors: IntArray) -> None:
@@ -118,6 +124,7 @@ class FilterState:
             array[:, :, : len(ancestors)] = old[:, :, ancestors]
             setattr(self, name, array)
         self._path_log_weights = self._path_log_weights[ancestors]
+        self._look_at_weights()
         self._weights = np.full(len(ancestors), 1.0 / len(ancestors))
         self._log_weights = np.full(len(ancestors), -np.log(len(ancestors)))
         self._buffers = FrameBuffers(self.num_robots, self._maps.padded)
@@ -133,6 +140,7 @@ class FilterState:
         self._frame[:] = new.frame
         self._blind.fill(False)
         self._log_weights[:], self._path_log_weights[:] = new.log_weights, new.log_densities
+        self._look_at_weights()
         self._weights[:] = np.exp(new.log_weights)
         self._estimates = PoseEstimates(new.means, new.covariances)
 
@@ -195,6 +203,7 @@ class FilterState:
         for name in KEPT:
             getattr(self, name)[:] = state[name]
         self._look_at_starts()
+        self._look_at_weights()
         self._maps.set_state(state["maps"])
         for log, logged in zip(self._logs, state["logs"], strict=True):
             log.set_state(logged)

@@ -52,6 +52,7 @@ def _join_poses(
 
 def finish(joint: FastSlam, a: FastSlam, b: FastSlam, renamed: IntArray) -> None:
     """Give a joint filter, whose map is loaded, its step count, estimates and logs; `renamed` as of `merge_filters`."""
+    joint._look_at_weights()
     joint._steps = max(a._steps, b._steps)
     joint._estimates = joint._mixtures()
     joint._widen()

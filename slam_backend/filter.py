@@ -173,6 +173,7 @@ class FastSlam(FilterKnowledge):
         report, self._estimates = conclude(
             frames, buffers, maps.ids, weights, (self._means, self._covariances), threshold
         )  # fmt: skip
+        self._look_at_weights()
         self._write_down(frames, inputs, report)
         self._widen()
         for slots in deserted:
@@ -262,6 +263,7 @@ class FastSlam(FilterKnowledge):
         if count == self.num_particles:
             held = (self._poses, self._starts, self._means, self._covariances, self._path_log_weights)
             self._maps.resample(ancestors, held)
+            self._look_at_weights()
             self._log_weights.fill(-np.log(count))
         else:
             self._become(ancestors)
