@@ -42,6 +42,7 @@ class RejuvenationStep:
         assert options.rejuvenate_every is not None
         self._options = options
         self._every = options.rejuvenate_every
+        self._share = max(LEAST_ROWS, (options.smoothing.slice_steps or 0) // num_robots)  # steps a slice takes in
         self._noiseless = options.motion.is_exact
         self._graph: PathGraph | None = None  # at its mode
         self._draft: Draft | None = None  # the same and a little more, on its way there
@@ -66,7 +67,7 @@ class RejuvenationStep:
             for guesses, refused in zip(self._guesses, self._refused, strict=True):
                 guesses.clear()
                 refused.clear()
-        if not self._never:
+        if not (self._exact or self._noiseless):
             self._guesses[robot][step] = pose
 
     def note_refused(self, robot: int, step: int, ids: IntArray, descriptors: NDArray[np.float32]) -> None:
@@ -81,11 +82,12 @@ class RejuvenationStep:
         self._count = now = self._count + 1
         self._waited += 1
         after, long_ago, last_seen = self._options.smoothing.closure_after, 0, self._last_seen
-        matched = [name for ids in associations for name in ids.tolist() if name >= 0]
-        for name in matched:
-            long_ago += now - last_seen.get(name, now) > after
-            last_seen[name] = now
-        self._read += len(matched)
+        for ids in associations:
+            for name in ids.tolist():
+                if name >= 0:
+                    long_ago += now - last_seen.get(name, now) > after
+                    last_seen[name] = now
+                    self._read += 1
         if after > 0 and long_ago >= CLOSURE:
             self._closed |= 2 * (self._count - self._last_closing) > after  # else it is the same one that goes on
             self._last_closing = self._count
@@ -111,10 +113,25 @@ class RejuvenationStep:
         """Whether it is time for new particles."""
         if self._asked:
             return True
-        smoothing = self._options.smoothing
         haste = SOONEST if self._closed else 1
+        if haste * self._waited < self._every:
+            return False
+        smoothing = self._options.smoothing
         sightings = 0 if self._graph is None else self._graph.num_sightings - smoothing.free_sightings
-        return haste * self._waited >= self._every and haste * smoothing.effort * self._read >= sightings
+        return haste * smoothing.effort * self._read >= sightings
+
+    def rests(self, logs: Sequence[RobotLog]) -> bool:
+        """Return whether there is nothing to do now: the rule. Else it is due, or a slice of the work can be done."""
+        if self.due:
+            return False
+        if self._exact or self._noiseless or self._options.smoothing.slice_steps is None:
+            return True
+        if self._graph is None or self._draft is not None:
+            return False
+        for log, step in zip(logs, self._graph.latest.tolist(), strict=True):
+            if log.last_step - step >= self._share:
+                return most_waiting(logs, self._graph) < self._share
+        return True  # there cannot be more of them, and to count costs more
 
     # ------------------------------------------------------------------ where there is time for it
 
@@ -122,7 +139,7 @@ class RejuvenationStep:
         self, logs: Sequence[RobotLog], starts: FloatArray, maps: ParticleMaps, best: int, camera: FloatArray,
         rng: np.random.Generator,
     ) -> Rejuvenation | None:  # fmt: skip
-        """Do what is to be done now: all that is due, or a slice of it; None if there is nothing to tell of it.
+        """Do all that is due, or a slice of it, if it does not rest; return None if there is nothing to tell of it.
 
         Args:
             logs: Per robot.
@@ -132,10 +149,7 @@ class RejuvenationStep:
             camera: (7,) as kernels take it.
             rng: Source of the draws.
         """
-        due, options = self.due, self._options
-        whole = options.smoothing.slice_steps is None
-        if not due and (whole or self._never or self._rests(logs)):
-            return None
+        options = self._options
         graph = PathGraph.at_uncertain_starts(starts) if self._graph is None else self._graph
         if self._exact or (self._graph is None and any(log.has_exact_poses for log in logs)):
             self._exact = True  # nobody may have noted it: a filter that is never rejuvenated is asked to, by a merge
@@ -143,14 +157,14 @@ class RejuvenationStep:
             self._rest()
             return _told(graph, reason)
         smoother = Smoother(options.motion, camera, options.smoothing, rng)
-        if whole:
+        if options.smoothing.slice_steps is None:
             return self._whole(graph, self._new(logs, graph, maps, best), smoother, maps, best)
         self._graph = graph
         if (draft := self._draft) is not None:
             outcome = smoother.descend(draft)
             return self._after(draft.graph, outcome, lambda: since(logs, graph, draft.graph), smoother)
-        share, waiting = self._share(logs), most_waiting(logs, graph)
-        if waiting > 2 * share or not due:
+        share, waiting = self._share, most_waiting(logs, graph)
+        if waiting > 2 * share or not self.due:
             if waiting < share:
                 return None
             taken = [first_rows(log, share) for log in self._new(logs, graph, maps, best)]
@@ -164,19 +178,6 @@ class RejuvenationStep:
             self._keep(drawn.graph)
             return drawn
         return self._after(graph, drawn, lambda: last, smoother)
-
-    def _share(self, logs: Sequence[RobotLog]) -> int:
-        """Return how many steps of each log a slice takes in."""
-        return max(LEAST_ROWS, (self._options.smoothing.slice_steps or 0) // len(logs))
-
-    def _rests(self, logs: Sequence[RobotLog]) -> bool:
-        """Return whether no slice is under way, and too little is new for another one: the rule."""
-        if self._graph is None or self._draft is not None:
-            return False
-        latest, share = self._graph.latest.tolist(), self._share(logs)
-        if all(log.last_step - step < share for log, step in zip(logs, latest, strict=True)):
-            return True  # there cannot be more of them, and to count costs more
-        return most_waiting(logs, self._graph) < share
 
     def _new(
         self, logs: Sequence[RobotLog], graph: PathGraph, maps: ParticleMaps, best: int

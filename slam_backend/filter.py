@@ -219,6 +219,8 @@ class FastSlam(FilterKnowledge):
 
     def _rejuvenate(self, smoother: RejuvenationStep) -> RejuvenationReport | None:
         """Draw the particles anew from the posterior of whole paths, if it is time and that can be found."""
+        if smoother.rests(self._logs):
+            return None
         starts = self._starts[:, :, : self.num_particles]
         result = smoother.run(
             self._logs, starts, self._maps, self.best_particle, self._assumed.camera, self._rng
