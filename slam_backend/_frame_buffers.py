@@ -13,6 +13,7 @@ from slam_backend.errors import BoolArray, FloatArray, IntArray
 from slam_backend.input_log import RobotInput
 from slam_backend.measurements import Measurements
 
+MEASUREMENTS = 8  # of one robot for which there is room from the start
 CANDIDATES = 64  # of one frame for which there is working space; more get their own each time
 EMPTY = Measurements.empty(0)
 NO_COVARIANCES = np.zeros((0, 3, 3))
@@ -77,7 +78,7 @@ class FrameBuffers:
         self.log_likelihood: FloatArray = np.zeros(padded)
         self.work: FloatArray = aligned((_kernels.WORK_ROWS * LANES,), np.float64)
         self.records: FloatArray = aligned((CANDIDATES, _kernels.CANDIDATE_ROWS * LANES), np.float64)
-        self._make_room(0)
+        self._make_room(MEASUREMENTS * num_robots)
 
     def _make_room(self, most: int) -> None:
         """Provide for so many measurements in a step."""
@@ -157,11 +158,15 @@ def _joined(
         return EMPTY.points, NO_COVARIANCES, EMPTY.descriptors, NO_NAMES
     points, covariances, descriptors, names = used[0]
     if len(used) > 1:
+        given = named = False
+        for _, spreads, _, called in used:
+            given |= spreads is not None
+            named |= called is not None
         points = np.concatenate([own[0] for own in used])
         descriptors = np.concatenate([own[2] for own in used])
-        if any(own[1] is not None for own in used):
+        if given:
             covariances = np.concatenate([np.zeros((len(own[0]), 3, 3)) if own[1] is None else own[1] for own in used])
-        if any(own[3] is not None for own in used):
+        if named:
             names = np.concatenate([np.zeros(len(own[0]), np.int64) if own[3] is None else own[3] for own in used])
     covariances = NO_COVARIANCES if covariances is None else covariances
     if points.flags.writeable:

@@ -1,5 +1,6 @@
 """Where the landmarks of all particles lie: rows of values, slots with names and descriptors, and how both grow."""
 
+import math
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ LINE = 64  # [bytes]; vectors that straddle cache lines are slow
 def aligned(shape: tuple[int, ...], dtype: Any) -> Any:
     """Return zeros of a shape and a numpy type that start at a cache line."""
     kind = np.dtype(dtype)
-    size = int(np.prod(shape)) * kind.itemsize
+    size = math.prod(shape) * kind.itemsize
     raw = np.zeros(size + LINE, dtype=np.uint8)
     start = -raw.ctypes.data % LINE
     return raw[start : start + size].view(kind).reshape(shape)
