@@ -14,6 +14,7 @@ from slam_backend.errors import bad_argument, check_int, check_seed
 from slam_backend.filter import FastSlam
 from slam_backend.filter_options import FilterOptions
 from slam_backend.groups import Group
+from slam_backend.lineup import Lineup
 from slam_backend.merge_options import MergeOptions
 from slam_backend.records import Records
 from slam_backend.reports import MergeEvent
@@ -28,9 +29,8 @@ class TeamState:
         _groups: By ascending first robot.
         _records: What they write down in common.
         _events: All attempts, merges and undos so far, in order.
-        _places: Of each robot its group, the branch that it goes by, and its place in that; none while robots change
-            theirs.
-        _numbers: Of all maps that are in use, and `_numbered`: the branches and their watches as that was found.
+        _lineup: What the groups come to; None while they change. Ask `lineup` for it.
+        _numbers: Of all maps that are in use, as of the lineup `_numbered`.
         _step: Number of the next step.
         _epoch: How many merges and undos there were.
         _size: Length of the descriptors, 0 before it is known.
@@ -73,9 +73,9 @@ class TeamState:
         ]
         self._groups, self._records, self._num_robots = groups, Records(count, of_forks), count
         self._events: list[MergeEvent] = []
-        self._places: list[tuple[Group, Branch, int]] = []
-        self._numbers = set(range(count))
-        self._numbered: list[tuple[int, int]] = []
+        self._lineup: Lineup | None = None
+        self._numbers = frozenset(range(count))
+        self._numbered: Lineup | None = None
         self._step = 0
         self._epoch = 0
         self._size = 0
@@ -117,8 +117,8 @@ class TeamState:
         self._events = list(state["events"])
         at_hand = {group.robots: group.trunk.filter for group in self._groups}  # filling is faster than building
         self._groups = [Group.from_state(group, at_hand) for group in state["groups"]]
-        self._places, self._numbered, self._size = [], [], 0
-        self._numbers = set(state["numbers"])
+        self._lineup, self._numbered, self._size = None, None, 0
+        self._numbers = frozenset(state["numbers"])
         self._alignment, self._merging = state["alignment"], state["merging"]
         self._schedule.set_state(state["schedule"])
         self._records.set_state(state["records"])

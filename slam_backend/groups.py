@@ -101,9 +101,12 @@ class Group:
 
     # ------------------------------------------------------------------ snapshots
 
-    def oldest_unknown(self, now: int) -> int:
-        """Return the first step that some filter may have to take in yet, `now` + 1 if there is none."""
-        return min([_oldest_unknown(branch, now) for branch in self.branches])
+    def steps_unknown(self) -> list[int]:
+        """Return from which past steps on its filters may have to take in readings yet; none if they know all."""
+        held = [
+            1 + last for branch in self.branches for robot, last in branch.known.items() if robot not in branch.live
+        ]
+        return held + [side.oldest for branch in self.branches for watch in branch.watches for side in watch.sides]
 
     def numbers(self) -> set[int]:
         """Return the numbers of all maps that the group uses or may take up again."""
@@ -127,14 +130,6 @@ class Group:
         )
         group.undoing = None if state["undoing"] is None else Undoing.from_state(state["undoing"])
         return group
-
-
-def _oldest_unknown(branch: Branch, now: int) -> int:
-    """Return the first step that a filter may still have to take in; the next one if there is none."""
-    if not branch.watches and len(branch.live) == len(branch.robots):
-        return now + 1
-    held = [1 + last for robot, last in branch.known.items() if robot not in branch.live]
-    return min([now + 1, *held, *(side.oldest for watch in branch.watches for side in watch.sides)])
 
 
 def _numbers(watch: Watch) -> set[int]:

@@ -21,12 +21,15 @@ from slam_backend.errors import IntArray, bad_argument
 from slam_backend.group_changes import contradicted, merge_groups, undone
 from slam_backend.groups import Group
 from slam_backend.input_log import RobotInput
+from slam_backend.lineup import Lineup
 from slam_backend.measurements import Measurements
 from slam_backend.merging import inverse_alignment
-from slam_backend.reports import MapDropped, MergeEvent, RejuvenationReport, Renaming, TeamReport
+from slam_backend.reports import MapDropped, MergeEvent, RejuvenationReport, Renaming, StepReport, TeamReport
 from slam_backend.team_knowledge import TeamKnowledge
 from slam_backend.trying import attempt, speakers
 from slam_backend.undoing import Undoing
+
+NO_IDS: IntArray = np.empty(0, np.int64)
 
 
 class TeamSlam(TeamKnowledge):
@@ -79,36 +82,32 @@ class TeamSlam(TeamKnowledge):
         inputs = check_step(self._num_robots, size, camera, odometry, measurements, identities, poses)
         records, before = self._records, len(self._events)
         records.log.record(self._step, inputs)
-        if contacts is not None or any(len(group.branches) > 1 for group in self._groups):
-            for group in self._groups:
-                group.regroup(networks, records)
-            self._places = []
-        associations: list[IntArray] = [np.empty(0, np.int64)] * self._num_robots
+        if contacts is not None or self.lineup.is_split:
+            self._regroup(networks)
+        associations: list[IntArray] = [NO_IDS] * self._num_robots
         created = list(associations)
         rejuvenations: list[tuple[tuple[int, ...], RejuvenationReport]] = []
-        for group in self._groups:
-            for branch in group.branches:
-                self._advance(branch, inputs)
-                if branch.report is not None:
-                    if branch.report.rejuvenation is not None:
-                        rejuvenations.append((branch.live, branch.report.rejuvenation))
-                    for index, robot in enumerate(branch.robots):
-                        if robot in branch.live:
-                            associations[robot] = branch.report.associations[index]
-                            created[robot] = branch.report.created[index]
+        for branch in self.lineup.branches:
+            done = self._advance(branch, inputs)
+            if done.rejuvenation is not None:
+                rejuvenations.append((branch.live, done.rejuvenation))
+            for robot, found, made in zip(branch.robots, done.associations, done.created, strict=True):
+                if robot in branch.live:
+                    associations[robot], created[robot] = found, made
         self._doubt()
         renamings = self._attempt(networks)
-        oldest = min([group.oldest_unknown(self._step) for group in self._groups])
+        lineup = self.lineup
+        oldest = self._step + 1 if lineup.oldest is None else lineup.oldest
         records.log.forget_before(oldest)
         report = TeamReport(
             step=self._step,
             associations=tuple(associations),
             created=tuple(created),
-            groups=self.groups,
+            groups=lineup.groups,
             events=tuple(self._events[before:]),
             renamings=renamings,
-            maps=self.maps,
-            entries=(*records.entries, *self._dropped()),
+            maps=lineup.maps,
+            entries=(*records.entries, *self._dropped(lineup)),
             oldest_step=oldest,
             rejuvenations=tuple(rejuvenations),
         )
@@ -116,11 +115,20 @@ class TeamSlam(TeamKnowledge):
         self._step += 1
         return report
 
-    def _advance(self, branch: Branch, inputs: Sequence[RobotInput]) -> None:
+    def _regroup(self, networks: IntArray) -> None:
+        """Let robots of each group lose and find each other."""
+        was_split = self.lineup.is_split
+        for group in self._groups:
+            group.regroup(networks, self._records)
+        if was_split or any(len(group.branches) > 1 for group in self._groups):
+            self._lineup = None
+
+    def _advance(self, branch: Branch, inputs: Sequence[RobotInput]) -> StepReport:
         """Step a filter with what its robots have just read."""
         report = take_in(branch, self._step, branch.live, [inputs[robot] for robot in branch.live])
         self._records.note_created(branch, branch.live, self._step, report)
         self._records.exchange.record_step(branch.robots, report, branch.filter.descriptor_size, branch.live)
+        return report
 
     def merge(self, robot_a: int, robot_b: int, alignment: Alignment, known: bool = False) -> Renaming:
         """Merge the joint filters of two robots' groups with a given alignment, unasked whether it is right.
@@ -167,7 +175,7 @@ class TeamSlam(TeamKnowledge):
         """Put some groups in the place of others."""
         self._groups = [group for group in self._groups if all(group is not other for other in old)] + list(new)
         self._groups.sort(key=lambda group: group.robots)
-        self._places = []
+        self._lineup = None
 
     def _doubt(self) -> None:
         """Weigh the evidence about the merges that can still be undone, and undo what contradicts itself."""
@@ -182,6 +190,7 @@ class TeamSlam(TeamKnowledge):
             for branch in group.branches:
                 while branch.watches and branch.watches[0].steps >= self._merging.watch_steps:
                     branch.watches.pop(0)
+                    self._lineup = None
 
     def _undo(self, group: Group, undoing: Undoing) -> None:
         """Go on with taking back a merge; it is done when all sides have caught up and are in contact."""
@@ -211,19 +220,16 @@ class TeamSlam(TeamKnowledge):
         groups = self._group_of(event.robots_a[0]), self._group_of(event.robots_b[0])
         return (self.merge(*speakers(groups), event.alignment),)
 
-    def _dropped(self) -> list[MapDropped]:
+    def _dropped(self, lineup: Lineup) -> list[MapDropped]:
         """Return the maps that are gone since this was asked last."""
-        numbered = [(branch.number, len(branch.watches)) for group in self._groups for branch in group.branches]
-        if numbered == self._numbered:
+        if lineup is self._numbered:
             return []
-        self._numbered = numbered
-        numbers = set[int]().union(*(group.numbers() for group in self._groups))
-        gone, self._numbers = sorted(self._numbers - numbers), self._numbers | numbers
-        self._numbers -= set(gone)
+        gone = sorted(self._numbers - lineup.numbers)
+        self._numbered, self._numbers = lineup, lineup.numbers
         return [MapDropped(number) for number in gone]
 
     def _descriptor_size(self) -> int:
         """Return the length of the descriptors in use, 0 before the first one; it stays the same from there on."""
         if not self._size:
-            self._size = max([branch.filter.descriptor_size for group in self._groups for branch in group.branches])
+            self._size = max([branch.filter.descriptor_size for branch in self.lineup.branches])
         return self._size

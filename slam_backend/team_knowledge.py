@@ -10,6 +10,7 @@ from slam_backend.errors import FloatArray, IntArray, bad_argument
 from slam_backend.geometry import inverse
 from slam_backend.groups import Group
 from slam_backend.landmark_map import LandmarkMap, MapOutline, TeamOutlines
+from slam_backend.lineup import Lineup
 from slam_backend.reports import MergeEvent, PoseEstimate
 from slam_backend.standpoints import Standpoints
 
@@ -23,9 +24,16 @@ class TeamKnowledge(TeamState):
         return self._num_robots
 
     @property
+    def lineup(self) -> Lineup:
+        """Who goes by which filter; the same object until that changes."""
+        if self._lineup is None:
+            self._lineup = Lineup.of(self._groups)
+        return self._lineup
+
+    @property
     def groups(self) -> tuple[tuple[int, ...], ...]:
         """The groups, each in ascending order of robots, by ascending first robot."""
-        return tuple([group.robots for group in self._groups])
+        return self.lineup.groups
 
     @property
     def events(self) -> tuple[MergeEvent, ...]:
@@ -40,17 +48,7 @@ class TeamKnowledge(TeamState):
     @property
     def maps(self) -> tuple[int, ...]:
         """Per robot the number of the map that it goes by; see `TeamReport`."""
-        return tuple([branch.number for _, branch, _ in self._placed()])
-
-    @property
-    def all_members(self) -> list[tuple[int, ...]]:
-        """Per robot its `members`."""
-        return [branch.robots for _, branch, _ in self._placed()]
-
-    @property
-    def all_mates(self) -> list[tuple[int, ...]]:
-        """Per robot its `mates`."""
-        return [branch.live for _, branch, _ in self._placed()]
+        return self.lineup.maps
 
     @property
     def diagnostics(self) -> tuple[dict[str, float], ...]:
@@ -159,7 +157,7 @@ class TeamKnowledge(TeamState):
 
     def outlines(self, min_count: int = 1) -> TeamOutlines:
         """Return the outlines of `map(robot, min_count=min_count)` of all robots, much faster. Fresh arrays."""
-        branches = [branch for group in self._groups for branch in group.branches]
+        branches = self.lineup.branches
         rows = MapOutline.unwritten(sum([branch.filter.map_room for branch in branches]))
         parts, first = np.empty((self._num_robots, 2), np.int64), 0
         for branch in branches:
@@ -172,11 +170,10 @@ class TeamKnowledge(TeamState):
     def standpoints(self) -> Standpoints:
         """Return where all robots stand: `pose_from_start`, `start_from_group`, `pose` at once. Fresh arrays."""
         points = Standpoints.unwritten(self._num_robots)
-        for group in self._groups:
-            for branch in group.branches:
-                slam, report = branch.filter, branch.report
-                ess = 1.0 if report is None else report.ess / slam.num_particles
-                slam._stand(branch.robots, branch.live, ess, points)
+        for branch in self.lineup.branches:
+            slam, report = branch.filter, branch.report
+            ess = 1.0 if report is None else report.ess / slam.num_particles
+            slam._stand(branch.robots, branch.live, ess, points)
         return points
 
     def _group_of(self, robot: int) -> Group:
@@ -187,18 +184,10 @@ class TeamKnowledge(TeamState):
         """Return the branch that the robot goes by, and its place in it."""
         return self._place(robot)[1:]
 
-    def _placed(self) -> list[tuple[Group, Branch, int]]:
-        """Return each robot's group, the branch that it goes by, and its place in that."""
-        if not self._places:
-            branches = [(group, branch) for group in self._groups for branch in group.branches]
-            places = {r: (group, branch, branch.robots.index(r)) for group, branch in branches for r in branch.live}
-            self._places = [places[r] for r in range(self._num_robots)]
-        return self._places
-
     def _place(self, robot: int) -> tuple[Group, Branch, int]:
-        """Return what `_placed` does of one robot."""
+        """Return the robot's group, the branch that it goes by, and its place in that."""
         if type(robot) is int and 0 <= robot < self._num_robots:
-            return self._placed()[robot]
+            return self.lineup.places[robot]
         if isinstance(robot, (int, np.integer)) and not isinstance(robot, bool) and 0 <= robot < self._num_robots:
-            return self._placed()[robot]
+            return self.lineup.places[robot]
         raise bad_argument("robot", f"an index from 0 to {self.num_robots - 1}", robot, "Count robots from 0.")

@@ -74,7 +74,7 @@ class TeamBelief:
     @property
     def groups(self) -> tuple[tuple[int, ...], ...]:
         """The groups, each in ascending order of robots."""
-        return self._groups
+        return self._lineup.groups
 
     @property
     def events(self) -> tuple[MergeEvent, ...]:
@@ -117,7 +117,7 @@ class TeamBelief:
         self._look_up_poses()
         self._grids.follow(self._tick, report.entries, report.renamings)
         points = self._points
-        self._grids.meet(self._team.all_mates, points.starts)
+        self._grids.meet(self._lineup.mates, points.starts)
         self._grids.paint(self._tick, points.poses, scans, np.array(bumps, np.bool_))
         for robot in self._whose_candidates_are_due():
             self._slots[robot].update(self._grids[robot].cells, points.own[robot], self._mates_around(robot))
@@ -128,13 +128,13 @@ class TeamBelief:
         renaming = self._team.merge(robot_a, robot_b, alignment, known)
         self._look_up_poses()
         self._grids.keep(self._tick + 1, renaming)
-        self._grids.meet(self._team.all_mates, self._points.starts)
+        self._grids.meet(self._lineup.mates, self._points.starts)
         return renaming
 
     @property
     def known_groups(self) -> Sequence[tuple[int, ...]]:
         """Per robot those that share a map with it, as far as it knows, itself included."""
-        return self._members
+        return self._lineup.members
 
     def speaker(self, group: tuple[int, ...]) -> int:
         """Return the first robot of a group that goes by its joint filter, and so can merge it with another."""
@@ -146,7 +146,7 @@ class TeamBelief:
 
     def group_map(self, robot: int) -> LandmarkMap:
         """Return the confirmed landmarks of a robot's group, in the group's map frame."""
-        number = self._team.maps[robot]
+        number = self._lineup.maps[robot]
         if number not in self._maps:
             self._maps[number] = self._team.map(robot, min_count=self._confirm_after)
         return self._maps[number]
@@ -211,8 +211,7 @@ class TeamBelief:
 
     def _look_up_poses(self) -> None:
         """Take note of the groups and poses after a step or a merge, and forget what was derived from those before."""
-        self._groups = self._team.groups
-        self._members = self._team.all_members
+        self._lineup = self._team.lineup
         self._points = self._team.standpoints()
         self._beliefs.clear()
         self._maps.clear()
@@ -220,7 +219,7 @@ class TeamBelief:
 
     def _others(self, robot: int) -> list[int]:
         """Return the other robots that a robot knows of, ascending."""
-        return [mate for mate in self._members[robot] if mate != robot]
+        return [mate for mate in self._lineup.members[robot] if mate != robot]
 
     def _mates_around(self, robot: int) -> FloatArray:
         """Return where a robot believes these to be (n, 2) [m], in its own start frame."""
@@ -237,7 +236,7 @@ class TeamBelief:
 
     def _make_belief(self, robot: int) -> Belief:
         """Put together what `belief` returns."""
-        points, slots, group = self._points, self._slots[robot], self._members[robot]
+        points, slots, group = self._points, self._slots[robot], self._lineup.members[robot]
         return Belief(
             robot=robot,
             tick=self._tick,

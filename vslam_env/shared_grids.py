@@ -159,7 +159,7 @@ class SharedGrids:
 
     def _settle(self, mates: Sequence[tuple[int, ...]]) -> None:
         """Take note of who goes by the same filter as whom."""
-        self._mates = list(mates)
+        self._mates = tuple(mates)
         pairs = [(owner, robot) for owner, group in enumerate(mates) for robot in group]
         self._owners, self._robots = np.array(pairs).T.copy()
 
@@ -190,7 +190,7 @@ class SharedGrids:
         """Return all that decides how the grids go on; what is never written to is shared."""
         return {
             "grids": [grid.get_state() for grid in self._grids],
-            "mates": tuple(self._mates),
+            "mates": self._mates,
             "kept": tuple(self._kept),
             "strokes": tuple(self._strokes),
         }

@@ -106,8 +106,8 @@ def test_where_robots_stand_is_told_at_once_as_one_by_one() -> None:
             team.merge(0, 1, align_maps(team.map(0, "mixture"), team.map(1, "mixture")))
         points, outlines = team.standpoints(), team.outlines(2)
         for robot in range(3):
-            assert_same(team.all_members[robot], team.members(robot))
-            assert_same(team.all_mates[robot], team.mates(robot))
+            assert_same(team.lineup.members[robot], team.members(robot))
+            assert_same(team.lineup.mates[robot], team.mates(robot))
             assert_same(points.poses[robot, robot], points.own[robot])
             assert_same(PoseEstimate(points.own[robot], points.covariances[robot]), team.pose_from_start(robot))
             np.testing.assert_allclose(points.starts[robot], team.start_from_group(robot), atol=1e-15)

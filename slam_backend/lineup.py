@@ -1,0 +1,54 @@
+"""`Lineup`: who goes by which filter, and what of the past its filters may still ask for; it changes seldom."""
+
+from collections.abc import Sequence
+from typing import NamedTuple, Self
+
+from slam_backend.branches import Branch
+from slam_backend.groups import Group
+
+
+class Lineup(NamedTuple):
+    """What the groups of a team come to, as long as no group, branch or watch of a merge begins or ends.
+
+    Attributes:
+        groups: The robots of each group, by ascending first robot.
+        branches: Of all groups.
+        places: Per robot its group, the branch that it goes by, and its place in that.
+        members: Per robot those whose places its filter knows, itself included, ascending.
+        mates: Per robot those that go by the same filter, itself included, ascending.
+        maps: Per robot the number of the map that it goes by.
+        numbers: Of all maps that are in use or may be taken up again.
+        oldest: The first step that some filter may have to take in yet; None: there is none.
+    """
+
+    groups: tuple[tuple[int, ...], ...]
+    branches: tuple[Branch, ...]
+    places: tuple[tuple[Group, Branch, int], ...]
+    members: tuple[tuple[int, ...], ...]
+    mates: tuple[tuple[int, ...], ...]
+    maps: tuple[int, ...]
+    numbers: frozenset[int]
+    oldest: int | None
+
+    @property
+    def is_split(self) -> bool:
+        """Whether some robots are out of contact with their group's joint filter."""
+        return len(self.branches) > len(self.groups)
+
+    @classmethod
+    def of(cls, groups: Sequence[Group]) -> Self:
+        """Return that of these groups."""
+        owned = [(group, branch) for group in groups for branch in group.branches]
+        by_robot = {r: (group, branch, branch.robots.index(r)) for group, branch in owned for r in branch.live}
+        places = tuple(by_robot[robot] for robot in sorted(by_robot))
+        oldest = [step for group in groups for step in group.steps_unknown()]
+        return cls(
+            groups=tuple(group.robots for group in groups),
+            branches=tuple(branch for _, branch in owned),
+            places=places,
+            members=tuple(branch.robots for _, branch, _ in places),
+            mates=tuple(branch.live for _, branch, _ in places),
+            maps=tuple(branch.number for _, branch, _ in places),
+            numbers=frozenset[int]().union(*(group.numbers() for group in groups)),
+            oldest=min(oldest, default=None),
+        )
