@@ -13,6 +13,7 @@ from slam_backend.filter_options import FilterOptions
 from slam_backend.geometry import rotate_covariances
 from slam_backend.landmark_map import LandmarkMap, TeamOutlines
 from slam_backend.reports import MergeEvent, Renaming, TeamReport
+from slam_backend.standpoints import Standpoints
 from slam_backend.team import TeamSlam
 from vslam_env.navigation import TeamGrids, TeamSlots
 from vslam_env.readings import Readings
@@ -91,11 +92,6 @@ class TeamBelief:
         """(K, 3) float64 [m, m, rad]. Where each robot believes to be, in its own start frame. A copy."""
         return self._points.own.copy()
 
-    @property
-    def position_sigmas(self) -> FloatArray:
-        """(K,) float64 [m]. One sigma of each robot's position in its own start frame, averaged over directions."""
-        return self._points.sigmas.diagonal().copy()
-
     def step(self, readings: Sequence[Readings]) -> TeamReport:
         """Take in one tick's readings of all K robots; the first ones are those of the reset.
 
@@ -159,9 +155,9 @@ class TeamBelief:
         return self._outlines
 
     @property
-    def starts_from_group(self) -> FloatArray:
-        """(K, 3) float64 [m, m, rad]. The motion from its group's map frame to each robot's own start frame."""
-        return self._points.starts
+    def points(self) -> Standpoints:
+        """Where the robots stand; to be looked at."""
+        return self._points
 
     @property
     def grids(self) -> TeamGrids:

@@ -17,7 +17,6 @@ from vslam_env.communication import contacts
 from vslam_env.config import TICK, EnvConfig
 from vslam_env.coverage import Coverage
 from vslam_env.oracle import true_alignment
-from vslam_env.pose_errors import pose_errors
 from vslam_env.readings import Readings
 from vslam_env.reward import Standing
 from vslam_env.sensors import EyeFrame, Frame
@@ -121,19 +120,20 @@ class Episode:
 
     def standing(self) -> Standing:
         """Return how the team stands now: its maps and poses are scored."""
-        belief, poses = self.belief, self._simulator.poses
-        maps = self.ledger.scores(belief.outlines, belief.starts_from_group, self.true_starts)
-        distances, turns = pose_errors(self.true_starts, self.estimated_path[-1], poses)
+        belief, poses = self.belief, self.true_path[-1]
+        errors, rmses, recalls, precisions, placed, pose_errors, heading_errors, sigmas = self.ledger.scores(
+            belief.outlines, belief.points, self.true_starts, poses
+        )
         coverage, found = self._coverage.update(belief.grids, poses)
         return Standing(
-            map_errors=maps.errors,
-            map_rmses=maps.rmses,
-            map_recalls=maps.recalls,
-            map_precisions=maps.precisions,
-            placed_recalls=maps.placed,
-            pose_errors=distances,
-            heading_errors=turns,
-            pose_sigmas=belief.position_sigmas,
+            map_errors=errors,
+            map_rmses=rmses,
+            map_recalls=recalls,
+            map_precisions=precisions,
+            placed_recalls=placed,
+            pose_errors=pose_errors,
+            heading_errors=heading_errors,
+            pose_sigmas=sigmas,
             coverage=coverage,
             found=found,
             collisions=self._collisions.copy(),

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 from small_env import MEETING, room, small_env, turning, wander
 
-from slam_backend.geometry import between, compose, inverse, wrap_angle
+from slam_backend.geometry import between, compose, inverse
 from vslam_env import World
 from vslam_env.actions import DISCRETE_COMMANDS, command_of
-from vslam_env.pose_errors import pose_errors
 
 INFO_KEYS = [
     "map_error",
@@ -207,7 +206,7 @@ def test_an_oracle_merge_is_not_corrected_by_landmarks() -> None:
     for _ in range(60):
         env.step(turning(env.agents))
     assert env.events
-    assert np.allclose(env.episode.belief.starts_from_group[1], inverse(between(*MEETING)), atol=1e-3)
+    assert np.allclose(env.episode.belief.points.starts[1], inverse(between(*MEETING)), atol=1e-3)
     infos = env.step(turning(env.agents))[4]
     assert np.allclose(infos["robot_0"]["map_rmse"], infos["robot_1"]["map_rmse"], atol=1e-3)
 
@@ -387,16 +386,6 @@ def test_worlds_of_all_kinds() -> None:
     env.reset(seed=1)
     assert np.allclose(env.true_start_poses, own.start_poses)
     assert small_env(world="fig5").reset(seed=0)
-
-
-def test_pose_errors_are_differences_of_placed_poses() -> None:
-    """An estimated pose, laid at the true start, is compared with the true pose: position and heading."""
-    rng = np.random.default_rng(4)
-    starts, estimated, true = rng.uniform(-4.0, 4.0, (3, 20, 3))
-    placed = compose(starts, estimated)
-    distances, turns = pose_errors(starts, estimated, true)
-    np.testing.assert_allclose(distances, np.linalg.norm(placed[:, :2] - true[:, :2], axis=1))
-    np.testing.assert_allclose(turns, np.abs(wrap_angle(placed[:, 2] - true[:, 2])))
 
 
 def test_an_environment_goes_with_its_last_name() -> None:

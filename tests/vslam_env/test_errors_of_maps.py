@@ -1,20 +1,24 @@
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
+from scored import by_name, standing_at
 from small_env import MEETING, small_env, turning
 
 from slam_backend.errors import IntArray
-from slam_backend.geometry import compose, inverse, transform_points
+from slam_backend.geometry import compose, inverse, transform_points, wrap_angle
 from slam_backend.landmark_map import LandmarkMap, TeamOutlines
 from slam_backend.metrics import gospa, map_error, map_rmse
-from slam_backend.reports import LandmarksCreated, Renaming, TeamReport
+from slam_backend.reports import LandmarksCreated, MapCopied, MapDropped, Renaming, TeamReport
 from vslam_env.coverage import Coverage, CoverageMeter
 from vslam_env.errors_of_maps import ClaimLedger
 from vslam_env.navigation import FREE, SeenGrid, TeamGrids, cell_of
+from vslam_env.reward import Standing
 
 TRUTHS = np.array([[0.0, 0.0, 0.0], [5.0, 0.0, 0.3], [0.0, 6.0, -0.2], [7.0, 7.0, 0.0], [9.0, 1.0, 0.0]])
 COUNTABLE = np.array([True, True, False, True, True])
 STAY = np.zeros(3)
+MAP_SCORES = Standing._fields[:5]
 
 
 def _ids(*values: int) -> IntArray:
@@ -44,8 +48,8 @@ def _score(ledger: ClaimLedger, robot: int, held: LandmarkMap, world_from_group:
     maps, poses = [LandmarkMap.empty(2)] * robots, np.zeros((robots, 3))
     maps[robot], poses[robot] = held, world_from_group
     outlines = TeamOutlines.joined([each.outline for each in maps])
-    scores = ledger.scores(outlines, poses, np.zeros((robots, 3)))
-    return SimpleNamespace(**{name: of_all[robot] for name, of_all in scores._asdict().items()})
+    scores = ledger.scores(outlines, standing_at(poses), np.zeros((robots, 3)), np.zeros((robots, 3)))
+    return by_name(scores[:, robot])
 
 
 def test_claims_follow_creation() -> None:
@@ -66,15 +70,19 @@ def test_maps_are_scored_where_robots_believe_them_to_be() -> None:
         each.outline._replace(means=transform_points(pose, each.means)) for each, pose in zip(held, there, strict=True)
     ]
     rows, parts = TeamOutlines.joined(outlines[::-1])
-    scores = ledger.scores(TeamOutlines(rows, parts[::-1].copy()), starts, true_starts)
+    nowhere = np.zeros((2, 3))
+    scores = ledger.scores(TeamOutlines(rows, parts[::-1].copy()), standing_at(starts), true_starts, nowhere)
     for robot in range(2):
-        for name, expected in vars(_score(ledger, robot, held[robot], np.zeros(3))).items():
-            np.testing.assert_allclose(getattr(scores, name)[robot], expected, atol=1e-12)
+        expected = vars(_score(ledger, robot, held[robot], np.zeros(3)))
+        for name in MAP_SCORES:
+            np.testing.assert_allclose(getattr(by_name(scores), name)[robot], expected[name], atol=1e-12)
     ledger.rename(Renaming((0,), (1,), np.array([[0, 1], [1, 3], [2, 4]]), (0, 1, 2)))
     joint = TeamOutlines(rows, np.array([parts[1], parts[1]]))
-    scores = ledger.scores(joint, starts[[0, 0]], true_starts[[0, 0]])
-    for name, expected in vars(_score(ledger, 0, held[0], np.zeros(3))).items():
-        np.testing.assert_allclose(getattr(scores, name), [expected, expected], atol=1e-12)
+    scores = ledger.scores(joint, standing_at(starts[[0, 0]]), true_starts[[0, 0]], nowhere)
+    expected = vars(_score(ledger, 0, held[0], np.zeros(3)))
+    for robot in range(2):
+        for name in MAP_SCORES:
+            np.testing.assert_allclose(getattr(by_name(scores), name)[robot], expected[name], atol=1e-12)
 
 
 def test_claims_follow_a_merge() -> None:
@@ -82,6 +90,35 @@ def test_claims_follow_a_merge() -> None:
     ledger = _ledger()
     ledger.rename(Renaming((0,), (1,), np.array([[0, 1], [1, 3], [2, 4]]), (0, 1, 2)))
     assert ledger.claims(0, _ids(0, 1, 2, 3, 4)).tolist() == [0, 1, -1, 2, -2]
+
+
+def test_books_follow_their_maps() -> None:
+    """Whatever is copied, dropped or filled, a map claims what its landmarks were created as; so from a snapshot on."""
+    rng = np.random.default_rng(8)
+    ledger, numbers = ClaimLedger(2, TRUTHS, COUNTABLE, 1.0), [0, 1]
+    plain: dict[int, dict[int, int]] = {0: {}, 1: {}}
+    for turn in range(2, 200):
+        into, step = int(rng.choice(numbers)), 2 * turn
+        true_ids = rng.integers(-1, 5, 2)
+        ids = max(plain[into], default=-1) + np.array([1, 2 + rng.integers(3)])
+        entries: list[Any] = [LandmarksCreated(into, 0, step, ids)]
+        claims = [-1 if true < 0 else (0, 1, -2, 2, 3)[true] for true in true_ids]
+        plain[into] |= dict(zip(ids.tolist(), claims, strict=True))
+        if turn % 3 == 0:
+            entries.append(MapCopied(into, turn))
+            plain[turn] = dict(plain[into])
+            numbers.append(turn)
+        if len(numbers) > 4:
+            entries.append(MapDropped(numbers.pop(0)))
+        maps = tuple(rng.choice(numbers, 2).tolist())
+        report = TeamReport(step, (), (), ((0,), (1,)), (), (), maps, tuple(entries), step + 1)
+        ledger.record(report, [true_ids, _ids()])
+        if turn % 50 == 0:
+            state, ledger = ledger.get_state(), ClaimLedger(2, TRUTHS, COUNTABLE, 1.0)
+            ledger.set_state(state)
+        for robot, number in enumerate(maps):
+            expected = plain[number]
+            assert ledger.claims(robot, np.array([*expected], np.int64)).tolist() == [*expected.values()]
 
 
 def test_a_fused_false_landmark_stays_false() -> None:
@@ -96,16 +133,16 @@ def test_score_of_a_small_map() -> None:
     ledger = _ledger()
     means = TRUTHS[[0, 1, 3]] + np.array([[0.3, 0.0, 0.0], [0.0, 0.0, 0.4], [0.0, 0.0, 0.0]])
     score = _score(ledger, 0, _map(means, _ids(0, 1, 2)), STAY)
-    assert np.isclose(score.errors, np.sqrt((0.3**2 + 0.4**2 + 0.5 * (2 + 1)) / 4))
-    assert np.isclose(score.rmses, np.sqrt((0.3**2 + 0.4**2) / 2))
-    assert (score.recalls, score.precisions) == (0.5, 2 / 3)
+    assert np.isclose(score.map_errors, np.sqrt((0.3**2 + 0.4**2 + 0.5 * (2 + 1)) / 4))
+    assert np.isclose(score.map_rmses, np.sqrt((0.3**2 + 0.4**2) / 2))
+    assert (score.map_recalls, score.map_precisions) == (0.5, 2 / 3)
 
 
 def test_score_of_nothing() -> None:
     """An empty map misses everything; its RMSE is the cutoff."""
     score = _score(_ledger(), 0, LandmarkMap.empty(2), STAY)
-    assert np.isclose(score.errors, np.sqrt(0.5))
-    assert (score.rmses, score.recalls, score.precisions) == (1.0, 0.0, 0.0)
+    assert np.isclose(score.map_errors, np.sqrt(0.5))
+    assert (score.map_rmses, score.map_recalls, score.map_precisions) == (1.0, 0.0, 0.0)
 
 
 def test_duplicates_false_points_and_wrong_merges_cost() -> None:
@@ -113,10 +150,10 @@ def test_duplicates_false_points_and_wrong_merges_cost() -> None:
     ledger = _ledger()
     ledger.record(_report((_ids(3, 4), _ids())), [_ids(0, -1), _ids()])
     means = np.vstack([TRUTHS[[0, 1]], [[0.1, 0.0, 0.0], [4.0, 4.0, 0.0]]])
-    right = _score(ledger, 0, _map(means[:2], _ids(0, 1)), STAY).errors
-    duplicate = _score(ledger, 0, _map(means[:3], _ids(0, 1, 3)), STAY).errors
-    false = _score(ledger, 0, _map(means[[0, 1, 3]], _ids(0, 1, 4)), STAY).errors
-    wrong = _score(ledger, 0, _map(means[:2], _ids(0, 1)), np.array([1.0, 0.2, 0.1])).errors
+    right = _score(ledger, 0, _map(means[:2], _ids(0, 1)), STAY).map_errors
+    duplicate = _score(ledger, 0, _map(means[:3], _ids(0, 1, 3)), STAY).map_errors
+    false = _score(ledger, 0, _map(means[[0, 1, 3]], _ids(0, 1, 4)), STAY).map_errors
+    wrong = _score(ledger, 0, _map(means[:2], _ids(0, 1)), np.array([1.0, 0.2, 0.1])).map_errors
     assert right < min(duplicate, false, wrong)
     assert np.isclose(duplicate, false)
 
@@ -127,7 +164,7 @@ def test_error_agrees_with_gospa_where_landmarks_are_apart() -> None:
     rng = np.random.default_rng(3)
     means = TRUTHS[[0, 1]] + rng.normal(0.0, 0.2, (2, 3))
     score = _score(ledger, 0, _map(means, _ids(0, 1)), STAY)
-    assert np.isclose(score.errors, gospa(means, TRUTHS[COUNTABLE], cutoff=1.0).error)
+    assert np.isclose(score.map_errors, gospa(means, TRUTHS[COUNTABLE], cutoff=1.0).error)
 
 
 def test_scores_agree_with_the_metrics() -> None:
@@ -146,11 +183,25 @@ def test_scores_agree_with_the_metrics() -> None:
         score = _score(ledger, 0, _map(means, ids), inverse(pose))
         placed = transform_points(inverse(pose), means)
         matched = map_rmse(placed, ledger.true_positions, claims=claims)
-        assert np.isclose(score.errors, map_error(placed, claims, ledger.true_positions, 0.8))
-        assert np.isclose(score.rmses, matched.rmse if len(matched.matched) else 0.8)
-        assert np.allclose((score.recalls, score.precisions), (matched.recall, matched.precision))
+        assert np.isclose(score.map_errors, map_error(placed, claims, ledger.true_positions, 0.8))
+        assert np.isclose(score.map_rmses, matched.rmse if len(matched.matched) else 0.8)
+        assert np.allclose((score.map_recalls, score.map_precisions), (matched.recall, matched.precision))
         errors = np.linalg.norm(placed[matched.matched[:, 0]] - ledger.true_positions[matched.matched[:, 1]], axis=1)
-        assert np.isclose(score.placed, np.count_nonzero(errors < 0.5) / len(ledger.true_positions))
+        assert np.isclose(score.placed_recalls, np.count_nonzero(errors < 0.5) / len(ledger.true_positions))
+
+
+def test_pose_errors_are_differences_of_placed_poses() -> None:
+    """An estimated pose, laid at the true start, is compared with the true pose; beside it stands the own sigma."""
+    rng = np.random.default_rng(4)
+    starts, estimated, true = rng.uniform(-4.0, 4.0, (3, 20, 3))
+    points = standing_at(np.zeros((20, 3)))._replace(own=estimated, sigmas=rng.random((20, 20)))
+    ledger = ClaimLedger(20, TRUTHS, COUNTABLE, 1.0)
+    outlines = TeamOutlines.joined([LandmarkMap.empty(2).outline] * 20)
+    scores = by_name(ledger.scores(outlines, points, starts, true))
+    placed = compose(starts, estimated)
+    np.testing.assert_allclose(scores.pose_errors, np.linalg.norm(placed[:, :2] - true[:, :2], axis=1))
+    np.testing.assert_allclose(scores.heading_errors, np.abs(wrap_angle(placed[:, 2] - true[:, 2])))
+    np.testing.assert_array_equal(scores.pose_sigmas, points.sigmas.diagonal())
 
 
 def test_infos_agree_with_the_own_start_frame() -> None:
@@ -164,7 +215,7 @@ def test_infos_agree_with_the_own_start_frame() -> None:
                 belief, ledger = env.belief(agent), env.episode.ledger
                 placed = belief.map.moved(env.true_start_poses[robot])
                 score = _score(ledger, robot, placed, STAY)
-                assert np.isclose(infos[agent]["map_error"], score.errors)
+                assert np.isclose(infos[agent]["map_error"], score.map_errors)
     assert any(event.kind == "merge" for event in env.events)
 
 

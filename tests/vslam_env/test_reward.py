@@ -2,6 +2,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scored import by_name, standing_at
 from small_env import MEETING, small_env, turning
 
 from agents import make_policy
@@ -140,8 +141,9 @@ def test_a_map_that_is_placed_wrong_has_no_recall() -> None:
     held = LandmarkMap(truths[:2], np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 2)), ids=ids)
     for shift, placed in ((0.0, 2 / 3), (0.4, 2 / 3), (0.6, 0.0)):
         outlines = TeamOutlines.joined([held.outline])
-        scores = books.scores(outlines, np.array([[shift, 0.0, 0.0]]), np.zeros((1, 3)))
-        assert (scores.recalls[0], scores.placed[0]) == (2 / 3, placed)
+        points = standing_at(np.array([[shift, 0.0, 0.0]]))
+        scores = by_name(books.scores(outlines, points, np.zeros((1, 3)), np.zeros((1, 3))))
+        assert (scores.map_recalls[0], scores.placed_recalls[0]) == (2 / 3, placed)
 
 
 def test_a_wrong_merge_costs() -> None:
