@@ -6,7 +6,7 @@ import numpy as np
 
 from slam_backend import _kernels
 from slam_backend.camera import StereoCamera
-from slam_backend.errors import FloatArray, bad_argument, check_array
+from slam_backend.errors import FloatArray, IntArray, bad_argument, check_array
 from slam_backend.input_log import RobotInput
 from slam_backend.measurements import Measurements
 
@@ -31,41 +31,33 @@ def check_step(
         ValueError: If one is ill-formed; the text names it.
     """
     none = [None] * k
-    for name, value in (
-        ("odometry", odometry),
-        ("measurements", measurements),
-        ("identities", identities),
-        ("poses", poses),
-    ):
-        if value is None and name in ("identities", "poses"):
-            continue
-        if isinstance(value, Measurements) or not hasattr(value, "__len__") or len(value) != k:
-            got = f"a sequence of {len(value)}" if hasattr(value, "__len__") else value
-            got = "a bare frame" if isinstance(value, Measurements) else got
-            raise bad_argument(name, f"a sequence with one entry per robot ({k})", got, "Use None for no reading.")
-    identities = none if identities is None else identities
-    poses = none if poses is None else poses
+    moves, frames = _one_each("odometry", odometry, k), _one_each("measurements", measurements, k)
+    names = none if identities is None else _one_each("identities", identities, k)
+    exact = none if poses is None else _one_each("poses", poses, k)
+    limit = min(FARTHEST_POINT, FLATTEST * camera.baseline * camera.sigma_px / camera.sigma_disparity_px)
     inputs = []
-    for robot in range(k):
-        move, frame, identity, pose = odometry[robot], measurements[robot], identities[robot], poses[robot]
+    for robot, move, frame, own_names, pose in zip(range(k), moves, frames, names, exact, strict=True):
         if move is not None:
             move = _check_move(robot, move)
         if frame is not None:
-            if not isinstance(frame, Measurements):
-                raise bad_argument(f"measurements[{robot}]", "Measurements or None", frame, "Wrap the arrays.")
-            if len(frame):
-                size = _check_frame(robot, frame, size, camera)
-        if identity is not None:
-            wanted = (0 if frame is None else len(frame),)
-            if type(identity) is np.ndarray and identity.dtype == np.int64 and identity.shape == wanted:
-                identity = np.array(identity)
-            else:
-                cure = "Name each measurement."
-                identity = check_array(f"identities[{robot}]", identity, wanted, cure, dtype=np.int64)
+            size = _check_frame(robot, frame, size, limit)
+        if own_names is not None:
+            own_names = _check_names(robot, own_names, 0 if frame is None else len(frame))
         if pose is not None:
             pose = _check_pose(robot, pose)
-        inputs.append(RobotInput(move, frame, identity, pose))
+        inputs.append(RobotInput(move, frame, own_names, pose))
     return inputs
+
+
+def _one_each(name: str, value: Any, k: int) -> Any:
+    """Return a sequence that has one entry for each of k robots."""
+    if (type(value) is tuple or type(value) is list) and len(value) == k:
+        return value
+    if isinstance(value, Measurements) or not hasattr(value, "__len__") or len(value) != k:
+        got = f"a sequence of {len(value)}" if hasattr(value, "__len__") else value
+        got = "a bare frame" if isinstance(value, Measurements) else got
+        raise bad_argument(name, f"a sequence with one entry per robot ({k})", got, "Use None for no reading.")
+    return value
 
 
 def _check_move(robot: int, move: Any) -> FloatArray:
@@ -74,7 +66,8 @@ def _check_move(robot: int, move: Any) -> FloatArray:
         x, y, turn = move.tolist()
         far = FARTHEST_MOVE
         if -far <= x <= far and -far <= y <= far and -far <= turn <= far:  # NaN is not
-            return np.asarray(move.copy())
+            copied: FloatArray = move.copy()
+            return copied
     cure = "Give the motion (dx, dy, dtheta) in the previous robot frame, or None."
     checked = check_array(f"odometry[{robot}]", move, (3,), cure)
     if np.abs(checked).max() > FARTHEST_MOVE:
@@ -93,19 +86,49 @@ def _check_pose(robot: int, pose: Any) -> FloatArray:
     return checked
 
 
-def _check_frame(robot: int, frame: Measurements, size: int, camera: StereoCamera) -> int:
-    """Check one frame against the map's descriptor size (0 = any) and the camera model; return its descriptor size."""
-    if size not in (0, frame.descriptors.shape[1]):
-        raise bad_argument(
-            f"measurements[{robot}].descriptors",
-            f"vectors of size {size} as in the map",
-            f"shape {frame.descriptors.shape}",
-            "Use one kind of descriptor throughout a run.",
-        )
-    nearest, farthest = _kernels.extent(frame.points)
-    limit = FARTHEST_POINT
-    if frame.covariances is None:
-        limit = min(limit, FLATTEST * camera.baseline * camera.sigma_px / camera.sigma_disparity_px)
+def _check_names(robot: int, names: Any, count: int) -> IntArray:
+    """Return the caller's names of a robot's measurements as a checked array."""
+    if type(names) is np.ndarray and names.dtype == np.int64 and names.shape == (count,):
+        return np.array(names)
+    cure = "Name each measurement."
+    checked: IntArray = check_array(f"identities[{robot}]", names, (count,), cure, dtype=np.int64)
+    return checked
+
+
+def _check_frame(robot: int, frame: Any, size: int, limit: float) -> int:
+    """Check a robot's frame.
+
+    Args:
+        robot: Whose.
+        frame: As in `FastSlam.step`.
+        size: Length of the map's descriptors, 0 if there are none yet.
+        limit: To coordinates [m], where the camera model is to say how uncertain they are.
+
+    Returns:
+        The length of the map's descriptors from there on.
+    """
+    if not isinstance(frame, Measurements):
+        raise bad_argument(f"measurements[{robot}]", "Measurements or None", frame, "Wrap the arrays.")
+    own_size = frame.descriptors.shape[1]
+    if own_size != size and len(frame):
+        if size:
+            raise bad_argument(
+                f"measurements[{robot}].descriptors",
+                f"vectors of size {size} as in the map",
+                f"shape {frame.descriptors.shape}",
+                "Use one kind of descriptor throughout a run.",
+            )
+        size = own_size
+    nearest, farthest = frame.extent
+    if nearest < _kernels.MIN_DEPTH or farthest > limit:
+        _check_points(robot, frame, limit)
+    return size
+
+
+def _check_points(robot: int, frame: Measurements, limit: float) -> None:
+    """Raise unless all points are so near that their covariances can be used, and ahead where they have none yet."""
+    nearest, farthest = _kernels.extent(frame.points)  # of this frame alone; its `extent` may be that of several
+    limit = limit if frame.covariances is None else FARTHEST_POINT
     if farthest > limit:
         cure = "Check the units, metres, and drop points without disparity."
         raise bad_argument(f"measurements[{robot}].points", f"numbers within +-{limit:g}", farthest, cure)
@@ -116,4 +139,3 @@ def _check_frame(robot: int, frame: Measurements, size: int, camera: StereoCamer
             nearest,
             "Drop points at or behind the camera, or give covariances.",
         )
-    return int(frame.descriptors.shape[1])

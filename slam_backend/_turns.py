@@ -134,12 +134,13 @@ def conclude(
     given = sum(frames.sizes)
     associations, created = np.empty(given, np.int64), np.empty(given, np.int64)
     means, covariances = np.empty((robots, 3)), np.empty((robots, 3, 3))
-    ess, num_new, num_matched, squares, judged = _kernels.conclude(
+    ess, num_created, num_new, num_matched, squares, judged = _kernels.conclude(
         buffers.log_likelihood, *weights, *believed, means, covariances,
         buffers.found, buffers.distances, buffers.new_slots, buffers.rows_used(frames), ids, associations, created,
     )  # fmt: skip
     nis = squares / judged if judged else math.nan
-    rest = (num_new, num_matched, given - num_new - num_matched, ess, nis, used > 0 and ess <= threshold)
+    num_rejected = given - num_new - num_matched
+    rest = (num_created, num_new, num_matched, num_rejected, ess, nis, used > 0 and ess <= threshold)
     if robots == 1:
         return StepReport((associations,), (created,), *rest), PoseEstimates(means, covariances)
     ends = list(accumulate(frames.sizes))

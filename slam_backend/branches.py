@@ -13,7 +13,7 @@ import numpy as np
 
 from slam_backend.errors import IntArray
 from slam_backend.filter import FastSlam
-from slam_backend.input_log import NOTHING, InputLog, RobotInput
+from slam_backend.input_log import NOTHING, InputLog, RobotInput, are_silent
 from slam_backend.reports import StepReport
 from slam_backend.watching import Watch
 
@@ -137,20 +137,22 @@ def take_in(branch: Branch, step: int, robots: Sequence[int], inputs: Sequence[R
     """
     for robot in robots:
         branch.known[robot] = step
+    all_of_them = len(robots) == len(branch.robots)
     for watch in branch.watches:
-        watch.steps += watch.together(robots)
-    if all(reading.is_silent for reading in inputs):
+        watch.steps += all_of_them or watch.together(robots)
+    if are_silent(inputs):
         branch.report = _silent_report(branch)
         return branch.report
-    if len(robots) < len(branch.robots):
+    if not all_of_them:
         given = dict(zip(robots, inputs, strict=True))
         inputs = [given.get(robot, NOTHING) for robot in branch.robots]
     slam, smoothing = branch.filter, branch.robots if branch.split_from is None else branch.live
     slam.may_smooth = step % TURNS in [robot % TURNS for robot in smoothing]
     slam._steps = step
     branch.report = report = slam._step_checked(inputs)
-    for watch in branch.watches:
-        watch.note(branch.robots, report)
+    if report.num_created:
+        for watch in branch.watches:
+            watch.note(branch.robots, report)
     return report
 
 
@@ -158,7 +160,7 @@ def _silent_report(branch: Branch) -> StepReport:
     """Return the report of a step in which nothing happened."""
     nothing: tuple[IntArray, ...] = tuple(np.empty(0, np.int64) for _ in branch.robots)
     ess = float(branch.filter.num_particles) if branch.report is None else branch.report.ess
-    return StepReport(nothing, nothing, 0, 0, 0, ess, float("nan"), False)
+    return StepReport(nothing, nothing, 0, 0, 0, 0, ess, float("nan"), False)
 
 
 def fork(branch: Branch, live: tuple[int, ...], number: int, rng: np.random.Generator) -> Branch:

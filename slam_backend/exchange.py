@@ -42,23 +42,20 @@ class ExchangeLedger:
         self._known: dict[tuple[int, int], dict[int, int]] = {}  # (from, to) -> landmark id -> its count when last sent
 
     def record_step(
-        self, robots: tuple[int, ...], report: StepReport, descriptor_size: int, live: tuple[int, ...] | None = None
+        self, robots: tuple[int, ...], live: tuple[int, ...], report: StepReport, descriptor_size: int
     ) -> None:
         """Count what the robots of a joint filter broadcast in one step: pose, landmarks updated and created.
 
         Args:
             robots: Of the filter.
+            live: Those of them that go by it and hear each other; at least two.
             report: Of its step.
             descriptor_size: d.
-            live: Those of them that go by it and hear each other; None: all.
         """
-        live = robots if live is None else live
-        if len(live) < 2:
-            return
         for robot, associations, created_ids in zip(robots, report.associations, report.created, strict=True):
             if robot in live:
-                touched = sum([name >= 0 for name in associations.tolist()])
-                created = sum([name >= 0 for name in created_ids.tolist()])
+                touched = _num_named(associations) if report.num_rejected else len(associations)
+                created = _num_named(created_ids) if report.num_created else 0
                 self.bytes_sent[robot] += POSE_BYTES + touched * LANDMARK_BYTES + created * 4 * descriptor_size
 
     def record_replay(self, replayed: Sequence[ReplayedStep]) -> None:
@@ -111,3 +108,8 @@ class ExchangeLedger:
         """Take over counts that `get_state` returned."""
         self.bytes_sent = state["bytes_sent"].copy()
         self._known = copy.deepcopy(state["known"])
+
+
+def _num_named(ids: IntArray) -> int:
+    """Return how many measurements (n,) have the id of a landmark; -1 = none."""
+    return sum([name >= 0 for name in ids.tolist()])

@@ -15,13 +15,19 @@ class RobotInput(NamedTuple):
     identities: IntArray | None
     pose: FloatArray | None
 
-    @property
-    def is_silent(self) -> bool:
-        """Whether there is nothing to take in; an empty frame is something: it says that nothing was there to see."""
-        return self.odometry is None and self.pose is None and self.frame is None
-
 
 NOTHING = RobotInput(None, None, None, None)
+
+
+def are_silent(inputs: Sequence[RobotInput]) -> bool:
+    """Tell whether there is nothing to take in.
+
+    An empty frame is something: it says that nothing was there to see.
+    """
+    for odometry, frame, _, pose in inputs:
+        if odometry is not None or frame is not None or pose is not None:
+            return False
+    return True
 
 
 class InputLog:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from slam_backend import _kernels
 from slam_backend.errors import FloatArray, bad_argument, check_array
 
 LARGEST_DESCRIPTOR = 1e6  # of one component; squares of distances then stay far from the end of float32
@@ -23,6 +24,7 @@ class Measurements:
         descriptors: (n, d) float32 [-]. Appearance vectors (d_t); d is the same in all frames of a run.
         covariances: None, or (n, 3, 3) float64 [m^2], camera frame. None: the camera model is evaluated at the
             predicted point. Given: used as is.
+        extent: Bounds [m] that all points keep: none has a smaller depth Z, none a larger coordinate by magnitude.
 
     Raises:
         ValueError: If a shape is wrong, a number is not finite or a descriptor too large, or a covariance is not
@@ -32,6 +34,7 @@ class Measurements:
     points: FloatArray
     descriptors: NDArray[np.float32]
     covariances: FloatArray | None = field(default=None)
+    extent: tuple[float, float] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         cure = "Give one row per measured point."
@@ -50,27 +53,24 @@ class Measurements:
         for array in (self.points, self.descriptors, self.covariances):
             if array is not None:
                 array.setflags(write=False)
+        object.__setattr__(self, "extent", _kernels.extent(points))
 
     def __len__(self) -> int:
         return len(self.points)
 
     @classmethod
-    def _trusted(cls, points: FloatArray, descriptors: NDArray[np.float32]) -> "Measurements":
-        """Build a frame in a hot loop: no copies, no checks. The caller must not write to the arrays afterwards."""
-        self = object.__new__(cls)
-        for name, array in (("points", points), ("descriptors", descriptors)):
-            array.setflags(write=False)
-            object.__setattr__(self, name, array)
-        object.__setattr__(self, "covariances", None)
-        return self
-
-    @classmethod
     def _trusted_frames(
         cls, points: FloatArray, descriptors: NDArray[np.float32], counts: Sequence[int]
     ) -> "list[Measurements]":
-        """Do the same for several robots, so many points (n_i) of each one after the other."""
+        """Build frames in a hot loop: no copies, no checks. The caller must not write to the arrays afterwards.
+
+        Args:
+            points, descriptors: Of several frames, so many (n_i) of each one after the other.
+            counts: These.
+        """
         points.setflags(write=False)  # and so all views of them
         descriptors.setflags(write=False)
+        extent = _kernels.extent(points)  # what bounds all bounds those of each
         frames, begin, put = [], 0, object.__setattr__
         for count in counts:
             end = begin + count
@@ -78,6 +78,7 @@ class Measurements:
             put(frame, "points", points[begin:end])
             put(frame, "descriptors", descriptors[begin:end])
             put(frame, "covariances", None)
+            put(frame, "extent", extent)
             frames.append(frame)
             begin = end
         return frames

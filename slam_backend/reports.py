@@ -49,6 +49,7 @@ class StepReport(NamedTuple):
             measurement (the id of a new one if it made one); -1 = rejected.
         created: Per robot (n_i,) int64. Id of the landmark that the measurement created in at least one particle; -1
             if none did. A landmark stems from exactly one measurement.
+        num_created: Measurements that created a landmark in at least one particle.
         num_new: Landmarks created by the most probable particle.
         num_matched: Measurements that the most probable particle matched to landmarks it held.
         num_rejected: Measurements of which it made nothing: held back, in the dead zone, or named -1 by the caller.
@@ -61,6 +62,7 @@ class StepReport(NamedTuple):
 
     associations: tuple[IntArray, ...]
     created: tuple[IntArray, ...]
+    num_created: int
     num_new: int
     num_matched: int
     num_rejected: int

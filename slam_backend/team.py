@@ -125,9 +125,12 @@ class TeamSlam(TeamKnowledge):
 
     def _advance(self, branch: Branch, inputs: Sequence[RobotInput]) -> StepReport:
         """Step a filter with what its robots have just read."""
-        report = take_in(branch, self._step, branch.live, [inputs[robot] for robot in branch.live])
-        self._records.note_created(branch, branch.live, self._step, report)
-        self._records.exchange.record_step(branch.robots, report, branch.filter.descriptor_size, branch.live)
+        live = branch.live
+        report = take_in(branch, self._step, live, [inputs[robot] for robot in live])
+        if report.num_created:
+            self._records.note_created(branch, live, self._step, report)
+        if len(live) > 1:  # a robot that nobody hears sends nothing
+            self._records.exchange.record_step(branch.robots, live, report, branch.filter.descriptor_size)
         return report
 
     def merge(self, robot_a: int, robot_b: int, alignment: Alignment, known: bool = False) -> Renaming:

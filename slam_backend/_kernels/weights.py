@@ -95,7 +95,7 @@ def mixture(
 def summarise(
     found: Int32Array, distances: FloatArray, new_slots: IntArray, keep: IntArray, best: int, ids: IntArray,
     associations: IntArray, created: IntArray,
-) -> tuple[int, int, float, int]:  # fmt: skip
+) -> tuple[int, int, int, float, int]:  # fmt: skip
     """Tell what became of measurements.
 
     Args:
@@ -109,16 +109,17 @@ def summarise(
         created: Written: the id of the landmark that each measurement created in any particle, -1 = none.
 
     Returns:
-        How many the most probable particle started and matched, and the sum and number of its squared distances,
-        without what it predicted behind the camera.
+        How many started a landmark in any particle, how many the most probable particle started and matched, and the
+        sum and number of its squared distances, without what it predicted behind the camera.
     """
     associations[:] = REJECTED
     created[:] = REJECTED
-    num_new, num_matched, squares, judged = 0, 0, 0.0, 0
+    num_created, num_new, num_matched, squares, judged = 0, 0, 0, 0.0, 0
     for b in range(len(keep)):
         slot = found[b, best]
         if new_slots[b] >= 0:
             created[keep[b]] = ids[new_slots[b]]
+            num_created += 1
         if slot < 0:
             continue
         associations[keep[b]] = ids[slot]
@@ -129,7 +130,7 @@ def summarise(
             if distances[b, best] < np.inf:
                 squares += distances[b, best]
                 judged += 1
-    return num_new, num_matched, squares, judged
+    return num_created, num_new, num_matched, squares, judged
 
 
 @jit
@@ -138,7 +139,7 @@ def conclude(
     means: FloatArray, covariances: FloatArray, mean: FloatArray, covariance: FloatArray,
     found: Int32Array, distances: FloatArray, new_slots: IntArray, keep: IntArray, ids: IntArray,
     associations: IntArray, created: IntArray,
-) -> tuple[float, int, int, float, int]:  # fmt: skip
+) -> tuple[float, int, int, int, float, int]:  # fmt: skip
     """Do what `weigh`, `mixture` for each of K robots and, for the measurements of all, `summarise` do.
 
     Args:
@@ -153,7 +154,7 @@ def conclude(
     for robot in range(len(means)):
         mixture(means[robot], covariances[robot], weights, mean[robot], covariance[robot])
     best = int(path_log_weights.argmax())
-    new, matched, squares, judged = summarise(
+    made, new, matched, squares, judged = summarise(
         found, distances, new_slots, keep, best, ids, associations, created
     )  # fmt: skip
-    return ess, new, matched, squares, judged
+    return ess, made, new, matched, squares, judged

@@ -196,7 +196,8 @@ class StereoFrontEnd:
             descriptors = describe_points(left, pixels[:, :2], scales, self.options.descriptor)
             known = descriptors.any(axis=1)
             pixels, points, descriptors, kept = pixels[known], points[known], descriptors[known], kept[known]
-        return StereoFrame(Measurements._trusted(points, descriptors), pixels, matches.responses[kept], matches)
+        (frame,) = Measurements._trusted_frames(points, descriptors, [len(points)])
+        return StereoFrame(frame, pixels, matches.responses[kept], matches)
 
     def match(self, left: Image, right: Image) -> StereoMatches:
         """Match the corners of a pair that was checked already; all matches by descriptor are returned."""

@@ -79,6 +79,7 @@ def report_of(records: Sequence[RobotStep], best: int, weights: FloatArray, resa
     return StepReport(
         associations=associations,
         created=created,
+        num_created=int(np.sum(started >= 0)),
         num_new=num_new,
         num_matched=len(given) - num_new - num_rejected,
         num_rejected=num_rejected,

@@ -20,7 +20,9 @@ def map_of(counts: dict[int, int]) -> LandmarkMap:
 def report_of(associations: list[list[int]], created: list[list[int]]) -> StepReport:
     """A report of a joint step."""
     rows = [tuple(np.array(row, dtype=np.int64) for row in rows) for rows in (associations, created)]
-    return StepReport(rows[0], rows[1], num_new=0, num_matched=3, num_rejected=0, ess=1.0, nis=3.0, resampled=False)
+    named, made = (np.concatenate(row) >= 0 for row in rows)
+    counts = made.sum(), 0, named.sum(), (~named).sum()
+    return StepReport(rows[0], rows[1], *counts, ess=1.0, nis=3.0, resampled=False)
 
 
 def test_new_landmarks_are_sent_with_descriptors_and_changed_ones_without() -> None:
@@ -43,15 +45,19 @@ def test_what_one_robot_was_told_another_was_not() -> None:
 def test_members_of_a_group_send_poses_and_the_landmarks_they_touched() -> None:
     """Per step a robot sends its pose, each landmark it matched or made, and descriptors of those it made."""
     ledger = ExchangeLedger(4)
-    ledger.record_step((1, 3), report_of([[4, -1, 9], [2]], [[-1, -1, 9], [-1]]), 13)
-    assert ledger.bytes_sent.tolist() == [0, POSE_BYTES + 2 * LANDMARK_BYTES + LOOK, 0, POSE_BYTES + LANDMARK_BYTES]
+    ledger.record_step((1, 3), (1, 3), report_of([[4, -1, 9], [2]], [[-1, -1, 9], [-1]]), 13)
+    sent = np.array([0, POSE_BYTES + 2 * LANDMARK_BYTES + LOOK, 0, POSE_BYTES + LANDMARK_BYTES])
+    np.testing.assert_array_equal(ledger.bytes_sent, sent)
+    ledger.record_step((1, 3), (1, 3), report_of([[4, 9], [2]], [[-1, -1], [-1]]), 13)
+    sent += [0, POSE_BYTES + 2 * LANDMARK_BYTES, 0, POSE_BYTES + LANDMARK_BYTES]
+    np.testing.assert_array_equal(ledger.bytes_sent, sent)
 
 
-def test_a_lone_robot_sends_nothing() -> None:
-    """A group of one has nobody to talk to."""
-    ledger = ExchangeLedger(2)
-    ledger.record_step((1,), report_of([[4, 5]], [[4, -1]]), 13)
-    assert ledger.bytes_sent.tolist() == [0, 0]
+def test_a_robot_that_has_left_does_not_send() -> None:
+    """The joint filter goes on with those that hear each other."""
+    ledger = ExchangeLedger(3)
+    ledger.record_step((0, 1, 2), (0, 2), report_of([[4], [], [2]], [[4], [], [-1]]), 13)
+    assert ledger.bytes_sent.tolist() == [POSE_BYTES + LANDMARK_BYTES + LOOK, 0, POSE_BYTES + LANDMARK_BYTES]
 
 
 def test_a_ledger_goes_on_from_its_state() -> None:

@@ -70,7 +70,7 @@ def assert_same_report(found: StepReport, plain: WatchedPlainFastSlam) -> None:
     assert same, f"{found.associations}, and not as in {plain.possible_reports}"
     for a, b in zip(found.created, same[0].created, strict=True):
         np.testing.assert_array_equal(a, b)
-    for name in ("num_new", "num_matched", "num_rejected", "resampled"):
+    for name in ("num_created", "num_new", "num_matched", "num_rejected", "resampled"):
         assert getattr(found, name) == getattr(same[0], name), name
     assert found.ess == pytest.approx(same[0].ess, rel=1e-6)
     assert any(found.nis == pytest.approx(r.nis, rel=1e-6, nan_ok=True) for r in same)

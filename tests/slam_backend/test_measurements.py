@@ -1,3 +1,4 @@
+import copy
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,20 @@ def test_nothing_seen_is_a_frame_too() -> None:
     """An empty frame has no rows and its descriptor size."""
     frame = Measurements.empty(11)
     assert (len(frame), frame.points.shape, frame.descriptors.shape) == (0, (0, 3), (0, 11))
+
+
+def test_an_extent_bounds_all_points() -> None:
+    """That of a frame is tight; frames that are built together share one, and an empty one bounds nothing."""
+    rng = np.random.default_rng(100)
+    points, looks = rng.normal(0.0, 3.0, (7, 3)), np.zeros((7, 5), np.float32)
+    frame = Measurements(points, looks)
+    assert frame.extent == (points[:, 2].min(), np.abs(points).max())
+    assert copy.deepcopy(frame).extent == frame.extent
+    assert Measurements.empty().extent == (np.inf, 0.0)
+    for part in Measurements._trusted_frames(points, looks, [3, 0, 4]):
+        nearest, farthest = part.extent
+        assert (part.points[:, 2] >= nearest).all()
+        assert (np.abs(part.points) <= farthest).all()
 
 
 INDEFINITE = np.array([[[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 1.0]]] * 2)

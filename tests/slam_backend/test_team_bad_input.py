@@ -44,6 +44,9 @@ def test_a_team_that_cannot_be_built_says_why(arguments: dict[str, Any], message
         TeamSlam(**({"num_robots": 3} | arguments))
 
 
+ONE_BEHIND = Measurements._trusted_frames(
+    np.concatenate([GOOD.points, GOOD.points, -GOOD.points]), np.tile(GOOD.descriptors, (3, 1)), [len(GOOD)] * 3
+)
 ASYMMETRIC = np.array([[True, True, False], [False, True, False], [False, False, True]])
 BAD_STEPS: list[tuple[dict[str, Any], str]] = [
     ({"odometry": STILL[:2]}, r"odometry: expected a sequence with one entry per robot \(3\), got .*2"),
@@ -62,6 +65,7 @@ BAD_STEPS: list[tuple[dict[str, Any], str]] = [
         {"measurements": [GOOD, GOOD, Measurements(-GOOD.points, GOOD.descriptors)]},
         r"measurements\[2\]\.points: expected depths Z >= .* m, got -2\.0\. Drop points at or behind the camera",
     ),
+    ({"measurements": ONE_BEHIND}, r"measurements\[2\]\.points: expected depths Z >= .* m, got -2\.0\. Drop points at"),
     ({"identities": [[1], [1]]}, r"identities: expected a sequence with one entry per robot \(3\)"),
     ({"identities": [[1], [1], [1, 2]]}, r"identities\[2\]: expected an array of shape"),
     ({"poses": [None, None, [0.0, np.inf, 0.0]]}, r"poses\[2\]: expected finite numbers, got NaN or infinity at"),
