@@ -11,6 +11,7 @@ from vslam_env.observation import NUM_ACTIONS
 
 MAX_SPEED, MAX_REVERSE, MAX_TURN = 1.0, 0.3, 1.5  # [m/s], [m/s], [rad/s]
 DISCRETE_COMMANDS = ((0.0, 0.0), (MAX_SPEED, 0.0), (0.0, MAX_TURN), (0.0, -MAX_TURN))  # stay ahead left right
+PAIR_CURE = "Give (speed, turn) in [-1, 1]."
 
 
 def action_space(action_type: str) -> spaces.Space[Any]:
@@ -21,7 +22,7 @@ def action_space(action_type: str) -> spaces.Space[Any]:
 
 
 def checked_actions(actions: Any, agents: Sequence[str], action_type: str) -> list[Any]:
-    """Return one action per agent, in their order.
+    """Return what each agent's robot is to do, in their order.
 
     Args:
         actions: Mapping from agent to action.
@@ -29,7 +30,7 @@ def checked_actions(actions: Any, agents: Sequence[str], action_type: str) -> li
         action_type: Of all of them.
 
     Returns:
-        Pairs of floats in [-1, 1], or ints.
+        Velocity commands [m/s, rad/s], pairs of floats, of continuous and discrete actions; ints of `goal` actions.
 
     Raises:
         ValueError: If an agent is unknown or missing, or an action is outside its space.
@@ -43,29 +44,39 @@ def checked_actions(actions: Any, agents: Sequence[str], action_type: str) -> li
         gone = next(agent for agent in agents if agent not in actions)
         raise bad_argument("actions", f"an action of {gone!r}", f"no {gone!r}", "All agents act at once.")
     if action_type == "continuous":
-        return [_checked_pair(agent, actions[agent]) for agent in agents]
-    limit = len(DISCRETE_COMMANDS) if action_type == "discrete" else NUM_ACTIONS
-    return [_checked_index(agent, actions[agent], limit) for agent in agents]
+        return [_continuous_command(agent, actions[agent]) for agent in agents]
+    if action_type == "discrete":
+        limit = len(DISCRETE_COMMANDS)
+        return [DISCRETE_COMMANDS[_checked_index(agent, actions[agent], limit)] for agent in agents]
+    return [_checked_index(agent, actions[agent], NUM_ACTIONS) for agent in agents]
 
 
-def _checked_pair(agent: str, action: Any) -> tuple[float, float]:
-    """Return a continuous action as two floats in [-1, 1], or raise."""
+def _continuous_command(agent: str, action: Any) -> tuple[float, float]:
+    """Return the velocity command [m/s, rad/s] of a pair in [-1, 1], or raise.
+
+    It is scaled to the limits of either direction, so that zeros stand still.
+    """
     if type(action) is np.ndarray and action.shape == (2,) and action.dtype.kind == "f":  # what nearly all send
-        ahead, turn = action.tolist()
-        if -1.0 <= ahead <= 1.0 and -1.0 <= turn <= 1.0:
-            return ahead, turn
-    name, cure = "actions[%r]", "Give (speed, turn) in [-1, 1]."
+        speed, turn = action.tolist()
+    else:
+        speed, turn = _pair(agent, action)
+    if not (-1.0 <= speed <= 1.0 and -1.0 <= turn <= 1.0):  # false for NaN
+        raise bad_argument(f"actions[{agent!r}]", "two numbers in [-1, 1]", [speed, turn], PAIR_CURE)
+    return speed * (MAX_SPEED if speed > 0.0 else MAX_REVERSE), turn * MAX_TURN
+
+
+def _pair(agent: str, action: Any) -> tuple[float, float]:
+    """Return two numbers in any form as floats, or raise."""
+    name = f"actions[{agent!r}]"
     try:
         array = np.asarray(action)
     except (TypeError, ValueError) as error:
-        raise bad_argument(name % agent, "an array of shape (2,)", action, cure) from error
+        raise bad_argument(name, "an array of shape (2,)", action, PAIR_CURE) from error
     if array.dtype.kind not in "fiu":  # text and complex numbers could be turned into floats, but mean something else
-        raise bad_argument(name % agent, "an array of shape (2,) of real numbers", action, cure)
+        raise bad_argument(name, "an array of shape (2,) of real numbers", action, PAIR_CURE)
     if array.shape != (2,):
-        raise bad_argument(name % agent, "an array of shape (2,)", f"shape {array.shape}", cure)
+        raise bad_argument(name, "an array of shape (2,)", f"shape {array.shape}", PAIR_CURE)
     speed, turn = map(float, array.tolist())
-    if not (abs(speed) <= 1.0 and abs(turn) <= 1.0):  # false for NaN
-        raise bad_argument(name % agent, "two numbers in [-1, 1]", [speed, turn], cure)
     return speed, turn
 
 
@@ -76,14 +87,3 @@ def _checked_index(agent: str, action: Any, limit: int) -> int:
         cure = "Sample from env.action_space(agent)."
         raise bad_argument(f"actions[{agent!r}]", f"an int from 0 to {limit - 1}", action, cure)
     return value
-
-
-def command_of(action_type: str, action: Any) -> tuple[float, float]:
-    """Return the velocity command [m/s, rad/s] of a continuous or discrete action.
-
-    Continuous actions are scaled to the limits of either direction, so that zeros stand still.
-    """
-    if action_type == "discrete":
-        return DISCRETE_COMMANDS[action]
-    speed, turn = action
-    return speed * (MAX_SPEED if speed > 0.0 else MAX_REVERSE), turn * MAX_TURN

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend.errors import FloatArray
-from vslam_env.actions import MAX_SPEED, MAX_TURN, command_of
+from vslam_env.actions import MAX_SPEED, MAX_TURN
 from vslam_env.config import EnvConfig
 from vslam_env.episode import Episode
 from vslam_env.navigation import follow_path, plan_path
@@ -78,13 +78,13 @@ class Drivers:
 
         Args:
             episode: It is changed.
-            chosen: One action per robot, as `checked_actions` returns them.
+            chosen: What each robot is to do, as `checked_actions` returns it.
 
         Returns:
             Per robot 1 if its action was masked, else 0.
         """
         if self._action_type != "goal":
-            commands = np.array([command_of(self._action_type, action) for action in chosen])
+            commands = np.array(chosen)
             for _ in range(self._ticks):
                 episode.advance(commands)
             return [0] * len(chosen)

@@ -10,7 +10,7 @@ from small_env import MEETING, room, small_env, turning, wander
 
 from slam_backend.geometry import between, compose, inverse
 from vslam_env import World
-from vslam_env.actions import DISCRETE_COMMANDS, command_of
+from vslam_env.actions import DISCRETE_COMMANDS, checked_actions
 
 INFO_KEYS = [
     "map_error",
@@ -75,7 +75,8 @@ def test_stop_at_recall_terminates_everybody() -> None:
 )
 def test_continuous_actions_are_scaled(action: Any, command: Any) -> None:
     """Actions in [-1, 1] are scaled to -0.3 .. 1 m/s and -1.5 .. 1.5 rad/s; zeros stand still."""
-    assert np.allclose(command_of("continuous", action), command)
+    for form in (action, np.array(action, np.float32), np.array(action, np.float64)):
+        assert np.allclose(checked_actions({"robot_0": form}, ["robot_0"], "continuous"), [command])
 
 
 def test_robots_do_what_they_are_told() -> None:

@@ -141,8 +141,21 @@ def test_poses_share_no_memory() -> None:
     np.testing.assert_array_equal(simulator.poses, [[1.0, 1.0, 0.0]])
 
 
-@pytest.mark.parametrize("commands", [[[1.0, 0.0]], [[np.nan, 0.0], [0.0, 0.0]], "fast"])
+@pytest.mark.parametrize(
+    "commands",
+    [
+        [[1.0, 0.0]],
+        "fast",
+        [[np.nan, 0.0], [0.0, 0.0]],
+        np.array([[np.nan, 0.0], [0.0, 0.0]]),
+        np.array([[0.0, 0.0], [0.0, np.nan]]),
+        np.array([[0.0, np.inf], [0.0, 0.0]]),
+        np.array([[0.0, 0.0], [-np.inf, 0.0]]),
+    ],
+)
 def test_bad_commands_are_refused(commands: object) -> None:
     """Commands of the wrong shape, or not finite, are refused."""
+    simulator = Simulator(OPEN, [[0, 0, 0], [5, 5, 1]])
     with pytest.raises(ValueError, match=r"commands: expected .*Give \(v, omega\) for each robot\."):
-        Simulator(OPEN, [[0, 0, 0], [5, 5, 5]]).step(commands)
+        simulator.step(commands)
+    np.testing.assert_array_equal(simulator.poses, [[0, 0, 0], [5, 5, 1]])

@@ -1,6 +1,5 @@
 """The one owner of the pymunk space: robots drive as commanded until walls or other robots stop them."""
 
-import math
 from typing import Any
 
 import numpy as np
@@ -20,14 +19,23 @@ SHORTFALL = 0.01  # share of the commanded way that must be missing for a bump
 
 @jit
 def _drive_freely(
-    poses: FloatArray, commands: FloatArray, tick: float, walls: FloatArray, radius: float
-) -> tuple[FloatArray, bool]:
-    """Return where robots (K, 3) that nothing stops end after a tick, and whether surely nothing can stop them.
+    poses: FloatArray, commands: FloatArray, tick: float, walls: FloatArray, radius: float, goals: FloatArray
+) -> bool:
+    """Write down where robots end after a tick if nothing stops them; tell whether surely nothing can.
 
-    A robot goes along the chord of its arc, so that it ends where the arc does.
+    A robot goes along the chord of its arc, so that it ends where the arc does. A command that is not finite leads
+    nowhere, and so never surely freely.
+
+    Args:
+        poses: (K, 3) float64 [m, m, rad], world frame.
+        commands: (K, 2) float64 [m/s, rad/s].
+        tick: [s].
+        walls: (S, 4) float64 [m], world frame.
+        radius: Of the robots [m].
+        goals: (K, 3) float64 [m, m, rad], world frame. Written to.
     """
-    goals = np.empty_like(poses)
     reach = np.empty(len(poses))
+    clear = True
     for k in range(len(poses)):
         turn = commands[k, 1] * tick
         chord = commands[k, 0] * tick * (np.sin(0.5 * turn) / (0.5 * turn) if turn != 0.0 else 1.0)
@@ -35,7 +43,7 @@ def _drive_freely(
         goals[k, 1] = poses[k, 1] + chord * np.sin(poses[k, 2] + 0.5 * turn)
         goals[k, 2] = (poses[k, 2] + turn + np.pi) % (2.0 * np.pi) - np.pi
         reach[k] = radius + abs(chord)
-    clear = True
+        clear &= np.isfinite(reach[k])
     for k in range(len(poses)):
         for i in range(len(walls)):
             ex, ey = walls[i, 2] - walls[i, 0], walls[i, 3] - walls[i, 1]
@@ -45,14 +53,7 @@ def _drive_freely(
         for j in range(k):
             gap = (poses[k, 0] - poses[j, 0]) ** 2 + (poses[k, 1] - poses[j, 1]) ** 2
             clear &= gap > (reach[k] + reach[j]) ** 2
-    return goals, clear
-
-
-def _are_velocities(commands: Any, robots: int) -> bool:
-    """Tell whether commands are surely what they should be: a sum is finite only if all its parts are."""
-    if type(commands) is not np.ndarray or commands.dtype != np.float64 or commands.shape != (robots, 2):
-        return False
-    return commands.flags.c_contiguous and math.isfinite(sum(commands.ravel().tolist()))
+    return clear
 
 
 class Simulator:
@@ -110,12 +111,15 @@ class Simulator:
         Raises:
             ValueError: If the shape is wrong or a number is not finite.
         """
-        if not _are_velocities(commands, len(self._bodies)):
-            commands = check_array("commands", commands, (len(self._bodies), 2), "Give (v, omega) for each robot.")
-        goals, clear = _drive_freely(self._poses, commands, self.tick, self._walls, self.radius + SKIN)
-        if clear:
-            self._bumped = np.zeros(len(goals), dtype=np.bool_)
+        shape, cure = (len(self._bodies), 2), "Give (v, omega) for each robot."
+        as_it_stands = type(commands) is np.ndarray and commands.dtype == np.float64 and commands.flags.c_contiguous
+        if not as_it_stands or commands.shape != shape:
+            commands = check_array("commands", commands, shape, cure)
+        goals = np.empty_like(self._poses)
+        if _drive_freely(self._poses, commands, self.tick, self._walls, self.radius + SKIN, goals):
+            self._bumped = np.zeros(len(goals), np.bool_)
         else:
+            check_array("commands", commands, shape, cure)  # for only finite ones are surely free
             way = goals[:, :2] - self._poses[:, :2]
             goals[:, :2] = self._move_in_contact(way)
             achieved = np.sum((goals[:, :2] - self._poses[:, :2]) * way, axis=1)
