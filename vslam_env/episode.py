@@ -1,7 +1,7 @@
 """`Episode`: one world with robots in it, what they perceive and believe, and the simulator's books; tick by tick."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Any
@@ -83,7 +83,7 @@ class Episode:
         self.estimated_path: list[FloatArray] = []
         self.merge_ticks: list[tuple[int, tuple[int, ...], tuple[int, ...]]] = []
         self.readings: tuple[Readings, ...] = ()
-        self.frames: list[Frame] = []
+        self.frames: Sequence[Frame | EyeFrame] = []
 
     def _settle(self, setting: Setting) -> None:
         """Move into a setting, as at its reset."""
@@ -106,7 +106,7 @@ class Episode:
 
     def advance(self, commands: Any) -> None:
         """Drive all robots with velocity commands (K, 2) [m/s, rad/s] for a tick, and let them perceive and believe."""
-        before = self._simulator.poses
+        before = self.true_path[-1]
         self._simulator.step(commands)
         self.tick += 1
         after, bumped = self._simulator.poses, self._simulator.bumped
@@ -187,41 +187,30 @@ class Episode:
         self.frames = self.setting.sensor.measure(poses, self._streams["sensor"])
         scans = self.setting.scan.measure(poses, self._streams["scan"])
         heard = self._contacts(poses)
-        self.readings = self._readings(odometry, scans, bumped, heard, poses)
+        measurements, true_ids, *images = zip(*self.frames, strict=True)
+        nothing = [None] * config.num_robots
+        self.readings = tuple(
+            map(
+                Readings,
+                nothing if odometry is None else odometry,
+                measurements,
+                scans,
+                bumped.tolist(),
+                between(self.true_starts, poses) if config.oracle_pose else nothing,
+                true_ids if config.oracle_association else nothing,
+                nothing if heard is None else heard,
+                images[0] if config.observe_images else nothing,
+            )
+        )
         if self._tap.recorder is not None:
             self._tap.recorder(self.readings)
         report = self.belief.step(self.readings)
-        self.ledger.record(report, [frame.true_ids for frame in self.frames])
+        self.ledger.record(report, true_ids)
         self.merge_ticks += [(self.tick, made.robots_a, made.robots_b) for made in report.renamings]
         if config.oracle_merge:
             self._merge_by_oracle(reach(heard, config.num_robots))
         self.true_path.append(poses)
         self.estimated_path.append(self.belief.poses)
-
-    def _readings(
-        self,
-        odometry: FloatArray | None,
-        scans: FloatArray,
-        bumped: BoolArray,
-        heard: BoolArray | None,
-        poses: FloatArray,
-    ) -> tuple[Readings, ...]:
-        """Return what each robot reads in this tick, the truth only where an oracle tells it."""
-        config, frames = self._config, self.frames
-        nothing = [None] * config.num_robots
-        return tuple(
-            map(
-                Readings,
-                nothing if odometry is None else odometry,
-                [frame.measurements for frame in frames],
-                scans,
-                bumped.tolist(),
-                between(self.true_starts, poses) if config.oracle_pose else nothing,
-                [frame.true_ids for frame in frames] if config.oracle_association else nothing,
-                nothing if heard is None else heard,
-                [frame.left for frame in frames if isinstance(frame, EyeFrame)] if config.observe_images else nothing,
-            )
-        )
 
     def _contacts(self, poses: FloatArray) -> BoolArray | None:
         """Return who hears whom (K, K), None if all hear all."""

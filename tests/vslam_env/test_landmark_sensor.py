@@ -133,13 +133,16 @@ def test_noise_is_the_cameras() -> None:
 
 
 def test_a_frame_is_the_plain_definition() -> None:
-    """Points are disturbed in the image and triangulated, descriptors disturbed and normalised, false ones as well."""
+    """Points are disturbed in the image and triangulated, descriptors disturbed and normalised, false ones as well.
+
+    What lies beyond infinity by its disparity is left out.
+    """
     rng = np.random.default_rng(8)
     camera = StereoCamera(mount=(0.1, -0.2, 0.3))
-    ids, counts = np.array([2, -1, 4, 0, -2]), np.array([2, 0, 3])
+    ids, counts = np.array([2, -1, 4, 0, -2, 3]), np.array([3, 0, 3])
     robots = np.repeat(np.arange(3), counts)
     poses = rng.uniform(-1.0, 1.0, (3, 3))
-    seen = rng.uniform([-1.0, -1.0, 2.0], [1.0, 1.0, 6.0], (5, 3))
+    seen = rng.uniform([-1.0, -1.0, 2.0], [1.0, 1.0, 6.0], (6, 3))
     false, (looks, false_looks) = rng.uniform(1.0, 3.0, (2, 3)), rng.standard_normal((2, 5, 4))
     positions = np.empty((5, 3))
     for row in np.flatnonzero(ids >= 0):
@@ -147,18 +150,23 @@ def test_a_frame_is_the_plain_definition() -> None:
         x, y, z = camera.robot_from_camera(seen[row])
         positions[name, 2] = z
         positions[name, :2] = compose(poses[robot], [x, y, 0.0])[:2]
-    noise = rng.standard_normal((5, 7))
-    got = np.empty((5, 3)), np.empty((5, 4), np.float32), np.empty(5, np.bool_)
-    stereo = np.array([camera.focal_px, camera.baseline, camera.sigma_px, camera.sigma_disparity_px])
-    world = poses, np.array(camera.mount), positions, looks, false, false_looks
-    assert measure(ids, counts, *world, noise, stereo, 0.3, *got) == 5
-    is_true, made_up = ids[:, None] >= 0, (-1 - ids) % 2
-    true = np.where(is_true, seen, false[made_up])
+    noise = rng.standard_normal((6, 7))
+    noise[[0, 4], 2] = -1000.0
+    sharp = [1, 2, 3, 5]
+    is_true, made_up = ids[sharp, None] >= 0, (-1 - ids[sharp]) % 2
+    true = np.where(is_true, seen[sharp], false[made_up])
     sigmas = camera.sigma_px, camera.sigma_px, camera.sigma_disparity_px
-    np.testing.assert_allclose(got[0], camera.triangulate(camera.project(true) + sigmas * noise[:, :3]), rtol=1e-9)
-    disturbed = np.where(is_true, looks[ids], false_looks[made_up]) + 0.15 * noise[:, 3:]
-    np.testing.assert_allclose(got[1], disturbed / np.linalg.norm(disturbed, axis=1, keepdims=True), rtol=1e-6)
-    assert got[2].all()
+    pixels = camera.project(true) + sigmas * noise[sharp, :3]
+    disturbed = np.where(is_true, looks[ids[sharp]], false_looks[made_up]) + 0.15 * noise[sharp, 3:]
+
+    optics = np.array([*camera.mount, camera.focal_px, camera.baseline, camera.sigma_px, camera.sigma_disparity_px])
+    made_of = np.hstack([positions, looks]), np.hstack([false, false_looks[:2]])
+    got_points, got_looks = np.empty((6, 3)), np.empty((6, 4), np.float32)
+    measure(ids, counts, poses, *made_of, noise, optics, 0.3, got_points, got_looks)
+    assert counts.tolist() == [2, 0, 2]
+    assert ids[:4].tolist() == [-1, 4, 0, 3]
+    np.testing.assert_allclose(got_points[:4], camera.triangulate(pixels), rtol=1e-9)
+    np.testing.assert_allclose(got_looks[:4], disturbed / np.linalg.norm(disturbed, axis=1, keepdims=True), rtol=1e-6)
 
 
 def test_descriptor_noise_has_the_stated_length() -> None:

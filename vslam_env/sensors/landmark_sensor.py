@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 from itertools import accumulate
+from typing import NamedTuple
 
 import numpy as np
 
@@ -10,10 +11,9 @@ from slam_backend.errors import BoolArray, FloatArray, IntArray, bad_argument, c
 from slam_backend.measurements import Measurements
 from vslam_env.sensors import _landmark_kernels as kernels
 from vslam_env.world.spec import Landmarks
-from vslam_env.world.visibility import view_limits, visible_landmarks
+from vslam_env.world.visibility import see, view_limits
 
 NEAREST_FALSE_POINT = 0.5  # [m]
-_STEREO = ("focal_px", "baseline", "sigma_px", "sigma_disparity_px")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,8 +48,7 @@ class LandmarkSensorConfig:
         check_float("sensor.max_incidence", self.max_incidence, "Give radians.", above=0.0, at_most=np.pi / 2)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Frame:
+class Frame(NamedTuple):
     """What one camera reports in one tick, and, for the simulator's books, what it was.
 
     Attributes:
@@ -77,22 +76,26 @@ class LandmarkSensor:
         self.config = config
         self._walls = check_array("walls", walls, (None, 4), "Give rows x1 y1 x2 y2 in metres.")
         self._landmarks = landmarks
-        self._descriptors = landmarks.descriptors.astype(np.float64)
+        descriptors = landmarks.descriptors.astype(np.float64)
+        self._points = np.hstack([landmarks.positions, descriptors])
         self._robot_radius = check_float("robot_radius", robot_radius, "Give metres.", at_least=0.0)
-        self._mount = np.array(config.camera.mount)
-        self._stereo = np.array([getattr(config.camera, name) for name in _STEREO])
-        self._view = view_limits(config.camera, config.max_incidence)
-        self._no_false_points = np.empty((0, 3)), np.empty((0, self._descriptors.shape[1]))
+        camera = config.camera
+        self._mount = np.array(camera.mount)
+        lens = camera.focal_px, camera.baseline, camera.sigma_px, camera.sigma_disparity_px
+        self._optics = np.array([*camera.mount, *lens])
+        self._view = view_limits(camera, config.max_incidence)
+        self._no_false_points = np.empty((0, self._points.shape[1]))
         # False points look like landmarks of this world: the common part of all descriptors and a part of their own.
-        self._common = self._descriptors.mean(axis=0) if len(landmarks) else np.zeros(landmarks.descriptors.shape[1])
+        self._common = descriptors.mean(axis=0) if len(landmarks) else np.zeros(descriptors.shape[1])
         self._own_share = np.sqrt(max(0.0, 1.0 - float(self._common @ self._common)))
 
     def visible(self, poses: FloatArray) -> BoolArray:
         """Tell which landmarks (K, N) the robots at `poses` (K, 3) [m, m, rad], world frame, can see."""
         marks = self._landmarks
-        return visible_landmarks(
-            poses, marks.positions, marks.normals, marks.walls, self._walls, self._robot_radius, self._mount, self._view
-        )
+        seen = np.empty((len(poses), len(marks)), np.bool_)
+        on_walls = marks.positions, marks.normals, marks.walls, self._walls
+        see(poses, *on_walls, self._robot_radius, self._mount, self._view, seen)
+        return seen
 
     def measure(self, poses: FloatArray, rng: np.random.Generator) -> list[Frame]:
         """Take a frame with each robot's camera.
@@ -107,36 +110,28 @@ class LandmarkSensor:
         Returns:
             One frame for each robot. Nothing in the order of its points tells anything about them.
         """
-        config, marks = self.config, self._landmarks
+        config = self.config
         poses = np.ascontiguousarray(poses, dtype=np.float64)
-        robots, most = len(poses), config.max_measurements
+        robots, most, size = len(poses), config.max_measurements, self._points.shape[1]
         visible = self.visible(poses)
         num_false = rng.poisson(config.false_points, robots)
-        if max(num_false.tolist()) > most:
-            num_false = np.minimum(num_false, most)
         keys = rng.random(visible.shape)
         ids, counts = np.empty(robots * most, np.int64), np.empty(robots, np.int64)
-        total = kernels.choose(visible, keys, config.detection_probability, num_false, most, ids, counts)
-        ids, false_points = ids[:total], self._no_false_points
-        extra = sum(num_false.tolist())
+        total, extra = kernels.choose(visible, keys, config.detection_probability, num_false, most, ids, counts)
+        false_points = self._no_false_points
         if extra:
-            false_points = self._false_points(extra, rng), self._false_descriptors(extra, rng)
-            ids = np.concatenate([ids, -1 - np.arange(extra)])
-            ids = ids[_mixed(counts.tolist(), num_false.tolist(), rng.random(len(ids)).tolist())]
+            false_points = np.hstack([self._false_points(extra, rng), self._false_descriptors(extra, rng)])
+            ids = np.concatenate([ids[:total], -1 - np.arange(extra)])
+            total += extra
+            ids = ids[_mixed(counts.tolist(), num_false.tolist(), rng.random(total).tolist())]
             counts += num_false
-        noise = rng.standard_normal((len(ids), 3 + self._descriptors.shape[1]))
-        points, looks = np.empty((len(ids), 3)), np.empty((len(ids), self._descriptors.shape[1]), np.float32)
-        sharp = np.empty(len(ids), np.bool_)
-        truth = ids, counts, poses, self._mount, marks.positions, self._descriptors, *false_points
-        num_sharp = kernels.measure(*truth, noise, self._stereo, config.descriptor_noise, points, looks, sharp)
-        if extra:
-            ids = np.maximum(ids, -1)
-        if num_sharp < len(ids):
-            counts = np.bincount(np.repeat(np.arange(robots), counts)[sharp], minlength=robots)
-            ids, points, looks = ids[sharp], points[sharp], looks[sharp]
+        noise = rng.standard_normal((total, size))
+        points, looks = np.empty((total, 3)), np.empty((total, size - 3), np.float32)
+        truth = ids, counts, poses, self._points, false_points
+        kernels.measure(*truth, noise, self._optics, config.descriptor_noise, points, looks)
         each = counts.tolist()
-        firsts = accumulate(each, initial=0)
-        own_ids = [ids[first : first + count] for first, count in zip(firsts, each, strict=False)]
+        ends = list(accumulate(each))
+        own_ids = map(ids.__getitem__, map(slice, [0, *ends], ends))
         return list(map(Frame, Measurements._trusted_frames(points, looks, each), own_ids))
 
     def _false_points(self, count: int, rng: np.random.Generator) -> FloatArray:

@@ -7,7 +7,7 @@ import numpy as np
 from slam_backend._jit import jit
 from slam_backend.camera import StereoCamera
 from slam_backend.errors import FloatArray, check_array, check_float, check_int
-from vslam_env.world.visibility import cast_scans
+from vslam_env.world.visibility import cast_scans, rays_at
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,6 +49,7 @@ class Scan:
     def __init__(self, config: ScanConfig, walls: FloatArray, robot_radius: float = 0.2) -> None:
         self.config = config
         self.ray_angles = config.ray_angles
+        self._rays, self._tan_half = rays_at(self.ray_angles)
         self._walls = check_array("walls", walls, (None, 4), "Give rows x1 y1 x2 y2 in metres.")
         self._robot_radius = check_float("robot_radius", robot_radius, "Give metres.", at_least=0.0)
 
@@ -64,8 +65,10 @@ class Scan:
         """
         config = self.config
         poses = np.ascontiguousarray(poses, dtype=np.float64)
-        ranges = cast_scans(poses, self.ray_angles, self._walls, self._robot_radius, config.max_range)
-        _add_noise(ranges, rng.standard_normal(ranges.shape), config.sigma, config.max_range)
+        noise = rng.standard_normal((len(poses), len(self._rays)))
+        ranges = np.empty(noise.shape)
+        cast_scans(poses, self._rays, self._tan_half, self._walls, self._robot_radius, config.max_range, ranges)
+        _add_noise(ranges, noise, config.sigma, config.max_range)
         return ranges
 
 

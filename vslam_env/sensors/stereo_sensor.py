@@ -1,6 +1,7 @@
 """`StereoSensor`: rendered eyes and the image front end stand in for the landmark sensor."""
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -8,7 +9,7 @@ from slam_backend.camera import StereoCamera
 from slam_backend.errors import BoolArray, FloatArray, IntArray, bad_argument, check_float
 from slam_backend.frontend import CornerOptions, FrontEndOptions, StereoFrame, StereoFrontEnd
 from slam_backend.frontend.images import Image
-from vslam_env.sensors.landmark_sensor import Frame
+from slam_backend.measurements import Measurements
 from vslam_env.sensors.stereo_camera import ImagingConfig, StereoEye
 from vslam_env.sensors.stereo_textures import TextureConfig, WallTextures, draw_textures
 from vslam_env.sensors.stereo_truth import TextureCorners
@@ -61,16 +62,18 @@ class StereoSensorConfig:
             check_float(f"stereo.{name}", getattr(self, name), "Give metres.", above=0.0)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class EyeFrame(Frame):
+class EyeFrame(NamedTuple):
     """What one robot's eyes saw in one tick, and what was made of it.
 
     Attributes:
+        measurements, true_ids: As of a `Frame`.
         left: (H, W) uint8.
         right: (H, W) uint8.
         seen: What the front end found in them.
     """
 
+    measurements: Measurements
+    true_ids: IntArray
     left: Image
     right: Image
     seen: StereoFrame
@@ -122,7 +125,7 @@ class StereoSensor:
             poses, marks.positions, marks.normals, marks.walls, self._walls, self._robot_radius, mount, self._view
         )
 
-    def measure(self, poses: FloatArray, rng: np.random.Generator) -> list[Frame]:
+    def measure(self, poses: FloatArray, rng: np.random.Generator) -> list[EyeFrame]:
         """Take and measure a pair of images with each robot's eyes.
 
         Args:
@@ -133,7 +136,7 @@ class StereoSensor:
             One frame for each robot, with the true landmark behind each point, -1 where there is none: on edges that
             are none of a texture, on robots, where nothing stands, and where the depth is wrong.
         """
-        frames: list[Frame] = []
+        frames = []
         for robot in range(len(poses)):
             left, right = self._eye.take(poses, robot, rng)
             seen = self._front_end.measure(left, right)

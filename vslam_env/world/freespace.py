@@ -12,6 +12,7 @@ from vslam_env.world.clearance import clearance_raster, distances_to_walls
 from vslam_env.world.spec import Landmarks, World
 from vslam_env.world.visibility import (
     cast_scans,
+    rays_at,
     seen_from_somewhere,
     view_limits,
     visible_landmarks,
@@ -183,9 +184,10 @@ class FreeSpace:
     def _draw_heading(self, position: FloatArray, rng: np.random.Generator) -> float:
         """Draw a heading [rad] with some free way ahead, or, after a few draws, any."""
         headings = rng.uniform(-np.pi, np.pi, 8)
-        walls = self.world.walls
-        free = [cast_scans(np.array([[*position, h]]), np.zeros(1), walls, 0.0, VIEW_AHEAD)[0, 0] for h in headings]
-        return float(headings[int(np.argmax(np.array(free) >= VIEW_AHEAD))])
+        poses = np.column_stack([np.broadcast_to(position, (len(headings), 2)), headings])
+        free = np.empty((len(headings), 1))
+        cast_scans(poses, *rays_at(np.zeros(1)), self.world.walls, 0.0, VIEW_AHEAD, free)
+        return float(headings[int(np.argmax(free[:, 0] >= VIEW_AHEAD))])
 
     def check_starts(self, start_poses: Any, num_robots: int | None = None) -> FloatArray:
         """Check that robots can start there; return (K, 3) float64 [m, m, rad], theta in [-pi, pi).

@@ -66,9 +66,9 @@ def read_odometry(
     Returns:
         (K, 3) float64 [m, m, rad], each robot's previous frame: (dx, dy, dtheta).
     """
-    before, after = np.asarray(previous_poses, dtype=np.float64), np.asarray(poses, dtype=np.float64)
-    draws = rng.standard_normal((len(after), 2))
-    return _read(before, after, bias, draws, noise.sigma_distance, noise.sigma_heading_per_metre)
+    read, draws = np.empty((len(poses), 3)), rng.standard_normal((len(poses), 2))
+    _read(previous_poses, poses, bias, draws, noise.sigma_distance, noise.sigma_heading_per_metre, read)
+    return read
 
 
 @jit
@@ -79,9 +79,9 @@ def _read(
     draws: FloatArray,
     sigma_distance: float,
     sigma_heading_per_metre: float,
-) -> FloatArray:
-    """Return the readings (K, 3) of motions between poses (K, 3) under standard normal draws (K, 2)."""
-    read = np.empty((len(after), 3))
+    read: FloatArray,
+) -> None:
+    """Write down the readings (K, 3) of motions between poses (K, 3) under standard normal draws (K, 2)."""
     for k in range(len(after)):
         dx, dy, turned = after[k, 0] - before[k, 0], after[k, 1] - before[k, 1], after[k, 2] - before[k, 2]
         distance = math.hypot(dx, dy)
@@ -92,4 +92,3 @@ def _read(
         read[k, 0] = stretch * (c * dx - s * dy)
         read[k, 1] = stretch * (s * dx + c * dy)
         read[k, 2] = (turned + turn + math.pi) % (2.0 * math.pi) - math.pi
-    return read

@@ -15,7 +15,7 @@ TOUCH = 1e-6  # [m] what a ray meets this close to its target does not hide the 
 
 
 def view_limits(camera: StereoCamera, max_incidence: float) -> FloatArray:
-    """Return what a camera can see in the order that `visible_landmarks` expects it.
+    """Return what a camera can see in the order that `see` expects it.
 
     Args:
         camera: The robots'.
@@ -97,27 +97,39 @@ def _ray_to_disc(dx: float, dy: float, x: float, y: float, radius: float) -> flo
 
 
 @jit
+def rays_at(angles: FloatArray) -> tuple[FloatArray, float]:
+    """Return unit vectors (R, 2) at angles (R,) [rad], and the tangent of the wedge that holds them all.
+
+    The wedge is that of `walls_in_wedge`; the tangent is 0, for all round, where it is not much less than a half plane.
+    """
+    rays = np.empty((len(angles), 2))
+    for r in range(len(angles)):
+        rays[r, 0], rays[r, 1] = np.cos(angles[r]), np.sin(angles[r])
+    widest = np.max(np.abs(angles))
+    return rays, np.tan(widest) + EPSILON if widest < 1.5 else 0.0
+
+
+@jit
 def cast_scans(
-    poses: FloatArray, angles: FloatArray, walls: FloatArray, robot_radius: float, max_range: float
-) -> FloatArray:
-    """Return how far each robot can look along each of its rays.
+    poses: FloatArray,
+    rays: FloatArray,
+    tan_half: float,
+    walls: FloatArray,
+    robot_radius: float,
+    max_range: float,
+    ranges: FloatArray,
+) -> None:
+    """Write down how far each robot can look along each of its rays.
 
     Args:
         poses: (K, 3) float64 [m, m, rad], world frame.
-        angles: (R,) float64 [rad], robot frame. Directions of the rays, the same for all robots.
+        rays, tan_half: Of `rays_at`, robot frame. The same for all robots.
         walls: (S, 4) float64 [m], world frame.
         robot_radius: Of the other robots, which stop rays [m].
         max_range: Where rays end [m].
-
-    Returns:
-        (K, R) float64 [m], at most `max_range`.
+        ranges: (K, R) float64 [m], at most `max_range`. Written to.
     """
-    ranges = np.full((len(poses), len(angles)), max_range)
-    widest = np.max(np.abs(angles))
-    tan_half = np.tan(widest) + EPSILON if widest < 1.5 else 0.0
-    rays, others = np.empty((len(angles), 2)), np.empty((len(poses), 2))
-    for r in range(len(angles)):
-        rays[r, 0], rays[r, 1] = np.cos(angles[r]), np.sin(angles[r])
+    others = np.empty((len(poses), 2))
     for k in range(len(poses)):
         near, _ = walls_in_wedge(poses[k], walls, tan_half, max_range)
         c, s = np.cos(poses[k, 2]), np.sin(poses[k, 2])
@@ -127,7 +139,7 @@ def cast_scans(
             if j != k and max(abs(ox), abs(oy)) <= max_range + robot_radius:
                 others[num_others, 0], others[num_others, 1] = c * ox + s * oy, c * oy - s * ox
                 num_others += 1
-        for r in range(len(angles)):
+        for r in range(len(rays)):
             dx, dy = rays[r]
             nearest = max_range
             for i in range(len(near)):
@@ -135,7 +147,6 @@ def cast_scans(
             for j in range(num_others):
                 nearest = min(nearest, _ray_to_disc(dx, dy, others[j, 0], others[j, 1], robot_radius))
             ranges[k, r] = nearest
-    return ranges
 
 
 @jit
@@ -150,7 +161,6 @@ def _hidden(x: float, y: float, dx: float, dy: float, own_wall: int, walls: Floa
     return False
 
 
-@jit
 def visible_landmarks(
     poses: FloatArray,
     positions: FloatArray,
@@ -161,7 +171,25 @@ def visible_landmarks(
     mount: FloatArray,
     view: FloatArray,
 ) -> BoolArray:
-    """Tell which landmarks each robot's camera sees.
+    """Tell which landmarks (K, N) each robot's camera sees; arguments as of `see`."""
+    seen = np.empty((len(poses), len(positions)), dtype=np.bool_)
+    see(poses, positions, normals, own_walls, walls, robot_radius, mount, view, seen)
+    return seen
+
+
+@jit
+def see(
+    poses: FloatArray,
+    positions: FloatArray,
+    normals: FloatArray,
+    own_walls: IntArray,
+    walls: FloatArray,
+    robot_radius: float,
+    mount: FloatArray,
+    view: FloatArray,
+    seen: BoolArray,
+) -> None:
+    """Write down which landmarks each robot's camera sees.
 
     A landmark is seen if it lies in range and in the image, if its face is seen at less than the largest incidence,
     and if neither another wall nor another robot stands between. Its own wall does not hide it.
@@ -176,12 +204,10 @@ def visible_landmarks(
         mount: (3,) float64 [m], robot frame. Place of the camera.
         view: (4,) float64. Range [m], tangents of half the horizontal and vertical field of view, and the cosine of
             the largest incidence.
-
-    Returns:
-        (K, N) bool.
+        seen: (K, N) bool. Written to.
     """
     max_range, tan_half, tan_vertical, cos_incidence = view
-    seen = np.zeros((len(poses), len(positions)), dtype=np.bool_)
+    seen[:] = False
     camera = np.empty(3)
     for k in range(len(poses)):
         c, s = np.cos(poses[k, 2]), np.sin(poses[k, 2])
@@ -207,7 +233,6 @@ def visible_landmarks(
                     forward, side = c * ox + s * oy, c * oy - s * ox
                     free = _ray_to_disc(ahead / length, left / length, forward, side, robot_radius) >= length
             seen[k, n] = free
-    return seen
 
 
 @jit
@@ -236,7 +261,7 @@ def seen_from_somewhere(
         origin: (2,) float64 [m], world frame. Lower left corner of cell (0, 0).
         cell: Side of a cell [m].
         camera_height: z of the camera [m].
-        view: As in `visible_landmarks`.
+        view: As in `see`.
 
     Returns:
         (N,) bool.
