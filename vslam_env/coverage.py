@@ -89,6 +89,7 @@ def _update(
     area: Any,
     positions: Any,
     found: Any,
+    shares: Any,
 ) -> int:
     """Take in what has changed in all grids; return how many more floor cells are seen by some robot than before.
 
@@ -105,6 +106,7 @@ def _update(
         area: (N, 2) float64 [m], world frame. The floor cells.
         positions: As in `_find`, as is what follows.
         found: Changed.
+        shares: (K,) float64. Written to: the same as shares of the floor.
     """
     more = 0
     for robot in range(len(cells)):
@@ -112,6 +114,8 @@ def _update(
         more += _recount(changes[robot], cells[robot], places[own], floor[own], seen[own], seers, ever, fresh)
         changes[robot, 0] = 0
     _find(fresh, seers, area, positions, ever, found)
+    for robot in range(len(found)):
+        shares[robot] = found[robot] / max(len(area), 1)
     return more
 
 
@@ -156,7 +160,7 @@ class Coverage:
         self._fresh = np.zeros(1 + count, np.int32)
         self._found = np.zeros(len(meter.bounds) - 1, np.int64)
 
-    def update(self, grids: TeamGrids, positions: FloatArray) -> tuple[float, FloatArray]:
+    def update(self, grids: TeamGrids, positions: FloatArray, found: FloatArray) -> float:
         """Look at what the robots have seen by now, and take their grids' changes.
 
         A cell is found once, so that what has been found never falls, and sums up to the coverage unless floor has been
@@ -165,10 +169,11 @@ class Coverage:
         Args:
             grids: Of the robots.
             positions: (K, 2 or 3) float64 [m], world frame. True positions of the robots.
+            found: (K,) float64. Written to: the share of the free floor that each robot was nearest to when it was
+                first seen.
 
         Returns:
-            The coverage in [0, 1], and what each robot has found (K,): the share of the free floor that it was nearest
-            to when it was first seen.
+            The coverage in [0, 1].
         """
         if not self._began:
             grids.changes[:, 0] = -1
@@ -176,10 +181,9 @@ class Coverage:
         meter = self._meter
         self._covered += _update(
             grids.changes, grids.cells, meter.bounds, meter.places, meter.floor, self._seen, self._seers, self._ever,
-            self._fresh, meter.cells, positions, self._found,
+            self._fresh, meter.cells, positions, self._found, found,
         )  # fmt: skip
-        count = max(len(meter.cells), 1)
-        return self._covered / count, self._found / count
+        return self._covered / max(len(meter.cells), 1)
 
     def get_state(self) -> dict[str, Any]:
         """Return a copy of what cannot be counted again from the grids."""

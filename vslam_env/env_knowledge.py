@@ -13,8 +13,8 @@ from vslam_env.belief import Belief
 from vslam_env.episode import Episode, Recorder, Tap
 from vslam_env.readings import Readings
 from vslam_env.rendering import Scene
-from vslam_env.reward import Standing
 from vslam_env.scenes import scene_of
+from vslam_env.standing import Standing
 from vslam_env.world import World
 
 AgentID = str

@@ -1,15 +1,14 @@
 """`ExplorationEnv`: the PettingZoo parallel environment."""
 
 import dataclasses
-from collections.abc import Mapping
-from functools import reduce
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from slam_backend.errors import FloatArray, bad_argument, check_choice, check_int
+from slam_backend.errors import bad_argument, check_choice, check_int
 from vslam_env.actions import action_space, checked_actions
 from vslam_env.config import EnvConfig
 from vslam_env.driving import Drivers
@@ -19,10 +18,11 @@ from vslam_env.infos import infos_of
 from vslam_env.observation import observation_space
 from vslam_env.observing import observations_of
 from vslam_env.rendering import draw_frame
-from vslam_env.reward import RewardSpec, Standing, evaluate, make_terms
+from vslam_env.reward import RewardSpec, evaluate, make_terms, totals
 from vslam_env.scenes import scene_of
 from vslam_env.setting import draw_setting
 from vslam_env.snapshots import EnvState, check_state, restored_sequence, sequence_state, state_version
+from vslam_env.standing import Standing
 from vslam_env.window import Window
 from vslam_env.world import WorldSource, check_source, is_one_building
 
@@ -77,7 +77,7 @@ class ExplorationEnv(EnvKnowledge):
         self.action_spaces = {agent: action_space(config.action_type) for agent in self.possible_agents}
         size = STATE_PER_ROBOT * config.num_robots + 2
         self.state_space = spaces.Box(-np.inf, np.inf, (size,), np.float32)
-        self._nothing = np.zeros(config.num_robots)
+        self._nothing = [0.0] * config.num_robots
         self._root: np.random.SeedSequence | None = None
         self._episode: Episode | None = None
         self._cycle = 0
@@ -157,13 +157,12 @@ class ExplorationEnv(EnvKnowledge):
         self._cycle += 1
 
         terms = evaluate(self._terms, before, self._standing, self.config.shared_reward)
-        rewards = reduce(np.add, terms.values())
         goal = self.config.stop_at_recall
         terminated = goal is not None and bool(self._standing.map_recalls.min() >= goal)
         truncated = not terminated and self._cycle >= self.max_cycles
         results = (
             self._observations(),
-            dict(zip(agents, rewards.tolist(), strict=True)),
+            dict(zip(agents, totals(terms), strict=True)),
             dict.fromkeys(agents, terminated),
             dict.fromkeys(agents, truncated),
             self._infos(terms, invalid),
@@ -257,7 +256,7 @@ class ExplorationEnv(EnvKnowledge):
         episode = self._running_episode("step")
         return observations_of(self.possible_agents, episode.belief, episode.readings, *self._shown_as)
 
-    def _infos(self, terms: Mapping[str, FloatArray], invalid: list[int]) -> dict[AgentID, dict[str, Any]]:
+    def _infos(self, terms: Mapping[str, Sequence[float]], invalid: list[int]) -> dict[AgentID, dict[str, Any]]:
         """Return each agent's figures after a step that paid `terms`."""
         groups = self._running_episode("step").belief.known_groups
         return infos_of(self.agents, groups, self._standing, terms, invalid)

@@ -18,9 +18,9 @@ from vslam_env.config import TICK, EnvConfig
 from vslam_env.coverage import Coverage
 from vslam_env.oracle import true_alignment
 from vslam_env.readings import Readings
-from vslam_env.reward import Standing
 from vslam_env.sensors import EyeFrame, Frame
 from vslam_env.setting import Setting
+from vslam_env.standing import DISTANCES, FOUND, NUM_FIGURES, Standing
 from vslam_env.world import Simulator, read_odometry
 
 Recorder = Callable[[tuple[Readings, ...]], None]
@@ -121,26 +121,12 @@ class Episode:
     def standing(self) -> Standing:
         """Return how the team stands now: its maps and poses are scored."""
         belief, poses = self.belief, self.true_path[-1]
-        errors, rmses, recalls, precisions, placed, pose_errors, heading_errors, sigmas = self.ledger.scores(
-            belief.outlines, belief.points, self.true_starts, poses
-        )
-        coverage, found = self._coverage.update(belief.grids, poses)
+        figures = np.empty((NUM_FIGURES, len(poses)))
+        self.ledger.score(belief.outlines, belief.points, self.true_starts, poses, figures)
+        coverage = self._coverage.update(belief.grids, poses, figures[FOUND])
+        figures[DISTANCES] = self._distances
         return Standing(
-            map_errors=errors,
-            map_rmses=rmses,
-            map_recalls=recalls,
-            map_precisions=precisions,
-            placed_recalls=placed,
-            pose_errors=pose_errors,
-            heading_errors=heading_errors,
-            pose_sigmas=sigmas,
-            coverage=coverage,
-            found=found,
-            collisions=self._collisions.copy(),
-            distances=self._distances.copy(),
-            bytes_sent=belief.bytes_sent,
-            merges=len(self.merge_ticks),
-            time=self.tick * TICK,
+            figures, self._collisions.copy(), belief.bytes_sent, coverage, len(self.merge_ticks), self.tick * TICK
         )
 
     # ------------------------------------------------------------------ snapshots

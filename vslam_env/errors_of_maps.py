@@ -10,7 +10,7 @@ from slam_backend.errors import FloatArray, IntArray, check_float
 from slam_backend.landmark_map import TeamOutlines
 from slam_backend.reports import LandmarksCreated, MapCopied, MapDropped, Renaming, TeamReport
 from slam_backend.standpoints import Standpoints
-from vslam_env.scoring import FALSE, NUM_SCORES, UNCOUNTED, score_team
+from vslam_env.scoring import FALSE, UNCOUNTED, score_team
 
 UNUSED = -3  # an id that no landmark has had so far
 
@@ -76,9 +76,14 @@ class ClaimLedger:
         """Return the claims (n,) int64 of landmarks of a robot's map: index of the true one, -1 false, -2 no matter."""
         return np.asarray(self._books[self._book_of[robot], ids])
 
-    def scores(
-        self, outlines: TeamOutlines, points: Standpoints, true_starts: FloatArray, true_poses: FloatArray
-    ) -> FloatArray:
+    def score(
+        self,
+        outlines: TeamOutlines,
+        points: Standpoints,
+        true_starts: FloatArray,
+        true_poses: FloatArray,
+        scores: FloatArray,
+    ) -> None:
         """Score the robots' maps and poses where their own estimates put them.
 
         Args:
@@ -86,17 +91,13 @@ class ClaimLedger:
             points: Where they believe to be.
             true_starts: (K, 3) [m, m, rad]. The true start poses, in the frame of the true positions.
             true_poses: (K, 3) [m, m, rad]. Likewise.
-
-        Returns:
-            (8, K) float64. The first figures of `vslam_env.reward.Standing`, in its order. A fresh array.
+            scores: (8 or more, K) float64. Written to: the first figures of `vslam_env.standing.Standing`.
         """
         (means, _, _, ids), parts = outlines
-        scores = np.empty((NUM_SCORES, len(parts)))
         score_team(
             means, ids, parts, self._books, self._book_of, self.true_positions, self.cutoff, points.own, points.sigmas,
             points.starts, true_starts, true_poses, scores,
         )  # fmt: skip
-        return scores
 
     def get_state(self) -> dict[str, Any]:
         """Return a copy of the books, for the same world's landmarks."""

@@ -3,15 +3,14 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from slam_backend.errors import FloatArray
-from vslam_env.reward import Standing
+from vslam_env.standing import Standing
 
 
 def infos_of(
     agents: Sequence[str],
     groups: Sequence[tuple[int, ...]],
     standing: Standing,
-    terms: Mapping[str, FloatArray],
+    terms: Mapping[str, Sequence[float]],
     invalid: Sequence[int],
 ) -> dict[str, dict[str, Any]]:
     """Return each agent's figures; `map_rmse` is the cutoff of the map error while nothing is matched.
@@ -22,15 +21,12 @@ def infos_of(
         agents: Names of the K robots.
         groups: Per robot who shares its map, as far as it knows.
         standing: Of the team.
-        terms: (K,) by name: what each term of the reward has paid for the step.
+        terms: By name, per robot: what each term of the reward has paid for the step.
         invalid: Per robot 1 if its action was masked.
     """
-    errors, rmses = standing.map_errors.tolist(), standing.map_rmses.tolist()
-    recalls, precisions = standing.map_recalls.tolist(), standing.map_precisions.tolist()
-    pose_errors, heading_errors = standing.pose_errors.tolist(), standing.heading_errors.tolist()
-    collisions, distances = standing.collisions.tolist(), standing.distances.tolist()
-    bytes_sent = standing.bytes_sent.tolist()
-    paid = [(f"reward/{name}", values.tolist()) for name, values in terms.items()]
+    errors, rmses, recalls, precisions, _, pose_errors, heading_errors, _, _, distances = standing.figures.tolist()
+    collisions, bytes_sent = standing.collisions.tolist(), standing.bytes_sent.tolist()
+    paid = [(f"reward/{name}", values) for name, values in terms.items()]
     infos: dict[str, dict[str, Any]] = {}
     for robot, agent in enumerate(agents):
         group = groups[robot]

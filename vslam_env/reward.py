@@ -3,49 +3,18 @@
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol, runtime_checkable
+from functools import reduce
+from operator import add
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from slam_backend.errors import FloatArray, IntArray, bad_argument, check_float
+from slam_backend.errors import FloatArray, bad_argument, check_float
+from vslam_env.standing import Standing
 
-
-class Standing(NamedTuple):
-    """How the team stands at one moment, as the simulator knows it.
-
-    Attributes:
-        map_errors: (K,) float64 [m]. E of each robot's map.
-        map_rmses: (K,) float64 [m]. Of the landmarks that each holds; the cutoff of the map error where it holds none.
-        map_recalls: (K,) float64. Share of the landmarks that each holds, wherever it has them.
-        map_precisions: (K,) float64. Share of the landmarks in each map that are matched; of duplicates one is.
-        placed_recalls: (K,) float64. Share of the landmarks that each holds closer than 0.5 m to where they are.
-        pose_errors: (K,) float64 [m].
-        heading_errors: (K,) float64 [rad], at least 0.
-        pose_sigmas: (K,) float64 [m]. One sigma of the position in its own start frame, as each believes.
-        coverage: Share of the free floor that the team has seen.
-        found: (K,) float64. Share of it that each was nearest to when the team first saw it.
-        collisions: (K,) int64. Ticks since the reset in which each robot was kept from moving as commanded.
-        distances: (K,) float64 [m]. Way that each has gone since the reset.
-        bytes_sent: (K,) int64. Since the reset.
-        merges: Since the reset.
-        time: Since the reset [s].
-    """
-
-    map_errors: FloatArray
-    map_rmses: FloatArray
-    map_recalls: FloatArray
-    map_precisions: FloatArray
-    placed_recalls: FloatArray
-    pose_errors: FloatArray
-    heading_errors: FloatArray
-    pose_sigmas: FloatArray
-    coverage: float
-    found: FloatArray
-    collisions: IntArray
-    distances: FloatArray
-    bytes_sent: IntArray
-    merges: int
-    time: float
+__all__ = [
+    "COSTS", "POTENTIALS", "TERMS", "RewardSpec", "RewardTerm", "Standing", "evaluate", "make_terms", "totals",
+]  # fmt: skip
 
 
 @runtime_checkable
@@ -166,8 +135,8 @@ def make_terms(reward: RewardSpec) -> tuple[RewardTerm, ...]:
 
 def evaluate(
     terms: Sequence[RewardTerm], before: Standing, after: Standing, shared: bool = False
-) -> dict[str, FloatArray]:
-    """Return the weighted reward (K,) of each term for a step, by name.
+) -> dict[str, list[float]]:
+    """Return the weighted reward of each term for a step, by name, one for each of the K robots.
 
     Args:
         terms: What is paid for.
@@ -178,7 +147,7 @@ def evaluate(
     Raises:
         ValueError: If a term returns anything but one finite number for each robot.
     """
-    robots = len(after.map_errors)
+    robots = len(after.collisions)
     rewards = {}
     for term in terms:
         given = term(before, after)
@@ -186,9 +155,18 @@ def evaluate(
             value = np.asarray(given, dtype=np.float64)
         except (TypeError, ValueError):  # no numbers at all
             value = np.array(np.nan)
-        if value.shape != (robots,) or not all(map(math.isfinite, value.tolist())):
+        paid = value.tolist()
+        if value.shape != (robots,) or not all(map(math.isfinite, paid)):
             raise bad_argument(
                 f"reward term {term.name!r}", f"{robots} finite numbers", given, "Return one number for each robot."
             )
-        rewards[term.name] = term.weight * (np.full(robots, value.mean()) if shared else value)
+        weight = float(term.weight)
+        if shared:
+            paid = [float(value.mean())] * robots
+        rewards[term.name] = [weight * each for each in paid]
     return rewards
+
+
+def totals(rewards: Mapping[str, Sequence[float]]) -> list[float]:
+    """Return the sum of all terms of `evaluate` for each robot."""
+    return [reduce(add, paid) for paid in zip(*rewards.values(), strict=True)]

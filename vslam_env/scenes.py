@@ -7,7 +7,7 @@ from slam_backend.geometry import compose
 from vslam_env.config import TICK
 from vslam_env.episode import Episode
 from vslam_env.rendering import MergeFlash, RobotView, Scene
-from vslam_env.reward import Standing
+from vslam_env.standing import Standing
 
 FLASH_TICKS = 30
 

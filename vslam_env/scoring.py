@@ -10,7 +10,6 @@ from slam_backend.errors import FloatArray, IntArray
 
 FALSE, UNCOUNTED = -1, -2  # claims of landmarks that are no true one, or one that does not matter
 PLACED = 0.5  # [m] a landmark held nearer than this is well placed
-NUM_SCORES = 8
 
 
 @inlined
@@ -93,10 +92,10 @@ def score_team(
         cutoff: c of the map error [m].
         own, sigmas, starts: (K, 3), (K, K), (K, 3). Of `Standpoints`.
         true_starts, true_poses: (K, 3) [m, m, rad], world frame.
-        scores: (8, K) float64. Written to: per robot the map error E of the contract [m]; the RMSE [m] of the matched
-            landmarks, the cutoff where nothing is matched; matched landmarks over the true ones, and over those of the
-            map; matched ones nearer than 0.5 m over the true ones; errors of position [m] and heading [rad]; and what
-            the robot believes of the former, one sigma [m].
+        scores: (8 or more, K) float64. Written to: per robot the map error E of the contract [m]; the RMSE [m] of the
+            matched landmarks, the cutoff where nothing is matched; matched landmarks over the true ones, and over
+            those of the map; matched ones nearer than 0.5 m over the true ones; errors of position [m] and heading
+            [rad]; and what the robot believes of the former, one sigma [m].
     """
     least = np.empty(len(truths))
     for robot in range(len(starts)):

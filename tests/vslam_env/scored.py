@@ -1,10 +1,12 @@
-"""What scores are asked with and how they are told apart."""
+"""Scores of maps, asked for one team at a time."""
 
-from types import SimpleNamespace
+import numpy as np
 
 from slam_backend.errors import FloatArray
+from slam_backend.landmark_map import TeamOutlines
 from slam_backend.standpoints import Standpoints
-from vslam_env.reward import Standing
+from vslam_env.errors_of_maps import ClaimLedger
+from vslam_env.standing import NUM_FIGURES, Standing
 
 
 def standing_at(starts: FloatArray) -> Standpoints:
@@ -15,6 +17,11 @@ def standing_at(starts: FloatArray) -> Standpoints:
     return points._replace(starts=starts)
 
 
-def by_name(scores: FloatArray) -> SimpleNamespace:
-    """Return scores (8, ...) by the names of `Standing`."""
-    return SimpleNamespace(**dict(zip(Standing._fields, scores, strict=False)))
+def scored(
+    ledger: ClaimLedger, outlines: TeamOutlines, points: Standpoints, true_starts: FloatArray, true_poses: FloatArray
+) -> Standing:
+    """Return how a team stands of which nothing else is known."""
+    robots = len(true_poses)
+    figures, nothing = np.full((NUM_FIGURES, robots), np.nan), np.zeros(robots, np.int64)
+    ledger.score(outlines, points, true_starts, true_poses, figures)
+    return Standing(figures, nothing, nothing, 0.0, 0, 0.0)

@@ -15,7 +15,9 @@ def _looked(coverage: Coverage, team: TeamGrids, robot: int, x: float) -> FloatA
     """Let a robot see a disc around (x, 2), and return what each robot has found, robot 0 standing at x = 1."""
     own = x - STARTS[0, 0] if robot == 0 else STARTS[1, 0] - x  # robot 1 looks the other way
     team.grids[robot].clear_disc(np.array([own, 0.0, 0.0]), 0.5)
-    return coverage.update(team, STARTS[:, :2])[1]
+    found = np.empty(2)
+    coverage.update(team, STARTS[:, :2], found)
+    return found
 
 
 def test_floor_is_found_once_by_the_nearest() -> None:
@@ -41,12 +43,14 @@ def test_finds_are_those_of_a_plain_count() -> None:
         if turn == 30:
             coverage.set_state(coverage.get_state())
         positions = rng.uniform(0.0, 8.0, (3, 2))
-        said = coverage.update(team, positions)[1]
+        said = np.empty(3)
+        share = coverage.update(team, positions, said)
         fresh = (coverage._seers > 0) & ~ever
         nearest = np.hypot(*np.moveaxis(SQUARES[:, None] - positions, -1, 0)).argmin(axis=1)
         found += np.bincount(nearest[fresh], minlength=3) / len(SQUARES)
         ever |= fresh
         np.testing.assert_allclose(said, found)
+        assert share == np.mean(coverage._seers > 0)
     assert ever.mean() > 0.3
 
 

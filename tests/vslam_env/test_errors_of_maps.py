@@ -2,7 +2,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from scored import by_name, standing_at
+from scored import scored, standing_at
 from small_env import MEETING, small_env, turning
 
 from slam_backend.errors import IntArray
@@ -13,12 +13,11 @@ from slam_backend.reports import LandmarksCreated, MapCopied, MapDropped, Renami
 from vslam_env.coverage import Coverage, CoverageMeter
 from vslam_env.errors_of_maps import ClaimLedger
 from vslam_env.navigation import FREE, SeenGrid, TeamGrids, cell_of
-from vslam_env.reward import Standing
 
 TRUTHS = np.array([[0.0, 0.0, 0.0], [5.0, 0.0, 0.3], [0.0, 6.0, -0.2], [7.0, 7.0, 0.0], [9.0, 1.0, 0.0]])
 COUNTABLE = np.array([True, True, False, True, True])
 STAY = np.zeros(3)
-MAP_SCORES = Standing._fields[:5]
+MAP_SCORES = ("map_errors", "map_rmses", "map_recalls", "map_precisions", "placed_recalls")
 
 
 def _ids(*values: int) -> IntArray:
@@ -48,8 +47,8 @@ def _score(ledger: ClaimLedger, robot: int, held: LandmarkMap, world_from_group:
     maps, poses = [LandmarkMap.empty(2)] * robots, np.zeros((robots, 3))
     maps[robot], poses[robot] = held, world_from_group
     outlines = TeamOutlines.joined([each.outline for each in maps])
-    scores = ledger.scores(outlines, standing_at(poses), np.zeros((robots, 3)), np.zeros((robots, 3)))
-    return by_name(scores[:, robot])
+    standing = scored(ledger, outlines, standing_at(poses), np.zeros((robots, 3)), np.zeros((robots, 3)))
+    return SimpleNamespace(**{name: getattr(standing, name)[robot] for name in MAP_SCORES})
 
 
 def test_claims_follow_creation() -> None:
@@ -71,18 +70,18 @@ def test_maps_are_scored_where_robots_believe_them_to_be() -> None:
     ]
     rows, parts = TeamOutlines.joined(outlines[::-1])
     nowhere = np.zeros((2, 3))
-    scores = ledger.scores(TeamOutlines(rows, parts[::-1].copy()), standing_at(starts), true_starts, nowhere)
+    scores = scored(ledger, TeamOutlines(rows, parts[::-1].copy()), standing_at(starts), true_starts, nowhere)
     for robot in range(2):
         expected = vars(_score(ledger, robot, held[robot], np.zeros(3)))
         for name in MAP_SCORES:
-            np.testing.assert_allclose(getattr(by_name(scores), name)[robot], expected[name], atol=1e-12)
+            np.testing.assert_allclose(getattr(scores, name)[robot], expected[name], atol=1e-12)
     ledger.rename(Renaming((0,), (1,), np.array([[0, 1], [1, 3], [2, 4]]), (0, 1, 2)))
     joint = TeamOutlines(rows, np.array([parts[1], parts[1]]))
-    scores = ledger.scores(joint, standing_at(starts[[0, 0]]), true_starts[[0, 0]], nowhere)
+    scores = scored(ledger, joint, standing_at(starts[[0, 0]]), true_starts[[0, 0]], nowhere)
     expected = vars(_score(ledger, 0, held[0], np.zeros(3)))
     for robot in range(2):
         for name in MAP_SCORES:
-            np.testing.assert_allclose(getattr(by_name(scores), name)[robot], expected[name], atol=1e-12)
+            np.testing.assert_allclose(getattr(scores, name)[robot], expected[name], atol=1e-12)
 
 
 def test_claims_follow_a_merge() -> None:
@@ -197,7 +196,7 @@ def test_pose_errors_are_differences_of_placed_poses() -> None:
     points = standing_at(np.zeros((20, 3)))._replace(own=estimated, sigmas=rng.random((20, 20)))
     ledger = ClaimLedger(20, TRUTHS, COUNTABLE, 1.0)
     outlines = TeamOutlines.joined([LandmarkMap.empty(2).outline] * 20)
-    scores = by_name(ledger.scores(outlines, points, starts, true))
+    scores = scored(ledger, outlines, points, starts, true)
     placed = compose(starts, estimated)
     np.testing.assert_allclose(scores.pose_errors, np.linalg.norm(placed[:, :2] - true[:, :2], axis=1))
     np.testing.assert_allclose(scores.heading_errors, np.abs(wrap_angle(placed[:, 2] - true[:, 2])))
@@ -226,14 +225,14 @@ def test_coverage_of_known_floor() -> None:
     coverage = Coverage(CoverageMeter(centres, starts))
     team = TeamGrids(2)
     grids = team.grids
-    assert coverage.update(team, starts)[0] == 0.0
+    assert coverage.update(team, starts, np.empty(len(starts))) == 0.0
     grids[0].clear_disc(STAY)
-    assert np.isclose(coverage.update(team, starts)[0], 1 / 6)
+    assert np.isclose(coverage.update(team, starts, np.empty(len(starts))), 1 / 6)
     grids[1].clear_disc(STAY)
     grids[1].clear_disc([0.0, 1.0, 0.0])  # one metre to the left of a robot that looks up: (2, 2)
     row, col = cell_of([0.0, 1.0])
     assert grids[1].cells[row, col] == FREE
-    assert np.isclose(coverage.update(team, starts)[0], 3 / 6)
+    assert np.isclose(coverage.update(team, starts, np.empty(len(starts))), 3 / 6)
 
 
 def _plain_share(centres: np.ndarray, starts: np.ndarray, grids: list[SeenGrid]) -> float:
@@ -268,8 +267,8 @@ def test_coverage_is_a_union() -> None:
             grids[0].absorb(grids[2], rng.uniform(-1.0, 1.0, 3))
         if turn in (20, 30):
             grids[1].set_state(kept)
-        shares.append(coverage.update(team, starts)[0])
+        shares.append(coverage.update(team, starts, np.empty(len(starts))))
         assert shares[-1] == _plain_share(centres, starts, grids)
     assert shares[-1] > 0.1
     assert min(np.diff(shares)) < 0.0  # walls were seen where floor had been, and a grid was restored
-    assert Coverage(meter).update(team, starts)[0] == shares[-1]
+    assert Coverage(meter).update(team, starts, np.empty(3)) == shares[-1]

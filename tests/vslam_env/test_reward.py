@@ -2,7 +2,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scored import by_name, standing_at
+from scored import scored, standing_at
 from small_env import MEETING, small_env, turning
 
 from agents import make_policy
@@ -14,26 +14,36 @@ from vslam_env.errors_of_maps import ClaimLedger
 from vslam_env.oracle import true_alignment
 from vslam_env.reward import POTENTIALS, TERMS, Standing, evaluate, make_terms
 
+FIGURES: dict[str, list[float]] = {  # in the order of their rows
+    "map_errors": [0.7, 0.6],
+    "map_rmses": [0.3, 0.2],
+    "map_recalls": [0.1, 0.2],
+    "map_precisions": [1.0, 0.9],
+    "placed_recalls": [0.1, 0.15],
+    "pose_errors": [0.0, 0.3],
+    "heading_errors": [0.0, 0.04],
+    "pose_sigmas": [0.02, 0.05],
+    "found": [0.2, 0.05],
+    "distances": [1.0, 2.0],
+}
 
-def _standing(**changes: Any) -> Standing:
-    values: dict[str, Any] = {
-        "map_errors": np.array([0.7, 0.6]),
-        "map_rmses": np.array([0.3, 0.2]),
-        "map_recalls": np.array([0.1, 0.2]),
-        "map_precisions": np.ones(2),
-        "placed_recalls": np.array([0.1, 0.15]),
-        "pose_errors": np.zeros(2),
-        "heading_errors": np.zeros(2),
-        "pose_sigmas": np.array([0.02, 0.05]),
-        "coverage": 0.25,
-        "found": np.array([0.2, 0.05]),
-        "collisions": np.array([0, 3]),
-        "distances": np.array([1.0, 2.0]),
-        "bytes_sent": np.zeros(2, np.int64),
-        "merges": 0,
-        "time": 3.0,
-    }
-    return Standing(**values | changes)
+
+def _standing(coverage: float = 0.25, collisions: tuple[int, int] = (0, 3), time: float = 3.0, **rows: Any) -> Standing:
+    return Standing(
+        figures=np.array([*(FIGURES | rows).values()]),
+        collisions=np.array(collisions),
+        bytes_sent=np.zeros(2, np.int64),
+        coverage=coverage,
+        merges=0,
+        time=time,
+    )
+
+
+def test_figures_go_by_their_names() -> None:
+    """Each row of the table is what its name says."""
+    standing = _standing()
+    for name, figures in FIGURES.items():
+        assert getattr(standing, name).tolist() == figures
 
 
 def _rewards(env: ExplorationEnv, actions: dict[str, Any]) -> tuple[dict[str, float], dict[str, dict[str, Any]]]:
@@ -45,13 +55,13 @@ def _rewards(env: ExplorationEnv, actions: dict[str, Any]) -> tuple[dict[str, fl
 def test_named_terms() -> None:
     """Each named term is what its name says, times its weight."""
     after = _standing(
-        map_errors=np.array([0.5, 0.65]),
-        placed_recalls=np.array([0.3, 0.1]),
-        pose_sigmas=np.array([0.03, 0.01]),
+        map_errors=[0.5, 0.65],
+        placed_recalls=[0.3, 0.1],
+        pose_sigmas=[0.03, 0.01],
         coverage=0.5,
-        found=np.array([0.25, 0.25]),
-        collisions=np.array([2, 3]),
-        distances=np.array([1.25, 2.0]),
+        found=[0.25, 0.25],
+        collisions=(2, 3),
+        distances=[1.25, 2.0],
         time=3.5,
     )
     weights = {name: float(weight) for weight, name in enumerate(TERMS, start=2)}
@@ -142,7 +152,7 @@ def test_a_map_that_is_placed_wrong_has_no_recall() -> None:
     for shift, placed in ((0.0, 2 / 3), (0.4, 2 / 3), (0.6, 0.0)):
         outlines = TeamOutlines.joined([held.outline])
         points = standing_at(np.array([[shift, 0.0, 0.0]]))
-        scores = by_name(books.scores(outlines, points, np.zeros((1, 3)), np.zeros((1, 3))))
+        scores = scored(books, outlines, points, np.zeros((1, 3)), np.zeros((1, 3)))
         assert (scores.map_recalls[0], scores.placed_recalls[0]) == (2 / 3, placed)
 
 
