@@ -58,6 +58,11 @@ class TeamOutlines(NamedTuple):
     parts: IntArray
 
     @classmethod
+    def unwritten(cls, num_robots: int, room: int) -> Self:
+        """Return room for the maps of K robots with so many landmarks in all."""
+        return cls(MapOutline.unwritten(room), np.empty((num_robots, 2), np.int64))
+
+    @classmethod
     def joined(cls, outlines: Sequence[MapOutline]) -> Self:
         """Return these, one for each robot, behind one another."""
         ends = np.cumsum([len(outline.ids) for outline in outlines])

@@ -9,7 +9,7 @@ from slam_backend.branches import Branch, restored_filter
 from slam_backend.errors import FloatArray, IntArray, bad_argument
 from slam_backend.geometry import inverse
 from slam_backend.groups import Group
-from slam_backend.landmark_map import LandmarkMap, MapOutline, TeamOutlines
+from slam_backend.landmark_map import LandmarkMap, TeamOutlines
 from slam_backend.lineup import Lineup
 from slam_backend.reports import MergeEvent, PoseEstimate
 from slam_backend.standpoints import Standpoints
@@ -155,21 +155,33 @@ class TeamKnowledge(TeamState):
         branch, index = self._find(robot)
         return inverse(branch.filter.start_pose(index))
 
-    def outlines(self, min_count: int = 1) -> TeamOutlines:
-        """Return the outlines of `map(robot, min_count=min_count)` of all robots, much faster. Fresh arrays."""
+    def outlines(self, min_count: int = 1, into: TeamOutlines | None = None) -> TeamOutlines:
+        """Return the outlines of `map(robot, min_count=min_count)` of all robots, much faster.
+
+        Args:
+            min_count: Landmarks that were measured fewer times are left out.
+            into: What this has returned before; it is written to, as long as it has room. None: fresh arrays.
+        """
         branches = self.lineup.branches
-        rows = MapOutline.unwritten(sum([branch.filter.map_room for branch in branches]))
-        parts, first = np.empty((self._num_robots, 2), np.int64), 0
+        room = sum([branch.filter.map_room for branch in branches])
+        if into is None or len(into.rows.ids) < room:
+            into = TeamOutlines.unwritten(self._num_robots, room)
+        rows, parts = into
+        first = 0
         for branch in branches:
             last = branch.filter._outline(min_count, rows, first)
             for robot in branch.live:
                 parts[robot] = first, last
             first = last
-        return TeamOutlines(rows, parts)
+        return into
 
-    def standpoints(self) -> Standpoints:
-        """Return where all robots stand: `pose_from_start`, `start_from_group`, `pose` at once. Fresh arrays."""
-        points = Standpoints.unwritten(self._num_robots)
+    def standpoints(self, into: Standpoints | None = None) -> Standpoints:
+        """Return where all robots stand: `pose_from_start`, `start_from_group`, `pose` at once.
+
+        Args:
+            into: What this has returned before; it is written to. None: fresh arrays.
+        """
+        points = Standpoints.unwritten(self._num_robots) if into is None else into
         for branch in self.lineup.branches:
             slam, report = branch.filter, branch.report
             ess = 1.0 if report is None else report.ess / slam.num_particles

@@ -60,11 +60,17 @@ class TeamBelief:
         self._candidates = TeamSlots(num_robots)
         self._slots = self._candidates.slots
         self._robots = np.arange(num_robots)
+        self._turns = [
+            [robot for robot in range(num_robots) if robot * CANDIDATE_TICKS // num_robots == tick]
+            for tick in range(CANDIDATE_TICKS)
+        ]
         self._tick = -1
         self._confirm_after = config.confirm_after
         self._beliefs: dict[int, Belief] = {}  # of this tick, made when asked for
         self._maps: dict[int, LandmarkMap] = {}  # of this tick, by the number of the map
-        self._outlines: TeamOutlines | None = None  # likewise
+        self._points = Standpoints.unwritten(num_robots)  # of this tick, written to in the next
+        self._outlines = TeamOutlines.unwritten(num_robots, 0)  # likewise, when asked for
+        self._has_outlines = False
         self._look_up_poses()
 
     @property
@@ -98,7 +104,7 @@ class TeamBelief:
         Raises:
             ValueError: If a reading is ill-formed or some robots have oracles and others have not.
         """
-        if len(readings) != self.num_robots:
+        if len(readings) != len(self._robots):
             raise bad_argument("readings", f"{self.num_robots} of them", len(readings), "Give one for each robot.")
         scans = scans_of(readings, len(self._body.ray_angles))
         odometry, measurements, _, bumps, true_poses, identities, heard, _ = zip(*readings, strict=True)
@@ -149,14 +155,15 @@ class TeamBelief:
 
     @property
     def outlines(self) -> TeamOutlines:
-        """The outlines of the `group_map` of all robots, much faster; to be looked at."""
-        if self._outlines is None:
-            self._outlines = self._team.outlines(self._confirm_after)
+        """The outlines of the `group_map` of all robots, much faster; to be looked at before the next step."""
+        if not self._has_outlines:
+            self._outlines = self._team.outlines(self._confirm_after, self._outlines)
+            self._has_outlines = True
         return self._outlines
 
     @property
     def points(self) -> Standpoints:
-        """Where the robots stand; to be looked at."""
+        """Where the robots stand; to be looked at before the next step."""
         return self._points
 
     @property
@@ -208,10 +215,10 @@ class TeamBelief:
     def _look_up_poses(self) -> None:
         """Take note of the groups and poses after a step or a merge, and forget what was derived from those before."""
         self._lineup = self._team.lineup
-        self._points = self._team.standpoints()
+        self._team.standpoints(self._points)
         self._beliefs.clear()
         self._maps.clear()
-        self._outlines = None
+        self._has_outlines = False
 
     def _others(self, robot: int) -> list[int]:
         """Return the other robots that a robot knows of, ascending."""
@@ -258,10 +265,9 @@ class TeamBelief:
 
     def _whose_candidates_are_due(self) -> Sequence[int]:
         """Return the robots whose candidates are to be renewed in this tick."""
-        robots = range(self.num_robots)
+        robots = range(len(self._robots))
         if self._tick == 0:
             return robots
         if self._decision_ticks is not None:
             return () if self._tick % self._decision_ticks else robots
-        now = self._tick % CANDIDATE_TICKS
-        return [robot for robot in robots if robot * CANDIDATE_TICKS // len(robots) == now]
+        return self._turns[self._tick % CANDIDATE_TICKS]

@@ -95,16 +95,20 @@ def test_a_renaming_names_every_landmark_of_b_s_map() -> None:
 
 
 def test_where_robots_stand_is_told_at_once_as_one_by_one() -> None:
-    """Before, while and after two of three robots merge, one of which then loses contact."""
+    """Before, while and after two of three robots merge, one of which then loses contact; in the same arrays or not."""
     simulation = SimulatedTeam(num_robots=3, seed=5)
     team = simulation.build(num_particles=20, attempts=AttemptOptions(enabled=False))
     apart = np.eye(3, dtype=bool)
+    points, outlines = team.standpoints(), team.outlines(2)
     for stage in range(4):
         if stage:
             simulation.run(team, 30, apart if stage == 3 else None)
         if stage == 2:
             team.merge(0, 1, align_maps(team.map(0, "mixture"), team.map(1, "mixture")))
-        points, outlines = team.standpoints(), team.outlines(2)
+        assert team.standpoints(points) is points
+        outlines = team.outlines(2, outlines)
+        assert team.outlines(2, outlines) is outlines
+        assert_same(points, team.standpoints())
         for robot in range(3):
             assert_same(team.lineup.members[robot], team.members(robot))
             assert_same(team.lineup.mates[robot], team.mates(robot))
