@@ -7,19 +7,20 @@ from typing import Any
 import numpy as np
 
 from slam_backend._existence_step import ExistenceStep
+from slam_backend._filter_arrays import FilterArrays
 from slam_backend._frame_buffers import FrameBuffers, Frames
-from slam_backend._map_store import aligned
+from slam_backend._kernels import add_share
+from slam_backend._kernels.layout import CAMERA, RECOVERY
 from slam_backend._mixtures import pose_mixtures
 from slam_backend._particle_maps import ParticleMaps
 from slam_backend._rejuvenated_maps import write_maps
 from slam_backend._rejuvenation_step import RejuvenationStep
-from slam_backend._turns import Assumed
+from slam_backend._turns import assumed
 from slam_backend.errors import IntArray, bad_argument, check_int, check_seed
 from slam_backend.filter_options import FilterOptions
 from slam_backend.input_log import RobotInput
 from slam_backend.reports import PoseEstimates, StepReport
 from slam_backend.run_log import RobotLog
-from slam_backend.smoothing.holding import add_share
 from slam_backend.smoothing.rejuvenation import Particles
 
 POSES = ("_poses", "_starts", "_means", "_covariances")  # (K, 3 or 6, P), of each robot
@@ -27,24 +28,14 @@ KEPT = (*POSES, "_frame", "_blind", "_log_weights", "_path_log_weights", "_weigh
 OTHERS_KEPT = ("steps", "estimates", "maps", "logs", "options", "rng")
 
 
-class FilterState:
-    """What a filter of K robots with M particles holds; in P lanes, as particles come in whole blocks of them.
-
-    The lanes beyond M mean nothing. Poses are in the map frame.
+class FilterState(FilterArrays):
+    """What a filter of K robots with M particles holds.
 
     Attributes:
         options: What it assumes and how it decides.
         may_smooth: Whether it may in the next step; filters of a team take turns.
-        _poses: (K, 3, P) float64 [m, m, rad]. Of each robot (x_t^[m]).
-        _starts: (K, 3, P) likewise. Where each robot started; spreads at a merge.
-        _from_origin: Whether all of that is zero, as in a filter that was never merged.
-        _means, _covariances: (K, 3, P), (K, 6, P). N(x^, P^) of each particle before sampling.
-        _frame: (3, 3) float64 [m, m, rad]. Covariance of a motion of the whole map that the particles do not show, as
-            their frame was held when they were drawn anew; estimates have their share of it.
-        _blind: (K,) bool. Whether that was propagated since the last sighting.
-        _log_weights: (M,) since the last resampling, normalised; `_weights` (M,) as the last step left them.
-        _path_log_weights: (M,) accumulated along the ancestral line (Eq. 12).
-        _best: Index of the largest of these.
+        _from_origin: Whether all robots started at the origin, as in a filter that was never merged.
+        _best: Index of the largest weight along paths.
         _maps: The landmarks of all particles.
         _estimates: The poses of all robots over all particles, as of the last step; never written to afterwards.
         _logs: Per robot what it did and measured, and which landmarks that was taken for.
@@ -59,26 +50,18 @@ class FilterState:
         self.options = options
         self.may_smooth = True
         self._rng = np.random.default_rng(check_seed(seed))
-        self._assumed = Assumed.by(options)
+        self._assumed = assumed(options)
+        self._camera = self._assumed[CAMERA:RECOVERY]
         existence = options.existence
         self._existence = None if existence is None else ExistenceStep(existence, options.camera)
         self._rejuvenation = None if options.rejuvenate_every is None else RejuvenationStep(options, k)
         self._maps = ParticleMaps(m, None if existence is None else existence.log_odds_prior)
-        padded = self._maps.padded
-        self._poses = aligned((k, 3, padded), np.float64)
-        self._starts = aligned((k, 3, padded), np.float64)
+        self._make_arrays(k, m, self._maps.padded)
         self._from_origin = True
-        self._means = aligned((k, 3, padded), np.float64)
-        self._covariances = aligned((k, 6, padded), np.float64)
-        self._frame = np.zeros((3, 3))
-        self._blind = np.zeros(k, dtype=np.bool_)
-        self._log_weights = np.full(m, -np.log(m))
-        self._path_log_weights = np.zeros(m)
         self._best = 0
-        self._weights = np.full(m, 1.0 / m)
         self._steps = 0
         self._logs = [RobotLog() for _ in range(k)]
-        self._buffers = FrameBuffers(k, padded)
+        self._buffers = FrameBuffers(k, self._maps.padded)
         self._estimates = self._mixtures()
 
     @property
@@ -86,23 +69,13 @@ class FilterState:
         """Index of the most probable particle, by accumulated log-weight (Eq. 12)."""
         return self._best
 
-    @property
-    def num_robots(self) -> int:
-        """K."""
-        return len(self._poses)
-
-    @property
-    def num_particles(self) -> int:
-        """M."""
-        return self._maps.num_particles
-
     def _mixtures(self) -> PoseEstimates:
         """Return the robots' poses over all particles, map frame. Fresh arrays."""
         return pose_mixtures(self._means, self._covariances, self._weights)
 
     def _widen(self) -> None:
-        """Give the estimates of the poses, as the particles show them, their share of what these do not show."""
-        if self._frame.item(0) or self._frame.item(-1):
+        """Give the mixtures of the poses, as the particles show them, their share of what these do not show."""
+        if self._frame.any():
             add_share(self._frame, *self._estimates)
 
     def _look_at_starts(self) -> None:
@@ -118,15 +91,12 @@ class FilterState:
     def _become(self, ancestors: IntArray) -> None:
         """Go on with as many particles as there are ancestors (M',), equally weighted."""
         self._maps = self._maps.taken(ancestors)
-        for name in POSES:
-            old = getattr(self, name)
-            array = aligned((*old.shape[:2], self._maps.padded), np.float64)
-            array[:, :, : len(ancestors)] = old[:, :, ancestors]
-            setattr(self, name, array)
-        self._path_log_weights = self._path_log_weights[ancestors]
+        of_robots, path_log_weights, blind, frame = self._of_robots, self._path_log_weights, self._blind, self._frame
+        self._make_arrays(self.num_robots, len(ancestors), self._maps.padded)
+        self._of_robots[..., : len(ancestors)] = of_robots[..., ancestors]
+        self._path_log_weights[:] = path_log_weights[ancestors]
+        self._blind, self._frame = blind, frame
         self._look_at_weights()
-        self._weights = np.full(len(ancestors), 1.0 / len(ancestors))
-        self._log_weights = np.full(len(ancestors), -np.log(len(ancestors)))
         self._buffers = FrameBuffers(self.num_robots, self._maps.padded)
 
     def _renew(self, new: Particles) -> None:
@@ -146,10 +116,9 @@ class FilterState:
 
     def reorder(self, order: IntArray) -> None:
         """Renumber the robots: robot i becomes the one that was `order[i]`; (K,) a permutation."""
-        for name in POSES:
+        for name in (*POSES, "_blind"):
             array = getattr(self, name)
             array[:] = array[order]
-        self._blind = self._blind[order]
         self._logs = [self._logs[robot] for robot in order]
         self._estimates = PoseEstimates(*(of_all[order] for of_all in self._estimates))
         if self._rejuvenation is not None:
@@ -159,16 +128,14 @@ class FilterState:
 
     def _write_down(self, frames: Frames, inputs: Sequence[RobotInput], report: StepReport) -> None:
         """Log what the robots did and measured in the step before `_steps`, and what that was taken for."""
-        step, buffers, smoother, first = self._steps - 1, self._buffers, self._rejuvenation, 0
+        step, buffers, smoother, masks, first = self._steps - 1, self._buffers, self._rejuvenation, frames.masks, 0
         for robot, (move, frame, names, exact) in enumerate(inputs):
-            size, keep, last = frames.sizes[robot], frames.keeps[robot], frames.ends[robot]
-            if exact is not None:
-                self._frame.fill(0.0)  # it is known now
-            if size or move is not None or exact is not None:
-                ids = report.associations[robot]
+            ids, last = report.associations[robot], frames.ends[robot]
+            if len(ids) or move is not None or exact is not None:
+                covered = frame is not None and frame.covariances is not None and len(ids) > 0
                 self._logs[robot].append(
-                    step, move, exact, buffers.points[first:last], ids if keep is None else ids[keep],
-                    buffers.noises[first:last] if size and buffers.given[robot] else None,
+                    step, move, exact, buffers.points[first:last], ids[masks[robot]] if robot in masks else ids,
+                    buffers.noises[first:last] if covered else None,
                 )  # fmt: skip
                 if smoother is not None:
                     smoother.note(robot, step, self._estimates.means[robot], exact is not None)

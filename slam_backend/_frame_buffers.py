@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from slam_backend import _kernels
 from slam_backend._kernels import LANES
+from slam_backend._kernels.layout import ACT, END, GIVEN, NAMED
 from slam_backend._map_store import aligned
 from slam_backend.errors import BoolArray, FloatArray, IntArray
 from slam_backend.input_log import RobotInput
@@ -29,24 +30,25 @@ class Frames(NamedTuple):
     """What all robots of a filter measured in a step, one robot's measurements after the other's.
 
     Attributes:
-        sizes: Per robot how many the caller gave.
-        keeps: Per robot which of these are used (n_i,): those that the caller did not name -1. None: all.
+        given: How many measurements the caller gave.
+        masks: By robot which of its measurements are used (n_i,) bool; only of robots that the caller gave some named
+            -1, which are not.
         ends: Per robot where its used measurements end among all n; they begin where those before it end.
+        active: How many robots did or saw anything.
         points: (n, 3) [m], camera frame.
         covariances: (n, 3, 3) [m^2] likewise, or (0, 3, 3) where no robot has any.
         descriptors: (n, d).
         names: (n,) the caller's names, or (0,) where no robot has any.
-        active: How many robots did or saw anything.
     """
 
-    sizes: list[int]
-    keeps: list[IntArray | None]
+    given: int
+    masks: dict[int, BoolArray]
     ends: list[int]
+    active: int
     points: FloatArray
     covariances: FloatArray
     descriptors: NDArray[np.float32]
     names: IntArray
-    active: int
 
 
 class FrameBuffers:
@@ -57,94 +59,82 @@ class FrameBuffers:
         padded: P, number of particles rounded up to whole blocks.
 
     Attributes:
-        acts: (K,) int64. What each robot did, as `_kernels.take_turns` takes it; with `moves` (K, 3) its odometry.
-        firsts: (K + 1,) int64. Where each robot's measurements begin among all.
-        given, named: (K,) bool. Whether its measurements come with covariances, and with names.
-        log_likelihood: (P,) of the step.
-        points, noises: (n', 3), (n', 6) the measurements relative to the camera centre in robot axes, and their
-            covariances, zeros for those that have none.
+        turns: (K, 4) int64, moves: (K, 3). What each robot did, as `_kernels.take_turns` takes it.
+        sightings: (n', 9) the measurements in robot axes: `points` (n', 3) relative to the camera centre, and `noises`
+            (n', 6), their covariances, zeros for those that have none.
         found: (n', P) int32. Slot to which each particle gave each measurement, -1 = none.
         distances: (n', P) squared Mahalanobis distances of matches, else NaN.
-        new_slots: (n',) int64. Slot of the landmark that a measurement started, -1 = none.
-        work, records: Of the kernels.
+        space: Of the kernels.
     """
 
     def __init__(self, num_robots: int, padded: int) -> None:
-        self.acts: IntArray = np.zeros(num_robots, dtype=np.int64)
+        self._padded = padded
+        self.turns: IntArray = np.zeros((num_robots, 4), dtype=np.int64)
         self.moves: FloatArray = np.zeros((num_robots, 3))
-        self.firsts: IntArray = np.zeros(num_robots + 1, dtype=np.int64)
-        self.given: BoolArray = np.zeros(num_robots, dtype=np.bool_)
-        self.named: BoolArray = np.zeros(num_robots, dtype=np.bool_)
-        self.log_likelihood: FloatArray = np.zeros(padded)
-        self.work: FloatArray = aligned((_kernels.WORK_ROWS * LANES,), np.float64)
-        self.records: FloatArray = aligned((CANDIDATES, _kernels.CANDIDATE_ROWS * LANES), np.float64)
+        records = CANDIDATES * _kernels.CANDIDATE_ROWS
+        self.space: FloatArray = aligned(((_kernels.WORK_ROWS + records) * LANES,), np.float64)
         self._make_room(MEASUREMENTS * num_robots)
 
     def _make_room(self, most: int) -> None:
         """Provide for so many measurements in a step."""
-        padded = len(self.log_likelihood)
-        self.points: FloatArray = np.zeros((most, 3))
-        self.noises: FloatArray = np.zeros((most, 6))
-        self.found: NDArray[np.int32] = np.zeros((most, padded), dtype=np.int32)
-        self.distances: FloatArray = np.zeros((most, padded))
-        self.new_slots: IntArray = np.zeros(most, dtype=np.int64)
-        self._rows: IntArray = np.arange(most)
+        self.sightings: FloatArray = np.zeros((most, 9))
+        self.found: NDArray[np.int32] = np.zeros((most, self._padded), dtype=np.int32)
+        self.distances: FloatArray = np.zeros((most, self._padded))
+
+    @property
+    def points(self) -> FloatArray:
+        """See `sightings`."""
+        return self.sightings[:, :3]
+
+    @property
+    def noises(self) -> FloatArray:
+        """See `sightings`."""
+        return self.sightings[:, 3:]
 
     def take(self, inputs: Sequence[RobotInput]) -> Frames:
         """Begin a step: take what all robots read, and provide for what becomes of it."""
-        self.log_likelihood.fill(0.0)
-        sizes: list[int] = []
-        keeps: list[IntArray | None] = []
+        turns = self.turns
+        masks: dict[int, BoolArray] = {}
         ends: list[int] = []
         used: list[Readings] = []  # of each robot that has measurements
-        total = idle = 0
+        given = total = active = 0
         for robot, (move, frame, names, exact) in enumerate(inputs):
-            size, left, keep = 0, 0, None
-            if frame is not None and len(frame.points):
+            act = _kernels.IDLE
+            if frame is not None and (size := len(frame.points)):
+                given += size
                 own: Readings = (frame.points, frame.covariances, frame.descriptors, names)
-                size = left = len(frame.points)
                 if names is not None and names.min() < 0:
-                    own, keep = _without_rejected(frame.points, frame.covariances, frame.descriptors, names)
-                    left = len(keep)
-                if left:
+                    masks[robot] = mask = names >= 0
+                    own = _masked(*own, mask)
+                    size = len(own[0])
+                if size:
+                    act = _kernels.STOOD
                     used.append(own)
-                    total += left
-                self.given[robot], self.named[robot] = frame.covariances is not None, names is not None
+                    total += size
+                turns[robot, GIVEN], turns[robot, NAMED] = frame.covariances is not None, names is not None
             if exact is not None:
-                self.acts[robot] = _kernels.PLACED
+                act = _kernels.PLACED
             elif move is not None:
-                self.acts[robot], self.moves[robot] = _kernels.MOVED, move
-            elif left:
-                self.acts[robot] = _kernels.STOOD
-            else:
-                self.acts[robot] = _kernels.IDLE
-                idle += 1
-            sizes.append(size)
-            keeps.append(keep)
+                act, self.moves[robot] = _kernels.MOVED, move
+            turns[robot, ACT], turns[robot, END] = act, total
+            active += act != _kernels.IDLE
             ends.append(total)
-            self.firsts[robot + 1] = total
         if total > len(self.found):
             self._make_room(2 * total)
-        return Frames(sizes, keeps, ends, *_joined(used), len(inputs) - idle)
-
-    def rows_used(self, frames: Frames) -> IntArray:
-        """Return which of all measurements that the caller gave are used (n,)."""
-        used = len(frames.points)
-        if used == sum(frames.sizes):
-            return self._rows[:used]
-        firsts = np.cumsum([0, *frames.sizes[:-1]])
-        kept = [
-            np.arange(size) if keep is None else keep for size, keep in zip(frames.sizes, frames.keeps, strict=True)
-        ]
-        return np.concatenate([first + own for first, own in zip(firsts, kept, strict=True)])
+        return Frames(given, masks, ends, active, *_joined(used))
 
 
-def _without_rejected(
-    points: FloatArray, covariances: FloatArray | None, descriptors: NDArray[np.float32], names: IntArray
-) -> tuple[Readings, IntArray]:
-    """Return the readings that the caller did not name -1, and which these are."""
-    keep = np.flatnonzero(names >= 0)
-    return (points[keep], None if covariances is None else covariances[keep], descriptors[keep], names[keep]), keep
+def _masked(
+    points: FloatArray, covariances: FloatArray | None, descriptors: NDArray[np.float32], names: IntArray | None,
+    mask: BoolArray,
+) -> Readings:  # fmt: skip
+    """Return the readings where the mask (n,) is set."""
+    return (
+        points[mask],
+        None if covariances is None else covariances[mask],
+        descriptors[mask],
+        None if names is None else names[mask],
+    )
 
 
 def _joined(

@@ -5,11 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from slam_backend import _kernels
 from slam_backend.errors import FloatArray, IntArray
 from slam_backend.geometry import compose, inverse, rotate_covariances
 from slam_backend.smoothing.coarsening import coarsened
 from slam_backend.smoothing.graph import PathGraph, mean_pose, scattered
-from slam_backend.smoothing.holding import add_share
 from slam_backend.smoothing.joining import joined
 from slam_backend.smoothing.options import SmoothingOptions
 
@@ -38,7 +38,7 @@ def joint_graph(
     motion = compose(mean_pose(start), inverse(began))
     spreads = scattered(start)[None], np.zeros((1, 3, 3))
     for frame, pose, spread in zip(frames, (mean_pose(start), began), spreads, strict=True):
-        add_share(frame, pose[None], spread)
+        _kernels.add_share(frame, pose[None], spread)
     spread = spreads[0][0] + rotate_covariances(float(motion[2]), spreads[1][0])
     return joined(own, other, motion, renamed, spread), motion
 

@@ -59,6 +59,4 @@ def finish(joint: FastSlam, a: FastSlam, b: FastSlam, renamed: IntArray) -> None
     joint._logs = [log.copy() for log in a._logs] + [log.renamed(renamed[:, 0], renamed[:, 1]) for log in b._logs]
     if joint._rejuvenation is not None and a._rejuvenation is not None and b._rejuvenation is not None:
         starts = [slam._starts[:, :, : slam.num_particles] for slam in (a, b, joint)]
-        joint._rejuvenation.join(
-            a._rejuvenation, b._rejuvenation, starts, (a._frame, b._frame), renamed, joint._assumed.camera
-        )
+        joint._rejuvenation.join(a._rejuvenation, b._rejuvenation, starts, (a._frame, b._frame), renamed, joint._camera)

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from slam_backend import _kernels
 from slam_backend._kernels import LANES
+from slam_backend._kernels.layout import FREE_SLOTS, IDENTITIES, IDS, MAP_OF, ROW_OF
 from slam_backend.errors import FloatArray, IntArray
 
 LINE = 64  # [bytes]; vectors that straddle cache lines are slow
@@ -39,13 +40,11 @@ class MapStore:
         values: (rows * 9 * P,) float64 [m, m^2], map frame, each row
             [block][x, y, z, Sxx, Sxy, Sxz, Syy, Syz, Szz][lane].
         counts: (rows, P) int32. How often the particle matched the landmark, its start included; 0: it lacks it.
-        row_of, map_of: (slots,) int64. Row of each slot, and the ancestor map by which it is to be read.
+        table: (5, slots) int64. Per slot `row_of`, `map_of`, `ids` and `identities`; and the stack `free_slots`.
         maps: (maps, P) int32. users: (maps,) int64, how many slots read by each.
         odds: (slots, P) float64. Log-odds that the landmark exists, read through its map as a row is; (0, P) without.
-        ids: (slots,) int64. Stable names of the landmarks, -1 = free slot.
-        identities: (slots,) int64. The caller's own names, -1 = none.
         descriptors: (slots, d) float32. heads: (h, slots) every (d / h)-th component of them, `FAR` where free.
-        free_rows, free_slots: Stacks; `tops` = (their heights, the name of the next landmark).
+        free_rows: A stack; `tops` = (its height, that of the free slots, the name of the next landmark).
     """
 
     def __init__(self, num_particles: int, log_odds_prior: float | None = None) -> None:
@@ -61,16 +60,37 @@ class MapStore:
         self.odds: FloatArray = aligned((0, self.padded), np.float64)
         self.maps: NDArray[np.int32] = np.zeros((1, self.padded), dtype=np.int32)
         self.users: IntArray = np.zeros(1, dtype=np.int64)
-        self.row_of: IntArray = np.zeros(0, dtype=np.int64)
-        self.map_of: IntArray = np.zeros(0, dtype=np.int64)
-        self.ids: IntArray = np.zeros(0, dtype=np.int64)
-        self.identities: IntArray = np.zeros(0, dtype=np.int64)
+        self.table: IntArray = np.zeros((5, 0), dtype=np.int64)
         self.descriptors: NDArray[np.float32] = np.zeros((0, 0), dtype=np.float32)
         self.heads: NDArray[np.float32] = np.zeros((0, 0), dtype=np.float32)
         self._free_maps = 0
         self.free_rows: IntArray = np.zeros(0, dtype=np.int64)
-        self.free_slots: IntArray = np.zeros(0, dtype=np.int64)
         self.tops: IntArray = np.zeros(3, dtype=np.int64)
+
+    @property
+    def row_of(self) -> IntArray:
+        """(slots,) row of each slot. A view, as the others."""
+        return np.asarray(self.table[ROW_OF])
+
+    @property
+    def map_of(self) -> IntArray:
+        """(slots,) the ancestor map by which each is to be read."""
+        return np.asarray(self.table[MAP_OF])
+
+    @property
+    def ids(self) -> IntArray:
+        """(slots,) stable names of the landmarks, -1 = free slot."""
+        return np.asarray(self.table[IDS])
+
+    @property
+    def identities(self) -> IntArray:
+        """(slots,) the caller's own names, -1 = none."""
+        return np.asarray(self.table[IDENTITIES])
+
+    @property
+    def free_slots(self) -> IntArray:
+        """(slots,) a stack of free slots."""
+        return np.asarray(self.table[FREE_SLOTS])
 
     @property
     def next_id(self) -> int:
@@ -81,8 +101,8 @@ class MapStore:
     def nbytes(self) -> int:
         """Memory held [bytes]."""
         arrays = (
-            self.values, self.counts, self.maps, self.users, self.row_of, self.map_of, self.ids, self.identities,
-            self.descriptors, self.heads, self.free_rows, self.free_slots, self.odds,
+            self.values, self.counts, self.maps, self.users, self.table, self.descriptors, self.heads, self.free_rows,
+            self.odds,
         )  # fmt: skip
         return sum(array.nbytes for array in arrays)
 
@@ -105,16 +125,17 @@ class MapStore:
             new: How many at most.
             descriptor_size: d of the landmarks; that of the map, if there are any.
         """
-        if self.tops[1] < new:
-            self._grow_slots(max(64, len(self.ids), new - int(self.tops[1])), descriptor_size)
-        if self.tops[0] < new + 1:
+        rows, slots, _ = self.tops.tolist()
+        if slots < new:
+            self._grow_slots(max(64, len(self.ids), new - slots), descriptor_size)
+        if rows < new + 1:
             self._grow_rows(max(64, len(self.counts) // 2, new + 1))
 
     def _grow_slots(self, extra: int, descriptor_size: int) -> None:
         """Provide so many more slots, with room for descriptors of that size."""
         old = len(self.ids)
-        for name, fill in (("row_of", 0), ("map_of", 0), ("ids", -1), ("identities", -1)):
-            setattr(self, name, np.concatenate([getattr(self, name), np.full(extra, fill, dtype=np.int64)]))
+        table = np.zeros((len(self.table), old + extra), dtype=np.int64)
+        table[:, :old], table[IDS, old:], table[IDENTITIES, old:] = self.table, -1, -1
         descriptors = aligned((old + extra, descriptor_size), np.float32)
         if old and self.descriptors.shape[1]:
             descriptors[:old] = self.descriptors
@@ -129,10 +150,10 @@ class MapStore:
             odds[:old] = self.odds
             self.odds = odds
         top = int(self.tops[1])
-        free = np.zeros(old + extra, dtype=np.int64)
-        free[:extra] = np.arange(old + extra - 1, old - 1, -1)  # the lowest is taken first once the old ones are gone
-        free[extra : extra + top] = self.free_slots[:top]
-        self.free_slots = free
+        # The lowest is taken first once the old ones are gone.
+        table[FREE_SLOTS, :extra] = np.arange(old + extra - 1, old - 1, -1)
+        table[FREE_SLOTS, extra : extra + top] = self.free_slots[:top]
+        self.table = table
         self.tops[1] = extra + top
 
     def _grow_rows(self, extra: int) -> None:

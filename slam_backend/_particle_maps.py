@@ -31,20 +31,19 @@ class ParticleMaps(MapStore):
 
     # ------------------------------------------------------------------ resampling
 
-    def resample(self, ancestors: IntArray, particles: Any) -> None:
+    def resample(self, ancestors: IntArray, of_robots: FloatArray, of_particles: FloatArray) -> None:
         """Let each particle become a copy of its ancestor.
 
         Args:
             ancestors: (M,) ascending.
-            particles: What else particles hold: poses, starts, means, covariances, path_log_weights.
+            of_robots, of_particles: What else particles hold, see `FilterArrays`.
         """
         if not self._free_maps:
             self._make_maps()
-        arguments = (
-            ancestors, *particles, self.maps, self.users, self.map_of, self.ids, self.row_of, self.counts, self.heads,
-            self.free_rows, self.free_slots, self.tops,
+        self._free_maps = _kernels.resample(
+            ancestors, of_robots, of_particles, self.counts, self.table, self.maps, self.users, self.free_rows,
+            self.tops, self.heads,
         )  # fmt: skip
-        self._free_maps = _kernels.resample(*arguments)
 
     def _make_maps(self) -> None:
         """Provide a free map, by one more or by bringing slots up to date."""

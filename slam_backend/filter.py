@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from slam_backend._frame_buffers import Frames
+from slam_backend._kernels.layout import NEW_SLOTS
 from slam_backend._rejuvenation_step import RejuvenationStep
 from slam_backend._step_input import check_step
-from slam_backend._turns import PoseParticles, conclude, place, take_turns
+from slam_backend._turns import Summary, place, report_of, take_turns
 from slam_backend.adaptation import AdaptiveParticles, next_num_particles
 from slam_backend.camera import StereoCamera
 from slam_backend.errors import IntArray, check_array
@@ -26,7 +27,7 @@ from slam_backend.geometry import wrap_angle
 from slam_backend.input_log import RobotInput
 from slam_backend.measurements import Measurements
 from slam_backend.motion import OdometryModel
-from slam_backend.reports import RejuvenationReport, StepReport
+from slam_backend.reports import PoseEstimates, RejuvenationReport, StepReport
 from slam_backend.resampling import RESAMPLING
 from slam_backend.smoothing.options import SmoothingOptions
 
@@ -164,26 +165,23 @@ class FastSlam(FilterKnowledge):
 
     def _step_checked(self, inputs: Sequence[RobotInput]) -> StepReport:
         """Do what `step` does with readings that `check_step` returned; none of them is written to."""
-        maps, buffers = self._maps, self._buffers
-        frames = buffers.take(inputs)
-        deserted = self._take_turns(inputs, frames)
-        self._steps += 1
-        weights = self._log_weights, self._path_log_weights, self._weights
+        maps, num_robots = self._maps, len(inputs)
+        frames = self._buffers.take(inputs)
+        told = np.empty((3, len(frames.points)), dtype=np.int64)
+        self._estimates = PoseEstimates(np.empty((num_robots, 3)), np.empty((num_robots, 3, 3)))
+        summary, deserted = self._take_turns(inputs, frames, told)
+        self._steps, self._best = self._steps + 1, summary[1]
         threshold = self.options.resample_threshold * maps.num_particles * (1.0 + 1e-9)
-        report, self._estimates = conclude(
-            frames, buffers, maps.ids, weights, (self._means, self._covariances), threshold
-        )  # fmt: skip
-        self._look_at_weights()
+        report = report_of(frames, told, summary, threshold)
         self._write_down(frames, inputs, report)
-        self._widen()
         for slots in deserted:
             maps.release(slots)
         if report.resampled:
             self._resample()
         if self._rejuvenation is not None:
             self._rejuvenation.count(report.associations)
-            if self.may_smooth and (told := self._rejuvenate(self._rejuvenation)) is not None:
-                return report._replace(rejuvenation=told)
+            if self.may_smooth and (news := self._rejuvenate(self._rejuvenation)) is not None:
+                return report._replace(rejuvenation=news)
         return report
 
     def rejuvenate(self) -> RejuvenationReport:
@@ -223,7 +221,7 @@ class FastSlam(FilterKnowledge):
             return None
         starts = self._starts[:, :, : self.num_particles]
         result = smoother.run(
-            self._logs, starts, self._maps, self.best_particle, self._assumed.camera, self._rng
+            self._logs, starts, self._maps, self.best_particle, self._camera, self._rng
         )  # fmt: skip
         if result is None:
             return None
@@ -231,29 +229,35 @@ class FastSlam(FilterKnowledge):
             self._renew(result.particles)
         return RejuvenationReport(result.reason, result.ess, result.iterations, result.graph.num_keys)
 
-    def _take_turns(self, inputs: Sequence[RobotInput], frames: Frames) -> list[IntArray]:
+    def _take_turns(
+        self, inputs: Sequence[RobotInput], frames: Frames, told: IntArray
+    ) -> tuple[Summary, list[IntArray]]:  # fmt: skip
         """Take all robots' turns; where one did and saw nothing no random number is drawn.
 
         Returns:
-            Slots of landmarks that turned out not to exist; to be released when nobody asks for their ids.
+            What all of it came to; and slots of landmarks that turned out not to exist, to be released when nobody asks
+            for their ids.
         """
         maps, buffers = self._maps, self._buffers
-        particles = PoseParticles(self._starts, self._poses, self._means, self._covariances, self._blind)
         for robot, reading in enumerate(inputs):
             if reading.pose is not None:
-                place(particles, maps.num_particles, robot, reading.pose)
+                place(self, robot, reading.pose)
+        if used := len(frames.points):
+            maps.make_room(used, frames.descriptors.shape[1])
         normals = self._rng.standard_normal((frames.active, maps.num_particles, 3))
+        step = (self._assumed, self, maps, buffers, frames, normals, told, self._estimates)
         if self._existence is None:
-            take_turns(self._assumed, particles, maps, buffers, frames, normals, 0, len(inputs))
-            return []
-        deserted = []
-        for robot, reading in enumerate(inputs):
-            take_turns(self._assumed, particles, maps, buffers, frames, normals, robot, robot + 1)
+            return take_turns(0, len(inputs), *step), []
+        deserted, best, first = [], self._best, 0
+        for robot, (reading, end) in enumerate(zip(inputs, frames.ends, strict=True)):
+            summary = take_turns(robot, robot + 1, *step)
             if reading.frame is not None:
-                own = slice(buffers.firsts[robot], buffers.firsts[robot + 1])
-                of_frame = buffers.found[own], buffers.new_slots[own]
-                deserted.append(self._existence.weigh(maps, self._poses[robot], self.best_particle, *of_frame))
-        return deserted
+                new_slots = told[NEW_SLOTS, first:end]
+                deserted.append(
+                    self._existence.weigh(maps, self._poses[robot], best, buffers.found[first:end], new_slots)
+                )
+            first = end
+        return summary, deserted
 
     def _resample(self) -> None:
         """Draw the particles anew in proportion to their weights; all that a particle holds goes with it."""
@@ -263,8 +267,7 @@ class FastSlam(FilterKnowledge):
             count = next_num_particles(self.options.adaptive, poses, self._weights)
         ancestors = RESAMPLING[self.options.resampling](self._weights, self._rng, count)
         if count == self.num_particles:
-            held = (self._poses, self._starts, self._means, self._covariances, self._path_log_weights)
-            self._maps.resample(ancestors, held)
+            self._maps.resample(ancestors, self._of_robots, self._of_particles)
             self._look_at_weights()
             self._log_weights.fill(-np.log(count))
         else:

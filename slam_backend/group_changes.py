@@ -6,6 +6,7 @@ from functools import partial
 
 import numpy as np
 
+from slam_backend import _kernels
 from slam_backend.alignment import RIVAL_ANGLE, RIVAL_DISTANCE, Alignment, AlignmentOptions
 from slam_backend.branches import Branch, fork
 from slam_backend.errors import FloatArray, IntArray
@@ -19,7 +20,6 @@ from slam_backend.merging import merge_filters, motion_covariance
 from slam_backend.mixture_merging import merge_mixtures
 from slam_backend.records import Records
 from slam_backend.reports import MergeUndone, Renaming
-from slam_backend.smoothing.holding import add_share
 from slam_backend.undoing import Undoing
 from slam_backend.watching import Side, Watch, begin_watch
 
@@ -167,5 +167,5 @@ def _of_frames(frame_a: FloatArray, frame_b: FloatArray, alignment: Alignment) -
     """Return what two frames that are held, (3, 3) each, leave open of the motion between where the groups began."""
     covariance = rotate_covariances(alignment.theta, frame_b)
     transform = alignment.transform.copy()  # can be written: the kernel is compiled for such arrays alone
-    add_share(frame_a, transform[None], covariance[None])
+    _kernels.add_share(frame_a, transform[None], covariance[None])
     return covariance

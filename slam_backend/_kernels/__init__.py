@@ -27,9 +27,9 @@ from slam_backend._kernels.places import carry_odds, refresh
 from slam_backend._kernels.resampling import resample
 from slam_backend._kernels.start_frames import stand
 from slam_backend._kernels.turns import IDLE, MOVED, PLACED, STOOD, take_turns, write_sigmas
-from slam_backend._kernels.weights import conclude, mixture
+from slam_backend._kernels.weights import add_share, mixture
 
 __all__ = [
     "CANDIDATE_ROWS", "FAR", "IDLE", "LANES", "MIN_DEPTH", "MOVED", "PLACED", "STOOD", "WORK_ROWS", "YOUNG",
-    "carry_odds", "conclude", "extent", "mixture", "refresh", "resample", "stand", "take_turns", "write_sigmas",
+    "add_share", "carry_odds", "extent", "mixture", "refresh", "resample", "stand", "take_turns", "write_sigmas",
 ]  # fmt: skip

@@ -3,7 +3,7 @@
 import numpy as np
 
 from slam_backend._jit import jit
-from slam_backend._kernels.layout import FAR
+from slam_backend._kernels.layout import FAR, FREE_SLOTS, IDS, MAP_OF, PATH_LOG_WEIGHTS, ROW_OF
 from slam_backend.errors import Float32Array, FloatArray, Int32Array, IntArray
 
 
@@ -39,10 +39,8 @@ def settle(ancestors: IntArray, count: int) -> tuple[IntArray, IntArray]:
 
 @jit
 def resample(
-    ancestors: IntArray, poses: FloatArray, starts: FloatArray, means: FloatArray, covariances: FloatArray,
-    path_log_weights: FloatArray, maps: Int32Array, users: IntArray, map_of: IntArray, ids: IntArray,
-    row_of: IntArray, counts: Int32Array, heads: Float32Array, free_rows: IntArray, free_slots: IntArray,
-    tops: IntArray,
+    ancestors: IntArray, robots: FloatArray, weights: FloatArray, counts: Int32Array, table: IntArray,
+    maps: Int32Array, users: IntArray, free_rows: IntArray, tops: IntArray, heads: Float32Array,
 ) -> int:  # fmt: skip
     """Let particles become copies of their ancestors, their landmarks lazily, and free what no survivor holds.
 
@@ -50,9 +48,9 @@ def resample(
 
     Args:
         ancestors: (M,) index of each new particle's parent, ascending; they are settled first.
-        poses, starts, means, covariances: (K, c, P); columns are copied.
-        path_log_weights: (M,), likewise.
-        maps and the following: The store, see `ParticleMaps`. At least one map is free.
+        robots: (5, K, 3, P) as in `take_turns`; columns are copied.
+        weights: (4, P); those along paths are copied.
+        counts, ..., heads: The store, see `ParticleMaps`. At least one map is free.
 
     Returns:
         How many maps are still free.
@@ -61,18 +59,14 @@ def resample(
     places = settle(ancestors, count)
     targets, sources = places[0].astype(np.uint32), places[1].astype(np.uint32)  # unsigned: none counts from the end
     moves = len(targets)
+    path_log_weights, rows = weights[PATH_LOG_WEIGHTS], robots.reshape((-1, robots.shape[3]))
     for i in range(moves):
         path_log_weights[targets[i]] = path_log_weights[sources[i]]
-    for robot in range(poses.shape[0]):
-        for c in range(3):
-            for i in range(moves):
-                target, source = targets[i], sources[i]
-                poses[robot, c, target] = poses[robot, c, source]
-                starts[robot, c, target] = starts[robot, c, source]
-                means[robot, c, target] = means[robot, c, source]
-        for c in range(6):
-            for i in range(moves):
-                covariances[robot, c, targets[i]] = covariances[robot, c, sources[i]]
+    for c in range(len(rows)):
+        row = rows[c]
+        for i in range(moves):
+            row[targets[i]] = row[sources[i]]
+    row_of, map_of, ids, free_slots = table[ROW_OF], table[MAP_OF], table[IDS], table[FREE_SLOTS]
     fresh, free = 0, 0
     for e in range(1, len(users)):
         if users[e] > 0:

@@ -8,7 +8,40 @@ from slam_backend._jit import jit
 from slam_backend._kernels.candidates import to_robot_axes
 from slam_backend._kernels.fastslam1 import update_fastslam1
 from slam_backend._kernels.fastslam2 import update_fastslam2
+from slam_backend._kernels.layout import (
+    ACT,
+    AMBIGUITY,
+    CAMERA,
+    CANDIDATE_ROWS,
+    COVARIANCES,
+    DEAD_RADIUS,
+    DEAD_ZONE,
+    DESCRIPTOR_GATE,
+    DESCRIPTOR_VARIANCE,
+    END,
+    FREE_SLOTS,
+    GIVEN,
+    IDENTITIES,
+    IDS,
+    IS_ONE_TO_ONE,
+    IS_SIGHTING,
+    LANES,
+    LOG_LIKELIHOOD,
+    LOG_P0,
+    MAP_OF,
+    MEANS,
+    NAMED,
+    NEW_SLOTS,
+    NOISE,
+    POSES,
+    POSITION_GATE,
+    RECOVERY,
+    ROW_OF,
+    WALK,
+    WORK_ROWS,
+)
 from slam_backend._kernels.motion import move_blind
+from slam_backend._kernels.weights import conclude
 from slam_backend.errors import BoolArray, Float32Array, FloatArray, Int32Array, IntArray
 
 IDLE, STOOD, MOVED, PLACED = 0, 1, 2, 3  # what a robot did: nothing at all, stood and looked, moved, was told its pose
@@ -25,67 +58,88 @@ def write_sigmas(noise: FloatArray, move: FloatArray, sigmas: FloatArray) -> Non
 
 @jit
 def take_turns(
-    low: int, high: int, sighting: bool, acts: IntArray, moves: FloatArray, noise: FloatArray, normals: FloatArray,
-    poses: FloatArray, means: FloatArray, covariances: FloatArray, blind: BoolArray,
-    values: FloatArray, counts: Int32Array, odds: FloatArray, row_of: IntArray, map_of: IntArray, maps: Int32Array,
-    users: IntArray, free_rows: IntArray, free_slots: IntArray, tops: IntArray, ids: IntArray, identities: IntArray,
-    stored: Float32Array, heads: Float32Array,
-    firsts: IntArray, measured: FloatArray, spreads: FloatArray, given: BoolArray, descriptors: Float32Array,
-    names: IntArray, named: BoolArray, camera: FloatArray,
-    descriptor_gate: float, descriptor_variance: float, position_gate: float, dead_zone: float, dead_radius: float,
-    ambiguity: float, recovery: FloatArray, log_p0: float, walk: float, one_to_one: bool,
-    points: FloatArray, noises: FloatArray, work: FloatArray, records: FloatArray, found: Int32Array,
-    distances: FloatArray, new_slots: IntArray, log_likelihood: FloatArray,
-) -> None:  # fmt: skip
+    low: int, high: int, assumed: FloatArray, turns: IntArray, moves: FloatArray, normals: FloatArray,
+    robots: FloatArray, blind: BoolArray, weights: FloatArray, frame: FloatArray,
+    values: FloatArray, counts: Int32Array, odds: FloatArray, table: IntArray, maps: Int32Array, users: IntArray,
+    free_rows: IntArray, tops: IntArray, stored: Float32Array, heads: Float32Array,
+    measured: FloatArray, spreads: FloatArray, descriptors: Float32Array, names: IntArray,
+    sightings: FloatArray, space: FloatArray, found: Int32Array, distances: FloatArray, told: IntArray,
+    mean: FloatArray, covariance: FloatArray,
+) -> tuple[float, int, int, int, int, float, int]:  # fmt: skip
     """Move robots `low` to `high` - 1 in all particles, match, weigh and update landmarks (Algorithm 1, l. 6-8).
 
+    What belongs together comes in one array, whose rows `layout` names: it is the number of arrays that a call costs.
+
     Args:
-        low, high: Whose turns are taken.
-        sighting: Whether measurements shape the sampled pose (FastSLAM 2.0).
-        acts: (K,) what each robot did: `IDLE`, `STOOD`, `MOVED`, or `PLACED`, with the pose already in `poses`.
+        low, high: Whose turns are taken; the step begins with the first robot, and with the last one it is concluded.
+        assumed: (26,) noise of the odometry, camera, and the rest, see `Assumed`.
+        turns: (K, 4) int64. What each robot did: `IDLE`, `STOOD`, `MOVED`, or `PLACED`, with the pose already written;
+            where its measurements end among all n; whether these come with covariances, and with names.
         moves: (K, 3) odometry [m, m, rad] of those that moved.
-        noise: (6,) the odometry model: sigmas along, across, of heading, of turns, floors of position and heading.
         normals: (k, M, 3) standard normal draws, for the k robots that are not idle.
-        poses, means, covariances: (K, 3, P), (K, 3, P), (K, 6, P) samples x_t^[m], and N(x^, P^) before sampling.
+        robots: (5, K, 3, P) samples, starts, and N(x^, P^) before sampling.
         blind: (K,) whether that was propagated since the last sighting.
-        firsts: (K + 1,) where each robot's measurements begin among all n.
+        weights: (4, P), read and written up to M.
+        frame: (3, 3) as in `conclude`.
+        values, ..., heads: The store, see `ParticleMaps`. n + 1 rows and n slots are free.
         measured: (n, 3) [m], camera frame.
-        spreads: (n, 3, 3) [m^2], camera frame, their covariances, of the robots that `given` (K,) tells of.
-        names: (n,) the caller's names, of the robots that `named` (K,) tells of.
-        points, noises: (n, 3), (n, 6), written: `measured` and `spreads` in robot axes.
-        The others are as in `update_fastslam2`; those of measurements are of all robots.
+        spreads: (n, 3, 3) [m^2], camera frame, their covariances, of the robots that have them; or (0, 3, 3).
+        descriptors: (n, d).
+        names: (n,) the caller's names, of the robots that have them; or (0,).
+        sightings: (n, 9), written: `measured` and `spreads` in robot axes, relative to the camera centre.
+        space: Of the kernels: `WORK_ROWS` and the records of some candidates, in rows of lanes.
+        found, distances: (n, P), written as in `update_fastslam2`.
+        told: (3, n), written: as in `summarise`, and the slots of the landmarks that were started.
+        mean, covariance: (K, 3), (K, 3, 3), written in the end, as in `conclude`.
+
+    Returns:
+        What `conclude` returns; zeros before that.
     """
-    still, sigmas, drawn = np.zeros(3), np.zeros(3), -1
+    num_robots, num_particles = len(turns), normals.shape[1]
+    camera, recovery = assumed[CAMERA : CAMERA + 7], assumed[RECOVERY : RECOVERY + 3]
+    is_one_to_one = assumed[IS_ONE_TO_ONE] > 0.0
+    poses, means = robots[POSES], robots[MEANS]
+    covariances = robots[COVARIANCES:].reshape((num_robots, 6, robots.shape[3]))
+    log_likelihood, new_slots = weights[LOG_LIKELIHOOD], told[NEW_SLOTS]
+    row_of, map_of, ids, identities = table[ROW_OF], table[MAP_OF], table[IDS], table[IDENTITIES]
+    free_slots = table[FREE_SLOTS]
+    points, noises = sightings[:, :3], sightings[:, 3:]
+    work, records = space[: WORK_ROWS * LANES], space[WORK_ROWS * LANES :].reshape((-1, CANDIDATE_ROWS * LANES))
+    still, sigmas, drawn, b = np.zeros(3), np.zeros(3), -1, 0
+    if low == 0:
+        log_likelihood[:] = 0.0
     for robot in range(high):
-        drawn += acts[robot] != IDLE
-        if robot < low or acts[robot] == IDLE:
+        act, a, b = turns[robot, ACT], b, turns[robot, END]
+        drawn += act != IDLE
+        if robot < low or act == IDLE:
             continue
-        a, b = firsts[robot], firsts[robot + 1]
-        own_spreads = spreads[a:b] if given[robot] else spreads[:0]
+        given, named = turns[robot, GIVEN] > 0, turns[robot, NAMED] > 0
+        own_spreads = spreads[a:b] if given else spreads[:0]
         to_robot_axes(measured[a:b], own_spreads, points[a:b], noises[a:b])
-        move, placed = still, acts[robot] == PLACED
+        move, placed = still, act == PLACED
         sigmas[:] = 0.0
-        if acts[robot] == MOVED:
+        if act == MOVED:
             move = moves[robot]
-            write_sigmas(noise, move, sigmas)
+            write_sigmas(assumed[NOISE : NOISE + 6], move, sigmas)
         own_poses, own_means, own_covariances = poses[robot], means[robot], covariances[robot]
         was_blind = blind[robot] and not placed
         lost = still if placed else recovery
-        if not sighting:
+        if assumed[IS_SIGHTING] == 0.0:
             update_fastslam1(
                 own_poses, own_means, own_covariances, not placed, move, sigmas, normals[drawn],
                 values, counts, odds, row_of, map_of, maps, users, free_rows, free_slots, tops, ids, identities, stored,
-                heads, points[a:b], noises[a:b], given[robot], camera, descriptors[a:b], names[a:b], named[robot],
-                descriptor_gate, position_gate, log_p0, walk, one_to_one,
+                heads, points[a:b], noises[a:b], given, camera, descriptors[a:b], names[a:b], named,
+                assumed[DESCRIPTOR_GATE], assumed[POSITION_GATE], assumed[LOG_P0], assumed[WALK], is_one_to_one,
                 work, records, found[a:b], distances[a:b], new_slots[a:b], log_likelihood,
             )  # fmt: skip
         elif b > a:
             update_fastslam2(
                 own_poses, own_means, own_covariances, was_blind, move, sigmas, normals[drawn],
                 values, counts, odds, row_of, map_of, maps, users, free_rows, free_slots, tops, ids, identities, stored,
-                heads, points[a:b], noises[a:b], given[robot], camera, descriptors[a:b], names[a:b], named[robot],
-                descriptor_gate, descriptor_variance, position_gate, dead_zone, dead_radius, ambiguity,
-                lost, log_p0, walk, one_to_one,
+                heads, points[a:b], noises[a:b], given, camera, descriptors[a:b], names[a:b], named,
+                assumed[DESCRIPTOR_GATE], assumed[DESCRIPTOR_VARIANCE], assumed[POSITION_GATE], assumed[DEAD_ZONE],
+                assumed[DEAD_RADIUS], assumed[AMBIGUITY], lost, assumed[LOG_P0],
+                assumed[WALK], is_one_to_one,
                 work, records, found[a:b], distances[a:b], new_slots[a:b], log_likelihood,
             )  # fmt: skip
             was_blind = False
@@ -96,3 +150,8 @@ def take_turns(
             move_blind(own_poses, own_means, own_covariances, was_blind, move, sigmas, normals[drawn], work)
             was_blind = True
         blind[robot] = was_blind
+    if high < num_robots:
+        return 0.0, 0, 0, 0, 0, 0.0, 0
+    return conclude(
+        weights, num_particles, means, covariances, frame, mean, covariance, found, distances, told, ids
+    )  # fmt: skip

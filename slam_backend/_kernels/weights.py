@@ -6,7 +6,17 @@ import numpy as np
 
 from slam_backend._jit import jit, lanes
 from slam_backend._kernels.lane_math import sine_cosine, wrapped
-from slam_backend._kernels.layout import LANES, REJECTED
+from slam_backend._kernels.layout import (
+    ASSOCIATED,
+    CREATED,
+    LANES,
+    LOG_LIKELIHOOD,
+    LOG_WEIGHTS,
+    NEW_SLOTS,
+    PATH_LOG_WEIGHTS,
+    REJECTED,
+    WEIGHTS,
+)
 from slam_backend.errors import FloatArray, Int32Array, IntArray
 
 
@@ -17,7 +27,7 @@ def weigh(
     """Add a step's log-likelihood to the log-weights (M,) and normalise (Eqs. 3, 11, 12; Algorithm 1, l. 9).
 
     Args:
-        log_likelihood: (P,), read up to M.
+        log_likelihood: (M,).
         log_weights, path_log_weights: (M,), updated.
         weights: (M,), written: they sum to 1.
 
@@ -92,38 +102,58 @@ def mixture(
 
 
 @jit
+def add_share(scatter: FloatArray, poses: FloatArray, covariances: FloatArray) -> None:
+    """Add to the covariances of poses, in place, what a scattered motion of the whole map adds, to first order.
+
+    Args:
+        scatter: (3, 3) covariance of the motion [m, m, rad] about the origin.
+        poses: (n, 3) [m, m, rad], map frame.
+        covariances: (n, 3, 3), changed: J C J^T with J = [[1, 0, -y], [0, 1, x], [0, 0, 1]] is added to each.
+    """
+    for n in range(len(poses)):
+        x, y, c = poses[n, 0], poses[n, 1], covariances[n]
+        across, along = scatter[0, 2] - y * scatter[2, 2], scatter[1, 2] + x * scatter[2, 2]
+        c[0, 0] += scatter[0, 0] - y * scatter[0, 2] - y * across
+        c[1, 1] += scatter[1, 1] + x * scatter[1, 2] + x * along
+        both = scatter[0, 1] + x * scatter[0, 2] - y * along
+        c[0, 1] += both
+        c[1, 0] += both
+        c[0, 2] += across
+        c[2, 0] += across
+        c[1, 2] += along
+        c[2, 1] += along
+        c[2, 2] += scatter[2, 2]
+
+
+@jit
 def summarise(
-    found: Int32Array, distances: FloatArray, new_slots: IntArray, keep: IntArray, best: int, ids: IntArray,
-    associations: IntArray, created: IntArray,
-) -> tuple[int, int, int, float, int]:  # fmt: skip
+    found: Int32Array, distances: FloatArray, told: IntArray, best: int, ids: IntArray
+) -> tuple[int, int, int, float, int]:
     """Tell what became of measurements.
 
     Args:
-        found: (n, P) slots to which the particles gave the used measurements, -1 = rejected.
+        found: (n, P) slots to which the particles gave the measurements, -1 = rejected.
         distances: (n, P) squared distances of matches.
-        new_slots: (n,) slots of the landmarks that were started, -1 = none.
-        keep: (n,) which of the caller's measurements were used.
+        told: (3, n). Read: the slots of the landmarks that were started, -1 = none. Written: the id to which the most
+            probable particle gave each measurement, -1 = rejected; and the id of the landmark that it created in any
+            particle, -1 = none.
         best: The most probable particle.
         ids: (slots,) stable names.
-        associations: Written: the id to which the most probable particle gave each measurement, -1 = rejected.
-        created: Written: the id of the landmark that each measurement created in any particle, -1 = none.
 
     Returns:
         How many started a landmark in any particle, how many the most probable particle started and matched, and the
         sum and number of its squared distances, without what it predicted behind the camera.
     """
-    associations[:] = REJECTED
-    created[:] = REJECTED
+    associated, created, new_slots = told[ASSOCIATED], told[CREATED], told[NEW_SLOTS]
     num_created, num_new, num_matched, squares, judged = 0, 0, 0, 0.0, 0
-    for b in range(len(keep)):
-        slot = found[b, best]
-        if new_slots[b] >= 0:
-            created[keep[b]] = ids[new_slots[b]]
-            num_created += 1
+    for b in range(len(new_slots)):
+        slot, new = found[b, best], new_slots[b]
+        associated[b] = ids[slot] if slot >= 0 else REJECTED
+        created[b] = ids[new] if new >= 0 else REJECTED
+        num_created += new >= 0
         if slot < 0:
             continue
-        associations[keep[b]] = ids[slot]
-        if slot == new_slots[b]:
+        if slot == new:
             num_new += 1
         else:
             num_matched += 1
@@ -135,26 +165,28 @@ def summarise(
 
 @jit
 def conclude(
-    log_likelihood: FloatArray, log_weights: FloatArray, path_log_weights: FloatArray, weights: FloatArray,
-    means: FloatArray, covariances: FloatArray, mean: FloatArray, covariance: FloatArray,
-    found: Int32Array, distances: FloatArray, new_slots: IntArray, keep: IntArray, ids: IntArray,
-    associations: IntArray, created: IntArray,
-) -> tuple[float, int, int, int, float, int]:  # fmt: skip
-    """Do what `weigh`, `mixture` for each of K robots and, for the measurements of all, `summarise` do.
+    weights: FloatArray, count: int, means: FloatArray, covariances: FloatArray, frame: FloatArray,
+    mean: FloatArray, covariance: FloatArray, found: Int32Array, distances: FloatArray, told: IntArray, ids: IntArray,
+) -> tuple[float, int, int, int, int, float, int]:  # fmt: skip
+    """Do what `weigh`, `mixture` and `add_share` for each of K robots and, for their measurements, `summarise` do.
 
     Args:
-        means, covariances: (K, 3, P), (K, 6, P).
-        mean, covariance: (K, 3), (K, 3, 3), written.
-        The others are as in those.
+        weights: (4, P) log-weights, those along paths, weights, and a step's log-likelihood; the first three change.
+        count: M.
+        means, covariances: (K, 3, P), (K, 6, P) N(x^, P^) before sampling.
+        frame: (3, 3) covariance of a motion of the whole map that particles do not show, or zeros.
+        mean, covariance: (K, 3), (K, 3, 3), written: of each robot's pose over all particles.
+        The others are as in `summarise`.
 
     Returns:
-        The effective sample size, and what `summarise` returns by the most probable particle.
+        The effective sample size, the most probable particle, and what `summarise` returns of that one.
     """
-    ess = weigh(log_likelihood, log_weights, path_log_weights, weights)
+    path_log_weights, own = weights[PATH_LOG_WEIGHTS][:count], weights[WEIGHTS][:count]
+    ess = weigh(weights[LOG_LIKELIHOOD][:count], weights[LOG_WEIGHTS][:count], path_log_weights, own)
     for robot in range(len(means)):
-        mixture(means[robot], covariances[robot], weights, mean[robot], covariance[robot])
+        mixture(means[robot], covariances[robot], own, mean[robot], covariance[robot])
+    if frame[0, 0] != 0.0 or frame[2, 2] != 0.0:
+        add_share(frame, mean, covariance)
     best = int(path_log_weights.argmax())
-    made, new, matched, squares, judged = summarise(
-        found, distances, new_slots, keep, best, ids, associations, created
-    )  # fmt: skip
-    return ess, made, new, matched, squares, judged
+    num_created, num_new, num_matched, squares, judged = summarise(found, distances, told, best, ids)
+    return ess, best, num_created, num_new, num_matched, squares, judged

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slam_backend._jit import jit, lanes
+from slam_backend._jit import lanes
 from slam_backend.errors import FloatArray, IntArray
 from slam_backend.geometry import compose, inverse, wrap_angle
 from slam_backend.smoothing._kernels import LANES
@@ -129,30 +129,6 @@ def moved_tiles(tiles: FloatArray, num_landmarks: int, num_blocks: int, motions:
                 tile[6 * LANES + i] = s * s * xx + 2.0 * c * s * xy + c * c * yy
                 tile[5 * LANES + i] = c * xz - s * yz
                 tile[7 * LANES + i] = s * xz + c * yz
-
-
-@jit
-def add_share(scatter: FloatArray, poses: FloatArray, covariances: FloatArray) -> None:
-    """Add to the covariances of poses, in place, what a scattered motion of the whole map adds, to first order.
-
-    Args:
-        scatter: (3, 3) covariance of the motion [m, m, rad] about the origin.
-        poses: (n, 3) [m, m, rad], map frame.
-        covariances: (n, 3, 3), changed: J C J^T with J = [[1, 0, -y], [0, 1, x], [0, 0, 1]] is added to each.
-    """
-    for n in range(len(poses)):
-        x, y, c = poses[n, 0], poses[n, 1], covariances[n]
-        across, along = scatter[0, 2] - y * scatter[2, 2], scatter[1, 2] + x * scatter[2, 2]
-        c[0, 0] += scatter[0, 0] - y * scatter[0, 2] - y * across
-        c[1, 1] += scatter[1, 1] + x * scatter[1, 2] + x * along
-        both = scatter[0, 1] + x * scatter[0, 2] - y * along
-        c[0, 1] += both
-        c[1, 0] += both
-        c[0, 2] += across
-        c[2, 0] += across
-        c[1, 2] += along
-        c[2, 1] += along
-        c[2, 2] += scatter[2, 2]
 
 
 def of_points(scatter: FloatArray, points: FloatArray) -> FloatArray:

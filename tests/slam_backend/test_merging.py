@@ -313,7 +313,7 @@ def test_the_most_probable_particle_takes_both_pasts_into_account() -> None:
     rng = np.random.default_rng(2)
     a = map_once(NAMES_A, np.zeros(3), 0.05, rng, 50, moves=1)
     b = map_once(NAMES_B, A_FROM_B, 0.05, rng, 50, moves=1)
-    a._path_log_weights, b._path_log_weights = rng.normal(size=(2, 50))
+    a._path_log_weights[:], b._path_log_weights[:] = rng.normal(size=(2, 50))
     joint, _ = merge_filters(a, b, known_alignment(), PAIRS, np.random.default_rng(1))
     pasts = a._path_log_weights[parents_of(joint, 0, a)] + b._path_log_weights[parents_of(joint, 1, b)]
     np.testing.assert_allclose(np.ptp(joint._path_log_weights - pasts), 0.0, atol=1e-6)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from small_problems import small_run
 
+from slam_backend._kernels import add_share
 from slam_backend._rejuvenation_step import RejuvenationStep
 from slam_backend.errors import FloatArray
 from slam_backend.filter import FastSlam
@@ -12,7 +13,7 @@ from slam_backend.geometry import between, compose, inverse, rotation, transform
 from slam_backend.smoothing import rejuvenation
 from slam_backend.smoothing._kernels import LANES
 from slam_backend.smoothing.graph import RIGID, PathGraph
-from slam_backend.smoothing.holding import add_share, holding, move_tiles, of_points
+from slam_backend.smoothing.holding import holding, move_tiles, of_points
 from training.stereo_runs import RunSpec, simulate_run
 
 SCATTER = np.array([[0.04, 0.01, -0.02], [0.01, 0.09, 0.03], [-0.02, 0.03, 0.05]])
