@@ -6,14 +6,16 @@ import numpy as np
 
 from slam_backend._jit import jit
 from slam_backend._kernels import LANES
+from slam_backend._kernels.layout import IDS, MAP_OF, ROW_OF
 from slam_backend._particle_maps import ParticleMaps
 from slam_backend.errors import FloatArray, IntArray
 from slam_backend.landmark_map import MapOutline
 
 
 @jit
-def _held(ids: Any, row_of: Any, map_of: Any, maps: Any, counts: Any, m: int, min_count: int) -> tuple[IntArray, bool]:
+def _held(table: Any, maps: Any, counts: Any, m: int, min_count: int) -> tuple[IntArray, bool]:
     """Return the slots that particle m holds with at least so many measurements, and whether their ids ascend."""
+    row_of, map_of, ids = table[ROW_OF], table[MAP_OF], table[IDS]
     slots = np.empty(len(ids), np.int64)
     n, last, ascending = 0, -1, True
     for slot in range(len(ids)):
@@ -29,12 +31,13 @@ def _held(ids: Any, row_of: Any, map_of: Any, maps: Any, counts: Any, m: int, mi
 
 @jit
 def _gather(
-    slots: Any, ids: Any, row_of: Any, map_of: Any, maps: Any, values: Any, counts: Any, m: int, lanes: int
+    slots: Any, table: Any, maps: Any, values: Any, counts: Any, m: int, lanes: int
 ) -> tuple[FloatArray, FloatArray, IntArray, IntArray]:
     """Return means (n, 3), covariances (n, 3, 3), counts (n,) and ids (n,) of slots of particle m.
 
     The number of lanes is an argument, for a compiled kernel would not notice that it changed in another file.
     """
+    row_of, map_of, ids = table[ROW_OF], table[MAP_OF], table[IDS]
     n, padded = len(slots), counts.shape[1]
     means, covariances = np.empty((n, 3)), np.empty((n, 3, 3))
     times, names = np.empty(n, np.int64), np.empty(n, np.int64)
@@ -55,7 +58,7 @@ def _gather(
 
 @jit
 def _outline(
-    ids: Any, row_of: Any, map_of: Any, maps: Any, values: Any, counts: Any, m: int, min_count: int, lanes: int,
+    table: Any, maps: Any, values: Any, counts: Any, m: int, min_count: int, lanes: int,
     means: Any, variances: Any, times: Any, names: Any, n: int,
 ) -> tuple[int, bool]:  # fmt: skip
     """Write from row n on what particle m holds with at least so many measurements.
@@ -63,6 +66,7 @@ def _outline(
     Returns:
         The row after the last, and whether ids ascend.
     """
+    row_of, map_of, ids = table[ROW_OF], table[MAP_OF], table[IDS]
     last, ascending, padded = -1, True, counts.shape[1]
     for slot in range(len(ids)):
         if ids[slot] >= 0:
@@ -92,9 +96,7 @@ def write_outline(maps: ParticleMaps, m: int, min_count: int, rows: MapOutline, 
     Returns:
         The row after the last.
     """
-    last, ascending = _outline(
-        maps.ids, maps.row_of, maps.map_of, maps.maps, maps.values, maps.counts, m, min_count, LANES, *rows, first
-    )
+    last, ascending = _outline(maps.table, maps.maps, maps.values, maps.counts, m, min_count, LANES, *rows, first)
     if not ascending:
         order = first + np.argsort(rows.ids[first:last])
         for column in rows:
@@ -104,7 +106,7 @@ def write_outline(maps: ParticleMaps, m: int, min_count: int, rows: MapOutline, 
 
 def slots_held(maps: ParticleMaps, m: int, min_count: int) -> IntArray:
     """Return the slots (n,) of `best_map`, which takes the same, by ascending id."""
-    slots, ascending = _held(maps.ids, maps.row_of, maps.map_of, maps.maps, maps.counts, m, min_count)
+    slots, ascending = _held(maps.table, maps.maps, maps.counts, m, min_count)
     return slots if ascending else slots[np.argsort(maps.ids[slots])]
 
 
@@ -121,7 +123,5 @@ def best_map(maps: ParticleMaps, m: int, min_count: int) -> tuple[FloatArray, Fl
         all fresh.
     """
     slots = slots_held(maps, m, min_count)
-    means, covariances, times, names = _gather(
-        slots, maps.ids, maps.row_of, maps.map_of, maps.maps, maps.values, maps.counts, m, LANES
-    )
+    means, covariances, times, names = _gather(slots, maps.table, maps.maps, maps.values, maps.counts, m, LANES)
     return means, covariances, maps.descriptors[slots], times, names

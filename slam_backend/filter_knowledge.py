@@ -88,8 +88,8 @@ class FilterKnowledge(FilterState):
     def _stand(self, names: tuple[int, ...], live: tuple[int, ...], ess: float, points: Standpoints) -> None:
         """Write where the robots stand, which the team calls by these names, of those that are live; `ess` as it is."""
         weights = NO_WEIGHTS if self._from_origin else self.weights
-        of_particles = self._starts, self._means, self._covariances, weights, self.best_particle, self._from_origin
-        _kernels.stand(*of_particles, *self._estimates, *filter_rows(names, live), ess, *points)
+        of_filter = self._of_robots, weights, self._best, self._from_origin, *self._estimates
+        _kernels.stand(*of_filter, *filter_rows(names, live), ess, *points)
 
     def particles_from_start(self, robot: int = 0) -> FloatArray:
         """Return a robot's poses (M, 3) [m, m, rad], each seen from where it started in that particle."""
@@ -133,7 +133,7 @@ class FilterKnowledge(FilterState):
 
     def _outline(self, min_count: int, rows: MapOutline, first: int) -> int:
         """Write `outline` from this row on; return the row after the last."""
-        return write_outline(self._maps, self.best_particle, max(min_count, 1), rows, first)
+        return write_outline(self._maps, self._best, max(min_count, 1), rows, first)
 
     def existence(self) -> tuple[IntArray, FloatArray]:
         """Return the ids (n,) of the landmarks of `map()`, ascending, and the probability (n,) that each exists.

@@ -19,6 +19,7 @@ class Lineup(NamedTuple):
         maps: Per robot the number of the map that it goes by.
         numbers: Of all maps that are in use or may be taken up again.
         oldest: The first step that some filter may have to take in yet; None: there is none.
+        is_split: Whether some robots are out of contact with their group's joint filter.
     """
 
     groups: tuple[tuple[int, ...], ...]
@@ -29,11 +30,7 @@ class Lineup(NamedTuple):
     maps: tuple[int, ...]
     numbers: frozenset[int]
     oldest: int | None
-
-    @property
-    def is_split(self) -> bool:
-        """Whether some robots are out of contact with their group's joint filter."""
-        return len(self.branches) > len(self.groups)
+    is_split: bool
 
     @classmethod
     def of(cls, groups: Sequence[Group]) -> Self:
@@ -51,4 +48,5 @@ class Lineup(NamedTuple):
             maps=tuple(branch.number for _, branch, _ in places),
             numbers=frozenset[int]().union(*(group.numbers() for group in groups)),
             oldest=min(oldest, default=None),
+            is_split=len(owned) > len(groups),
         )

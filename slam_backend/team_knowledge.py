@@ -166,13 +166,11 @@ class TeamKnowledge(TeamState):
         room = sum([branch.filter.map_room for branch in branches])
         if into is None or len(into.rows.ids) < room:
             into = TeamOutlines.unwritten(self._num_robots, room)
-        rows, parts = into
-        first = 0
+        (rows, parts), last = into, 0
         for branch in branches:
-            last = branch.filter._outline(min_count, rows, first)
+            first, last = last, branch.filter._outline(min_count, rows, last)
             for robot in branch.live:
-                parts[robot] = first, last
-            first = last
+                parts[robot, 0], parts[robot, 1] = first, last
         return into
 
     def standpoints(self, into: Standpoints | None = None) -> Standpoints:

@@ -5,6 +5,7 @@ import math
 import numpy as np
 
 from slam_backend._jit import inlined, jit
+from slam_backend._kernels.layout import COVARIANCES, MEANS, STARTS
 from slam_backend._kernels.weights import mixture
 from slam_backend.errors import BoolArray, FloatArray, IntArray
 
@@ -83,8 +84,8 @@ def _see_own(
 
 @jit
 def stand(
-    starts: FloatArray, means: FloatArray, covariances: FloatArray, weights: FloatArray, best: int, at_origin: bool,
-    estimates: FloatArray, spreads: FloatArray, names: IntArray, live: BoolArray, ess: float,
+    robots: FloatArray, weights: FloatArray, best: int, at_origin: bool, estimates: FloatArray, spreads: FloatArray,
+    names: IntArray, live: BoolArray, ess: float,
     poses: FloatArray, sigmas: FloatArray, own_poses: FloatArray, own_spreads: FloatArray, frames: FloatArray,
     shares: FloatArray,
 ) -> None:  # fmt: skip
@@ -94,7 +95,7 @@ def stand(
     does not blur it.
 
     Args:
-        starts, means, covariances: (n, 3, P), (n, 3, P), (n, 6, P) of its robots and all particles, map frame.
+        robots: (5, n, 3, P) what its robots have in all particles, see `layout`, map frame.
         weights: (M,) summing to 1.
         best: The most probable particle.
         at_origin: Whether all robots started at the origin in all particles.
@@ -104,6 +105,8 @@ def stand(
         ess: Effective sample size of the filter, as a share of M.
         poses, sigmas, own_poses, own_spreads, frames, shares: `Standpoints` of all robots of the team; written.
     """
+    starts, means = robots[STARTS], robots[MEANS]
+    covariances = robots[COVARIANCES:].reshape((len(names), 6, robots.shape[3]))
     for i in range(len(names)):
         if not live[i]:
             continue

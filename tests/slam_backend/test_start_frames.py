@@ -96,9 +96,10 @@ def test_own_frames_are_the_plain_definition() -> None:
     weights = rng.dirichlet(np.ones(count))
     of_four = [np.concatenate([rows, rows[:1]]) for rows in (starts, means, covariances)]
     estimates = pose_mixtures(*of_four[1:], weights)
+    robots = np.concatenate([rows.reshape(-1, 4, 3, LANES) for rows in (np.zeros((4, 3, LANES)), *of_four)])
     names, live = np.array([3, 0, 2, 4]), np.array([True, True, True, False])
     points = Standpoints(*(np.full_like(field, 7.0) for field in Standpoints.unwritten(5)))
-    stand(*of_four, weights, best, False, *estimates, names, live, 0.5, *points)
+    stand(robots, weights, best, False, *estimates, names, live, 0.5, *points)
 
     for field in points:
         assert (field[[1, 4]] == 7.0).all()
