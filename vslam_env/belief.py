@@ -16,9 +16,9 @@ from slam_backend.reports import MergeEvent, Renaming, TeamReport
 from slam_backend.standpoints import Standpoints
 from slam_backend.team import TeamSlam
 from vslam_env.navigation import TeamGrids, TeamSlots
-from vslam_env.readings import Readings
+from vslam_env.readings import TeamReadings
 from vslam_env.robot_belief import Belief, BeliefConfig, Body, Candidates, Teammate, View
-from vslam_env.shared_grids import SharedGrids, scans_of
+from vslam_env.shared_grids import SharedGrids
 
 __all__ = ["Belief", "BeliefConfig", "Body", "Candidates", "TeamBelief", "Teammate"]
 
@@ -98,29 +98,29 @@ class TeamBelief:
         """(K, 3) float64 [m, m, rad]. Where each robot believes to be, in its own start frame. A copy."""
         return self._points.own.copy()
 
-    def step(self, readings: Sequence[Readings]) -> TeamReport:
+    def step(self, readings: TeamReadings) -> TeamReport:
         """Take in one tick's readings of all K robots; the first ones are those of the reset.
 
         Raises:
-            ValueError: If a reading is ill-formed or some robots have oracles and others have not.
+            ValueError: If a reading is ill-formed.
         """
-        if len(readings) != len(self._robots):
-            raise bad_argument("readings", f"{self.num_robots} of them", len(readings), "Give one for each robot.")
-        scans = scans_of(readings, len(self._body.ray_angles))
-        odometry, measurements, _, bumps, true_poses, identities, heard, _ = zip(*readings, strict=True)
+        shape = len(self._robots), len(self._body.ray_angles)
+        if readings.scans.shape != shape:
+            got, cure = f"shape {readings.scans.shape}", "Give a range for each ray of each robot."
+            raise bad_argument("readings.scans", f"an array of shape {shape}", got, cure)
         report = self._team.step(
-            odometry,
-            measurements,
-            None if heard[0] is None else np.array(heard),
-            None if identities[0] is None else identities,
-            None if true_poses[0] is None else true_poses,
+            [None] * len(self._robots) if readings.odometry is None else list(readings.odometry),
+            readings.measurements,
+            readings.heard,
+            readings.identities,
+            None if readings.poses is None else list(readings.poses),
         )
         self._tick += 1
         self._look_up_poses()
         self._grids.follow(self._tick, report.entries, report.renamings)
         points = self._points
         self._grids.meet(self._lineup.mates, points.starts)
-        self._grids.paint(self._tick, points.poses, scans, np.array(bumps, np.bool_))
+        self._grids.paint(self._tick, points.poses, readings.scans, readings.bumps)
         for robot in self._whose_candidates_are_due():
             self._slots[robot].update(self._grids[robot].cells, points.own[robot], self._mates_around(robot))
         return report

@@ -94,10 +94,10 @@ class Drivers:
         for robot, (driver, candidate) in enumerate(zip(self._drivers, candidates, strict=True)):
             driver.choose(candidate, poses[robot], beliefs.cells(robot))
         for _ in range(self._ticks):
-            poses, readings = beliefs.poses, episode.readings
+            poses, bumps = beliefs.poses, episode.readings.bumps.tolist()
             episode.advance(
                 [
-                    driver.command(poses[robot], beliefs.cells(robot), readings[robot].bump)
+                    driver.command(poses[robot], beliefs.cells(robot), bumps[robot])
                     for robot, driver in enumerate(self._drivers)
                 ]
             )

@@ -80,7 +80,7 @@ class EnvKnowledge(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # Pe
     @property
     def readings(self) -> tuple[Readings, ...]:
         """What each robot perceived in the last tick."""
-        return self._running_episode("readings").readings
+        return self._running_episode("readings").readings.of_each()
 
     @property
     def world(self) -> World:

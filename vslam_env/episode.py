@@ -17,7 +17,7 @@ from vslam_env.communication import contacts
 from vslam_env.config import TICK, EnvConfig
 from vslam_env.coverage import Coverage
 from vslam_env.oracle import true_alignment
-from vslam_env.readings import Readings
+from vslam_env.readings import Readings, TeamReadings
 from vslam_env.sensors import EyeFrame, Frame
 from vslam_env.setting import Setting
 from vslam_env.standing import DISTANCES, FOUND, NUM_FIGURES, Standing
@@ -52,7 +52,7 @@ class Episode:
         belief: What the robots believe.
         ledger: What their landmarks are in truth.
         tick: Ticks since the reset.
-        readings: Of the last tick, one per robot; none before `begin`.
+        readings: Of the last tick; none before `begin`.
         frames: Of the last tick, with the true landmarks behind the measurements.
         true_path: Poses (K, 3) after each tick, world frame.
         estimated_path: Poses (K, 3) as estimated after each tick, each in the robot's own start frame.
@@ -82,7 +82,7 @@ class Episode:
         self.true_path: list[FloatArray] = []
         self.estimated_path: list[FloatArray] = []
         self.merge_ticks: list[tuple[int, tuple[int, ...], tuple[int, ...]]] = []
-        self.readings: tuple[Readings, ...] = ()
+        self.readings: TeamReadings  # set by `begin`
         self.frames: Sequence[Frame | EyeFrame] = []
 
     def _settle(self, setting: Setting) -> None:
@@ -174,22 +174,18 @@ class Episode:
         scans = self.setting.scan.measure(poses, self._streams["scan"])
         heard = self._contacts(poses)
         measurements, true_ids, *images = zip(*self.frames, strict=True)
-        nothing = [None] * config.num_robots
-        self.readings = tuple(
-            map(
-                Readings,
-                nothing if odometry is None else odometry,
-                measurements,
-                scans,
-                bumped.tolist(),
-                between(self.true_starts, poses) if config.oracle_pose else nothing,
-                true_ids if config.oracle_association else nothing,
-                nothing if heard is None else heard,
-                images[0] if config.observe_images else nothing,
-            )
+        self.readings = TeamReadings(
+            odometry,
+            measurements,
+            scans,
+            bumped,
+            between(self.true_starts, poses) if config.oracle_pose else None,
+            true_ids if config.oracle_association else None,
+            heard,
+            images[0] if config.observe_images else None,
         )
         if self._tap.recorder is not None:
-            self._tap.recorder(self.readings)
+            self._tap.recorder(self.readings.of_each())
         report = self.belief.step(self.readings)
         self.ledger.record(report, true_ids)
         self.merge_ticks += [(self.tick, made.robots_a, made.robots_b) for made in report.renamings]

@@ -3,22 +3,20 @@
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
-
 from vslam_env.belief import TeamBelief
 from vslam_env.observation import flatten, observed
-from vslam_env.readings import Readings
+from vslam_env.readings import TeamReadings
 
 
 def observations_of(
-    agents: Sequence[str], belief: TeamBelief, readings: Sequence[Readings], goal: bool, flat: bool
+    agents: Sequence[str], belief: TeamBelief, readings: TeamReadings, goal: bool, flat: bool
 ) -> dict[str, Any]:
     """Return each agent's observation after a tick.
 
     Args:
         agents: Names of the K robots.
         belief: What they believe.
-        readings: What each has read in the tick, with an image if that is to be shown.
+        readings: What they have read in the tick, with images if these are to be shown.
         goal: Whether actions are masked.
         flat: One vector instead of named arrays.
 
@@ -27,11 +25,11 @@ def observations_of(
         `{"observation", "action_mask"}` where actions are masked.
     """
     observations: dict[str, Any] = {}
-    scans = np.array([reading.scan for reading in readings])
-    shown = observed(belief.view(), scans, goal)
-    for agent, reading, observation in zip(agents, readings, shown, strict=True):
-        if reading.image is not None:
-            observation["image"] = reading.image[:, :, None].copy()
+    shown = observed(belief.view(), readings.scans, goal)
+    if readings.images is not None:
+        for observation, image in zip(shown, readings.images, strict=True):
+            observation["image"] = image[:, :, None].copy()
+    for agent, observation in zip(agents, shown, strict=True):
         if not flat:
             observations[agent] = observation
         elif goal:

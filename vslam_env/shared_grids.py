@@ -6,11 +6,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from slam_backend.errors import BoolArray, FloatArray, IntArray, bad_argument
+from slam_backend.errors import BoolArray, FloatArray, IntArray
 from slam_backend.geometry import compose, inverse
 from slam_backend.reports import MapDropped, MapEntry, MergeUndone, Renaming
 from vslam_env.navigation import SeenGrid, TeamGrids
-from vslam_env.readings import Readings
 from vslam_env.robot_belief import Body
 
 
@@ -201,21 +200,3 @@ class SharedGrids:
             grid.set_state(seen)
         self._settle(state["mates"])
         self._kept, self._strokes = list(state["kept"]), deque(state["strokes"])
-
-
-def scans_of(readings: Sequence[Readings], num_rays: int) -> FloatArray:
-    """Return the scans (K, R) [m] of all readings.
-
-    Raises:
-        ValueError: If one has another number of rays.
-    """
-    try:
-        scans = np.array([reading.scan for reading in readings], np.float64)
-    except ValueError:  # they have several shapes
-        scans = np.empty(0)
-    if scans.shape == (len(readings), num_rays):
-        return scans
-    shapes = [np.shape(reading.scan) for reading in readings]
-    robot = next(robot for robot, shape in enumerate(shapes) if shape != (num_rays,))
-    name, cure = f"readings[{robot}].scan", "Give a range for each ray."
-    raise bad_argument(name, f"an array of shape ({num_rays},)", f"shape {shapes[robot]}", cure)

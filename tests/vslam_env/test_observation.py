@@ -10,7 +10,7 @@ from vslam_env import ExplorationEnv
 from vslam_env.belief import Belief, TeamBelief
 from vslam_env.navigation import CELL, FREE, GRID_SIZE, OCCUPIED, UNKNOWN, cell_of
 from vslam_env.observation import flatten, observe
-from vslam_env.readings import Readings
+from vslam_env.readings import Readings, TeamReadings
 
 KEYS = ["pose", "pose_std", "map_stats", "local_grid", "scan", "candidates", "teammates", "teammates_mask"]
 
@@ -40,7 +40,7 @@ def test_observations_are_rebuilt_from_readings_alone(action_type: str, steps: i
     episode = env.episode
     belief = TeamBelief(env.config.belief, 2, episode.belief_seed, episode.body, decision_ticks=ticks if goal else None)
     for tick, now in enumerate(readings):
-        belief.step(now)
+        belief.step(TeamReadings.gathered(now))
         if tick % ticks:
             continue
         for robot, agent in enumerate(env.possible_agents):
@@ -51,18 +51,34 @@ def test_observations_are_rebuilt_from_readings_alone(action_type: str, steps: i
                 assert value.tobytes() == expected[name].tobytes(), (tick, agent, name)
 
 
-def test_a_scan_of_another_length_is_refused_before_anything_changes() -> None:
+def test_scans_of_another_length_are_refused_before_anything_changes() -> None:
     """Beliefs that refused readings go on with right ones as if they had never been given the wrong ones."""
     env = small_env()
     readings, _ = _record(env, 3)
     episode = env.episode
     whole, refusing = (TeamBelief(env.config.belief, 2, episode.belief_seed, episode.body) for _ in range(2))
-    for now in readings:
-        short = now[1]._replace(scan=now[1].scan[1:])
-        with pytest.raises(ValueError, match=r"readings\[1\].scan: .* shape \(32,\), got shape \(31,\)"):
-            refusing.step((now[0], short))
+    for now in map(TeamReadings.gathered, readings):
+        short = now._replace(scans=now.scans[:, 1:])
+        with pytest.raises(ValueError, match=r"readings.scans: .* shape \(2, 32\), got shape \(2, 31\)"):
+            refusing.step(short)
         whole.step(now), refusing.step(now)
         np.testing.assert_array_equal(refusing.poses, whole.poses)
+
+
+def test_readings_of_a_team_are_those_of_its_robots() -> None:
+    """Readings that are taken apart and gathered again are what they were; what does not fit together is refused."""
+    env = small_env(comm_loss=0.5, oracle_pose=True, oracle_association=True)
+    readings, _ = _record(env, 3)
+    for now in readings:
+        again = TeamReadings.gathered(now).of_each()
+        for one, other in zip(now, again, strict=True):
+            for field, value, same in zip(Readings._fields, one, other, strict=True):
+                np.testing.assert_array_equal(value, same, err_msg=field)
+    first, second = readings[-1]
+    with pytest.raises(ValueError, match=r"readings\[1\].scan: .* shape \(32,\), got shape \(31,\)"):
+        TeamReadings.gathered([first, second._replace(scan=second.scan[1:])])
+    with pytest.raises(ValueError, match=r"readings\[0\].heard: expected an array, got None"):
+        TeamReadings.gathered([first._replace(heard=None), second])
 
 
 @pytest.mark.parametrize("observation_type", ["dict", "flat"])
