@@ -20,7 +20,7 @@ class Strokes(NamedTuple):
         tick: Of the readings.
         owners: (n,) int64. Whose grids.
         robots: (n,) int64. Who scanned.
-        poses: (n, 3) [m, m, rad], start frame of the owner. Where they were believed to be.
+        poses: (K, K, 3) [m, m, rad]. Where robot j was believed to be in i's start frame.
         scans: (K, R) [m].
         bumps: (K,) bool. Who bumped into something.
     """
@@ -35,7 +35,7 @@ class Strokes(NamedTuple):
     def within(self, side: Sequence[int]) -> "Strokes":
         """Return those of some robots' readings that went into these robots' grids."""
         own = np.isin(self.owners, side) & np.isin(self.robots, side)
-        return self._replace(owners=self.owners[own], robots=self.robots[own], poses=self.poses[own])
+        return self._replace(owners=self.owners[own], robots=self.robots[own])
 
 
 class Kept(NamedTuple):
@@ -125,7 +125,7 @@ class SharedGrids:
                 self._grids[robot].set_state(kept.grids[robot])
             for strokes in self._strokes:
                 if strokes.tick >= kept.tick:
-                    self._draw(strokes.within(side))
+                    self._draw(*strokes.within(side)[1:])
         side_of = {robot: side for side in kept.sides for robot in side}
         self._settle(
             [
@@ -175,15 +175,14 @@ class SharedGrids:
         Raises:
             ValueError: If a range is out of its limits.
         """
-        strokes = Strokes(tick, self._owners, self._robots, poses[self._owners, self._robots], scans, bumps)
-        self._draw(strokes)
+        self._draw(self._owners, self._robots, poses, scans, bumps)
         if self._kept:
-            self._strokes.append(strokes)
+            self._strokes.append(Strokes(tick, self._owners, self._robots, poses.copy(), scans, bumps))
 
-    def _draw(self, strokes: Strokes) -> None:
-        """Paint readings into the grids."""
+    def _draw(self, owners: IntArray, robots: IntArray, poses: FloatArray, scans: FloatArray, bumps: BoolArray) -> None:
+        """Paint readings into the grids, as `Strokes` has them."""
         body = self._body
-        self._team.paint_readings(*strokes[1:], body.ray_angles, body.scan_range, body.radius)
+        self._team.paint_readings(owners, robots, poses, scans, bumps, body.ray_angles, body.scan_range, body.radius)
 
     def get_state(self) -> dict[str, Any]:
         """Return all that decides how the grids go on; what is never written to is shared."""

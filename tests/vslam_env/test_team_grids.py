@@ -19,10 +19,11 @@ def test_readings_are_painted_as_their_parts() -> None:
     for _ in range(30):
         count = int(rng.integers(0, 7))
         owners, robots = rng.integers(0, 3, count), rng.integers(0, 3, count)
-        poses = np.column_stack([rng.uniform(-9.0, 9.0, (count, 2)), rng.uniform(-3.0, 3.0, count)])
+        poses = rng.uniform(-1.0, 1.0, (3, 3, 3)) * [9.0, 9.0, 3.0]
         scans, bumps = rng.uniform(0.3, 9.0, (3, 32)), rng.random(3) < 0.4
         team.paint_readings(owners, robots, poses, scans, bumps, ANGLES, MAX_RANGE, RADIUS)
-        for owner, robot, pose in zip(owners, robots, poses, strict=True):
+        for owner, robot in zip(owners, robots, strict=True):
+            pose = poses[owner, robot]
             parts[owner].paint_scan(pose, scans[robot], ANGLES)
             parts[owner].clear_disc(pose, RADIUS)
             if bumps[robot]:
@@ -48,7 +49,8 @@ def test_readings_are_painted_as_their_parts() -> None:
 def test_a_bad_reading_is_refused(name: str, pose: list[float], ranges: np.ndarray, angles: np.ndarray) -> None:
     """Nothing is painted, not even what is good, beside a reading at no place, of negative ranges or a wrong fan."""
     team, pairs = TeamGrids(2), np.arange(2)
-    poses, scans = np.array([[0.0, 0.0, 0.0], pose]), np.array([np.ones(3), ranges])
+    poses, scans = np.full((2, 2, 3), np.nan), np.array([np.ones(3), ranges])
+    poses[0, 0], poses[1, 1] = 0.0, pose
     with pytest.raises(ValueError, match=rf"^{name}: expected"):
         team.paint_readings(pairs, pairs, poses, scans, np.zeros(2, np.bool_), angles, MAX_RANGE, RADIUS)
     assert all((grid.cells == UNKNOWN).all() for grid in team.grids)

@@ -46,7 +46,7 @@ class TeamGrids:
         Args:
             owners: (n,) int64. Into whose grid is painted; in this order.
             robots: (n,) int64. Whose readings.
-            poses: (n, 3) float64 [m, m, rad], start frame of the owner. Where this robot was.
+            poses: (K, K, 3) float64 [m, m, rad]. Where robot j was, in the start frame of i's grid.
             scans: (K, R) float64 [m]. As `SeenGrid.paint_scan` expects each.
             bumps: (K,) bool. Which robots bumped into something.
             angles: (R,) float64 [rad]. Likewise.
@@ -54,9 +54,10 @@ class TeamGrids:
             radius: Of the robots [m].
 
         Raises:
-            ValueError: If a pose is not finite, or ranges or angles are not as described; then nothing is painted.
+            ValueError: If one of these poses is not finite, or ranges or angles are not as described; then nothing is
+                painted.
         """
         grids = self._evidence, self._cells, self.changes
         fault, pair = _painting.paint_readings(*grids, owners, robots, poses, scans, bumps, angles, max_range, radius)
         if fault != _painting.READINGS_FINE:
-            raise bad_reading(fault, poses[pair], scans[robots[pair]], angles)
+            raise bad_reading(fault, poses[owners[pair], robots[pair]], scans[robots[pair]], angles)

@@ -51,16 +51,18 @@ def pairs_of_cells(rays: Any, x: float, y: float, first_row: int, first_col: int
     for i in range(count):
         slopes[0, i], slopes[1, i] = rays[i, 0] / min(rays[i, 1], -FLAT), rays[i, 0] / max(rays[i, 1], FLAT)
     pairs = np.empty((height, width), np.int16)
-    passed = np.empty(width + 1, np.int64)
+    passed, crossings = np.empty(width + 1, np.int64), np.empty(count, np.int32)
     for r in range(height):
         v = (first_row + r + 0.5) * CELL - HALF_WIDTH - y
         above = 1 if v > 0.0 else 0
         start, sense = (width - 1, -1) if above else (0, 1)
         beside = sense * ((x + HALF_WIDTH) / CELL - 0.5 - first_col - start)  # where the robot is on the way
+        for i in range(count):  # apart from what follows, so that this becomes vector instructions
+            crossing = beside - abs(v) / CELL * slopes[above, i]
+            crossings[i] = np.int32(np.ceil(min(max(crossing, 0.0), float(width))))
         passed[:] = 0
         for i in range(count):
-            crossing = beside - abs(v) / CELL * slopes[above, i]
-            passed[math.ceil(min(max(crossing, 0.0), float(width)))] = i + 1
+            passed[crossings[i]] = i + 1
         guess = 0
         for j in range(width):
             guess = max(guess, passed[j])

@@ -70,7 +70,7 @@ def paint_readings(
         changes: (K, 1 + n) int32.
         owners: See `TeamGrids.paint_readings`, also for the rest.
         robots: (n,) int64.
-        poses: (n, 3) float64 [m, m, rad].
+        poses: (K, K, 3) float64 [m, m, rad].
         scans: (K, R) float64 [m].
         bumps: (K,) bool.
         angles: (R,) float64 [rad].
@@ -81,14 +81,15 @@ def paint_readings(
         `READINGS_FINE`, or what is wrong, and with which of the n; nothing was written then.
     """
     for i in range(len(owners)):
-        if not math.isfinite(poses[i, 0] + poses[i, 1] + poses[i, 2]):
+        x, y, theta = poses[owners[i], robots[i]]
+        if not math.isfinite(x + y + theta):
             return BAD_POSE, i
         fault = fault_of_scan(scans[robots[i]], angles)
         if fault != READINGS_FINE:
             return fault, i
     for i in range(len(owners)):
         owner, robot = owners[i], robots[i]
-        x, y, theta = poses[i, 0], poses[i, 1], poses[i, 2]
+        x, y, theta = poses[owner, robot]
         paint_scan(evidence[owner], cells[owner], changes[owner], x, y, theta, scans[robot], angles, max_range)
         paint_disc(evidence[owner], cells[owner], changes[owner], x, y, radius)
         if bumps[robot]:
