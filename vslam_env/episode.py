@@ -1,6 +1,5 @@
 """`Episode`: one world with robots in it, what they perceive and believe, and the simulator's books; tick by tick."""
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -8,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend._jit import jit
 from slam_backend.contacts import reach
 from slam_backend.errors import BoolArray, FloatArray, IntArray
 from slam_backend.geometry import between, compose
@@ -107,12 +105,14 @@ class Episode:
     def advance(self, commands: Any) -> None:
         """Drive all robots with velocity commands (K, 2) [m/s, rad/s] for a tick, and let them perceive and believe."""
         before = self.true_path[-1]
-        self._simulator.step(commands)
+        touched = self._simulator.step(commands)
         self.tick += 1
         after, bumped = self._simulator.poses, self._simulator.bumped
-        _count(before, after, bumped, self._distances, self._collisions)
+        if touched:
+            self._collisions += bumped
         noise, stream = self._config.odometry, self._streams["odometry"]
-        self._perceive(after, bumped, read_odometry(before, after, self.setting.bias, noise, stream))
+        odometry = read_odometry(before, after, self.setting.bias, noise, stream, self._distances)
+        self._perceive(after, bumped, odometry)
 
     def believed_poses(self) -> FloatArray:
         """Return where the robots believe to be (K, 3) [m, m, rad], laid at their true starts, world frame."""
@@ -224,11 +224,3 @@ class Episode:
         """Return which true landmark each row of a group's filter map claims."""
         speaker = self.belief.speaker(group)
         return self.ledger.claims(speaker, self.belief.filter_map(speaker).ids)
-
-
-@jit
-def _count(before: Any, after: Any, bumped: Any, distances: Any, collisions: Any) -> None:
-    """Add the ways between poses (K, 3) to distances (K,) [m], and to collisions (K,) who bumped (K,)."""
-    for k in range(len(after)):
-        distances[k] += math.hypot(after[k, 0] - before[k, 0], after[k, 1] - before[k, 1])
-        collisions[k] += bumped[k]

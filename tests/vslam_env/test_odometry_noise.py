@@ -71,11 +71,12 @@ def test_negative_sigmas_are_refused() -> None:
 
 
 def test_readings_are_the_noisy_motions() -> None:
-    """The compiled reading is the formula on arrays: stretched and turned motion in the previous frame."""
+    """The compiled reading is the formula on arrays: stretched and turned motion in the previous frame; ways add up."""
     rng = np.random.default_rng(5)
     before, after = rng.uniform(-3.0, 3.0, (2, 40, 3))
     bias, noise = rng.normal(0.0, 0.02, (40, 2)), OdometryNoise()
-    read = read_odometry(before, after, bias, noise, np.random.default_rng(8))
+    travelled = np.ones(40)
+    read = read_odometry(before, after, bias, noise, np.random.default_rng(8), travelled)
     draws = np.random.default_rng(8).standard_normal((40, 2))
     moved = after - before
     distance = np.hypot(moved[:, 0], moved[:, 1])
@@ -86,3 +87,4 @@ def test_readings_are_the_noisy_motions() -> None:
     expected = np.stack([np.cos(angle) * x - np.sin(angle) * y, np.sin(angle) * x + np.cos(angle) * y], axis=1)
     np.testing.assert_allclose(read[:, :2], stretch[:, None] * expected, atol=1e-12)
     np.testing.assert_allclose(read[:, 2], wrap_angle(moved[:, 2] + turn), atol=1e-12)
+    np.testing.assert_allclose(travelled, 1.0 + distance, atol=1e-12)

@@ -61,7 +61,8 @@ def test_no_robot_enters_a_wall_or_another(seed: int) -> None:
             commands = np.column_stack([rng.choice([-0.3, 0.0, 0.5, 1.0, 1.0], 4), rng.uniform(-1.5, 1.5, 4)])
             commands[rng.random(4) < 0.5, 1] = 0.0
         before = simulator.poses
-        simulator.step(commands)
+        touched = simulator.step(commands)
+        assert touched or not simulator.bumped.any()
         poses = simulator.poses
         gaps = np.linalg.norm(poses[:, None, :2] - poses[None, :, :2], axis=2)[np.triu_indices(4, 1)]
         assert distances_to_walls(poses[:, :2], world.walls).min() > RADIUS - 0.005

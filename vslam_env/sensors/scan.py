@@ -4,7 +4,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from slam_backend._jit import jit
 from slam_backend.camera import StereoCamera
 from slam_backend.errors import FloatArray, check_array, check_float, check_int
 from vslam_env.world.visibility import cast_scans, rays_at
@@ -63,19 +62,8 @@ class Scan:
         Returns:
             (K, R) float64 [m] in [0, max_range]. A ray that meets nothing reads exactly `max_range`.
         """
-        config = self.config
+        limits = self._robot_radius, self.config.max_range, self.config.sigma
         poses = np.ascontiguousarray(poses, dtype=np.float64)
-        noise = rng.standard_normal((len(poses), len(self._rays)))
-        ranges = np.empty(noise.shape)
-        cast_scans(poses, self._rays, self._tan_half, self._walls, self._robot_radius, config.max_range, ranges)
-        _add_noise(ranges, noise, config.sigma, config.max_range)
+        ranges = rng.standard_normal((len(poses), len(self._rays)))
+        cast_scans(poses, self._rays, self._tan_half, self._walls, *limits, ranges)
         return ranges
-
-
-@jit
-def _add_noise(ranges: FloatArray, noise: FloatArray, sigma: float, max_range: float) -> None:
-    """Replace true ranges (K, R) [m] by what is read of them under standard normal draws (K, R)."""
-    for k in range(ranges.shape[0]):
-        for r in range(ranges.shape[1]):
-            if ranges[k, r] < max_range:
-                ranges[k, r] = min(max(ranges[k, r] * (1.0 + sigma * noise[k, r]), 0.0), max_range)

@@ -185,8 +185,8 @@ class FreeSpace:
         """Draw a heading [rad] with some free way ahead, or, after a few draws, any."""
         headings = rng.uniform(-np.pi, np.pi, 8)
         poses = np.column_stack([np.broadcast_to(position, (len(headings), 2)), headings])
-        free = np.empty((len(headings), 1))
-        cast_scans(poses, *rays_at(np.zeros(1)), self.world.walls, 0.0, VIEW_AHEAD, free)
+        free = np.zeros((len(headings), 1))
+        cast_scans(poses, *rays_at(np.zeros(1)), self.world.walls, 0.0, VIEW_AHEAD, 0.0, free)
         return float(headings[int(np.argmax(free[:, 0] >= VIEW_AHEAD))])
 
     def check_starts(self, start_poses: Any, num_robots: int | None = None) -> FloatArray:

@@ -50,6 +50,7 @@ def read_odometry(
     bias: FloatArray,
     noise: OdometryNoise,
     rng: np.random.Generator,
+    travelled: FloatArray | None = None,
 ) -> FloatArray:
     """Read the motion of one tick with the encoders' errors.
 
@@ -62,12 +63,16 @@ def read_odometry(
         bias: (K, 2) float64, from `draw_bias`.
         noise: Standard deviations.
         rng: Source of the draws: 2 K of them, whatever the motion.
+        travelled: (K,) float64 [m]. The true way of each robot is added to it; None: nobody asks.
 
     Returns:
         (K, 3) float64 [m, m, rad], each robot's previous frame: (dx, dy, dtheta).
     """
-    read, draws = np.empty((len(poses), 3)), rng.standard_normal((len(poses), 2))
-    _read(previous_poses, poses, bias, draws, noise.sigma_distance, noise.sigma_heading_per_metre, read)
+    robots = len(poses)
+    travelled = np.zeros(robots) if travelled is None else travelled
+    read, draws = np.empty((robots, 3)), rng.standard_normal((robots, 2))
+    sigmas = noise.sigma_distance, noise.sigma_heading_per_metre
+    _read(previous_poses, poses, bias, draws, *sigmas, travelled, read)
     return read
 
 
@@ -79,12 +84,14 @@ def _read(
     draws: FloatArray,
     sigma_distance: float,
     sigma_heading_per_metre: float,
+    travelled: FloatArray,
     read: FloatArray,
 ) -> None:
-    """Write down the readings (K, 3) of motions between poses (K, 3) under standard normal draws (K, 2)."""
+    """Write down the readings (K, 3) of motions between poses (K, 3) under standard normal draws (K, 2), add ways."""
     for k in range(len(after)):
         dx, dy, turned = after[k, 0] - before[k, 0], after[k, 1] - before[k, 1], after[k, 2] - before[k, 2]
         distance = math.hypot(dx, dy)
+        travelled[k] += distance
         stretch = 1.0 + bias[k, 0] + sigma_distance * draws[k, 0]
         turn = distance * (bias[k, 1] + sigma_heading_per_metre * draws[k, 1])
         into_robot = 0.5 * turn - before[k, 2]  # half of the misread turn falls before the middle of the way

@@ -102,11 +102,14 @@ class Simulator:
         """Which robots (K,) something kept from going where they were commanded in the last tick. A fresh copy."""
         return self._bumped.copy()
 
-    def step(self, commands: Any) -> None:
+    def step(self, commands: Any) -> bool:
         """Drive all robots for one tick.
 
         Args:
             commands: (K, 2) float64 [m/s, rad/s]. Speed ahead and rate of turn of each robot.
+
+        Returns:
+            Whether some robot was near enough to something that it may have bumped into it.
 
         Raises:
             ValueError: If the shape is wrong or a number is not finite.
@@ -115,8 +118,9 @@ class Simulator:
         as_it_stands = type(commands) is np.ndarray and commands.dtype == np.float64 and commands.flags.c_contiguous
         if not as_it_stands or commands.shape != shape:
             commands = check_array("commands", commands, shape, cure)
-        goals = np.empty_like(self._poses)
-        if _drive_freely(self._poses, commands, self.tick, self._walls, self.radius + SKIN, goals):
+        goals = np.empty((len(self._bodies), 3))
+        clear = _drive_freely(self._poses, commands, self.tick, self._walls, self.radius + SKIN, goals)
+        if clear:
             self._bumped = np.zeros(len(goals), np.bool_)
         else:
             check_array("commands", commands, shape, cure)  # for only finite ones are surely free
@@ -125,6 +129,7 @@ class Simulator:
             achieved = np.sum((goals[:, :2] - self._poses[:, :2]) * way, axis=1)
             self._bumped = achieved < (1.0 - SHORTFALL) * np.sum(way * way, axis=1)
         self._poses = goals
+        return not clear
 
     def _move_in_contact(self, way: FloatArray) -> FloatArray:
         """Move the bodies by `way` (K, 2) [m] as far as contacts allow; return their positions (K, 2) [m].

@@ -117,17 +117,19 @@ def cast_scans(
     walls: FloatArray,
     robot_radius: float,
     max_range: float,
+    sigma: float,
     ranges: FloatArray,
 ) -> None:
-    """Write down how far each robot can look along each of its rays.
+    """Read how far each robot can look along each of its rays.
 
     Args:
         poses: (K, 3) float64 [m, m, rad], world frame.
         rays, tan_half: Of `rays_at`, robot frame. The same for all robots.
         walls: (S, 4) float64 [m], world frame.
         robot_radius: Of the other robots, which stop rays [m].
-        max_range: Where rays end [m].
-        ranges: (K, R) float64 [m], at most `max_range`. Written to.
+        max_range: Where rays end [m]; what ends there is read without error.
+        sigma: Standard deviation of a reading, as a share of the distance.
+        ranges: (K, R) float64. Standard normal draws; the readings [m], from 0 to `max_range`, take their places.
     """
     others = np.empty((len(poses), 2))
     for k in range(len(poses)):
@@ -146,6 +148,8 @@ def cast_scans(
                 nearest = min(nearest, _ray_to_wall(dx, dy, near[i, 0], near[i, 1], near[i, 2], near[i, 3]))
             for j in range(num_others):
                 nearest = min(nearest, _ray_to_disc(dx, dy, others[j, 0], others[j, 1], robot_radius))
+            if nearest < max_range:
+                nearest = min(max(nearest * (1.0 + sigma * ranges[k, r]), 0.0), max_range)
             ranges[k, r] = nearest
 
 
