@@ -1,5 +1,6 @@
 """The readings of one step, checked before anything is changed, so that a refused step leaves no trace."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -31,14 +32,12 @@ def check_step(
         ValueError: If one is ill-formed; the text names it.
     """
     none = [None] * k
-    moves, frames = _one_each("odometry", odometry, k), _one_each("measurements", measurements, k)
+    moves, frames = _check_moves(odometry, k), _one_each("measurements", measurements, k)
     names = none if identities is None else _one_each("identities", identities, k)
     exact = none if poses is None else _one_each("poses", poses, k)
     limit = min(FARTHEST_POINT, FLATTEST * camera.baseline * camera.sigma_px / camera.sigma_disparity_px)
     inputs = []
     for robot, move, frame, own_names, pose in zip(range(k), moves, frames, names, exact, strict=True):
-        if move is not None:
-            move = _check_move(robot, move)
         if frame is not None:
             size = _check_frame(robot, frame, size, limit)
         if own_names is not None:
@@ -60,20 +59,33 @@ def _one_each(name: str, value: Any, k: int) -> Any:
     return value
 
 
+def _check_moves(odometry: Any, k: int) -> Sequence[FloatArray | None]:
+    """Return the odometry of k robots, None where there is none, as checked arrays."""
+    if type(odometry) is np.ndarray and odometry.dtype == np.float64 and odometry.shape == (k, 3):
+        moves: FloatArray = odometry.copy()
+        if _are_near(moves.ravel().tolist()):
+            return list(moves)
+    each = enumerate(_one_each("odometry", odometry, k))
+    return [None if move is None else _check_move(robot, move) for robot, move in each]
+
+
 def _check_move(robot: int, move: Any) -> FloatArray:
     """Return a robot's odometry as a checked array."""
     if type(move) is np.ndarray and move.dtype == np.float64 and move.shape == (3,):
-        x, y, turn = move.tolist()
-        far = FARTHEST_MOVE
-        if -far <= x <= far and -far <= y <= far and -far <= turn <= far:  # NaN is not
-            copied: FloatArray = move.copy()
+        copied: FloatArray = move.copy()
+        if _are_near(copied.tolist()):
             return copied
     cure = "Give the motion (dx, dy, dtheta) in the previous robot frame, or None."
     checked = check_array(f"odometry[{robot}]", move, (3,), cure)
-    if np.abs(checked).max() > FARTHEST_MOVE:
+    if not _are_near(checked.tolist()):
         cure = "Check the units: metres and radians since the robot's last step."
         raise bad_argument(f"odometry[{robot}]", f"numbers within +-{FARTHEST_MOVE:g}", move, cure)
     return checked
+
+
+def _are_near(numbers: list[float]) -> bool:
+    """Tell whether coordinates of moves are within what robots do in a step; NaN is not."""
+    return False not in [-FARTHEST_MOVE <= number <= FARTHEST_MOVE for number in numbers]
 
 
 def _check_pose(robot: int, pose: Any) -> FloatArray:
@@ -107,7 +119,7 @@ def _check_frame(robot: int, frame: Any, size: int, limit: float) -> int:
     Returns:
         The length of the map's descriptors from there on.
     """
-    if not isinstance(frame, Measurements):
+    if type(frame) is not Measurements and not isinstance(frame, Measurements):
         raise bad_argument(f"measurements[{robot}]", "Measurements or None", frame, "Wrap the arrays.")
     own_size = frame.descriptors.shape[1]
     if own_size != size and len(frame):

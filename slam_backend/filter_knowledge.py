@@ -37,7 +37,7 @@ class FilterKnowledge(FilterState):
     @property
     def map_room(self) -> int:
         """Landmarks for which there is room: no particle holds more."""
-        return len(self._maps.ids)
+        return int(self._maps.table.shape[1])
 
     @property
     def descriptor_size(self) -> int:
@@ -128,12 +128,8 @@ class FilterKnowledge(FilterState):
 
     def outline(self, min_count: int = 1) -> MapOutline:
         """Return the outline of `map(min_count=min_count)`, much faster. Fresh arrays."""
-        rows = MapOutline.unwritten(len(self._maps.ids))
-        return rows.part(0, self._outline(min_count, rows, 0))
-
-    def _outline(self, min_count: int, rows: MapOutline, first: int) -> int:
-        """Write `outline` from this row on; return the row after the last."""
-        return write_outline(self._maps, self._best, max(min_count, 1), rows, first)
+        rows = MapOutline.unwritten(self.map_room)
+        return rows.part(0, write_outline(self._maps, self._best, max(min_count, 1), rows, 0))
 
     def existence(self) -> tuple[IntArray, FloatArray]:
         """Return the ids (n,) of the landmarks of `map()`, ascending, and the probability (n,) that each exists.

@@ -17,7 +17,7 @@ from slam_backend._step_input import check_step
 from slam_backend.alignment import Alignment
 from slam_backend.branches import Branch, take_in
 from slam_backend.contacts import check_contacts, reach
-from slam_backend.errors import IntArray, bad_argument
+from slam_backend.errors import FloatArray, IntArray, bad_argument
 from slam_backend.group_changes import contradicted, merge_groups, undone
 from slam_backend.groups import Group
 from slam_backend.input_log import RobotInput
@@ -51,7 +51,7 @@ class TeamSlam(TeamKnowledge):
 
     def step(
         self,
-        odometry: Sequence[ArrayLike | None],
+        odometry: FloatArray | Sequence[ArrayLike | None],
         measurements: Sequence[Measurements | None],
         contacts: ArrayLike | None = None,
         identities: Sequence[ArrayLike | None] | None = None,
@@ -67,7 +67,7 @@ class TeamSlam(TeamKnowledge):
         align and merge.
 
         Args:
-            odometry: Per robot (3,) [m, m, rad], or None; see `FastSlam.step`.
+            odometry: Per robot (3,) [m, m, rad], or None; see `FastSlam.step`. (K, 3) where all have moved.
             measurements: Per robot its frame, or None.
             contacts: (K, K) bool, symmetric: who hears whom now; the diagonal means nothing. None = all.
             identities: Per robot (n_i,) int, see `FastSlam.step`.
@@ -82,12 +82,13 @@ class TeamSlam(TeamKnowledge):
         inputs = check_step(self._num_robots, size, camera, odometry, measurements, identities, poses)
         records, before = self._records, len(self._events)
         records.log.record(self._step, inputs)
-        if contacts is not None or self.lineup.is_split:
-            self._regroup(networks)
+        lineup = self.lineup
+        if contacts is not None or lineup.is_split:
+            lineup = self._regrouped(networks)
         associations: list[IntArray] = [NO_IDS] * self._num_robots
         created = list(associations)
         rejuvenations: list[tuple[tuple[int, ...], RejuvenationReport]] = []
-        for branch in self.lineup.branches:
+        for branch in lineup.branches:
             done = self._advance(branch, inputs)
             if done.rejuvenation is not None:
                 rejuvenations.append((branch.live, done.rejuvenation))
@@ -115,13 +116,14 @@ class TeamSlam(TeamKnowledge):
         self._step += 1
         return report
 
-    def _regroup(self, networks: IntArray) -> None:
-        """Let robots of each group lose and find each other."""
+    def _regrouped(self, networks: IntArray) -> Lineup:
+        """Let robots of each group lose and find each other, and return who goes by which filter then."""
         was_split = self.lineup.is_split
         for group in self._groups:
             group.regroup(networks, self._records)
         if was_split or any(len(group.branches) > 1 for group in self._groups):
             self._lineup = None
+        return self.lineup
 
     def _advance(self, branch: Branch, inputs: Sequence[RobotInput]) -> StepReport:
         """Step a filter with what its robots have just read."""

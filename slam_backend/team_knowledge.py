@@ -4,6 +4,7 @@ from typing import Literal
 
 import numpy as np
 
+from slam_backend._best_map import write_outline
 from slam_backend._team_state import TeamState
 from slam_backend.branches import Branch, restored_filter
 from slam_backend.errors import FloatArray, IntArray, bad_argument
@@ -162,13 +163,16 @@ class TeamKnowledge(TeamState):
             min_count: Landmarks that were measured fewer times are left out.
             into: What this has returned before; it is written to, as long as it has room. None: fresh arrays.
         """
-        branches = self.lineup.branches
-        room = sum([branch.filter.map_room for branch in branches])
+        branches, least = self.lineup.branches, max(min_count, 1)
+        room = 0
+        for branch in branches:
+            room += branch.filter.map_room
         if into is None or len(into.rows.ids) < room:
             into = TeamOutlines.unwritten(self._num_robots, room)
         (rows, parts), last = into, 0
         for branch in branches:
-            first, last = last, branch.filter._outline(min_count, rows, last)
+            slam = branch.filter
+            first, last = last, write_outline(slam._maps, slam._best, least, rows, last)
             for robot in branch.live:
                 parts[robot, 0], parts[robot, 1] = first, last
         return into

@@ -109,7 +109,7 @@ class TeamBelief:
             got, cure = f"shape {readings.scans.shape}", "Give a range for each ray of each robot."
             raise bad_argument("readings.scans", f"an array of shape {shape}", got, cure)
         report = self._team.step(
-            [None] * len(self._robots) if readings.odometry is None else list(readings.odometry),
+            [None] * len(self._robots) if readings.odometry is None else readings.odometry,
             readings.measurements,
             readings.heard,
             readings.identities,

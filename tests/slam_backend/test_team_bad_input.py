@@ -53,6 +53,9 @@ BAD_STEPS: list[tuple[dict[str, Any], str]] = [
     ({"odometry": None}, r"odometry: expected a sequence with one entry per robot \(3\), got .*None"),
     ({"odometry": [None, None, [0.1, 0.0]]}, r"odometry\[2\]: expected an array of shape \(3,\), got shape \(2,\)"),
     ({"odometry": [None, None, [0.1, np.nan, 0.0]]}, r"odometry\[2\]: expected finite numbers, got NaN or infinity at"),
+    ({"odometry": np.diag([0.0, 0.0, np.nan])}, r"odometry\[2\]: expected finite numbers, got"),
+    ({"odometry": np.diag([0.0, 0.0, 2e4])}, r"odometry\[2\]: expected numbers within \+-10000, got"),
+    ({"odometry": np.zeros((3, 2))}, r"odometry\[0\]: expected an array of shape \(3,\), got shape \(2,\)"),
     ({"odometry": [None, None, "ahead"]}, r"odometry\[2\]: expected an array of shape \(3,\), got 'ahead'"),
     ({"measurements": [GOOD, GOOD]}, r"measurements: expected a sequence with one entry per robot \(3\), got .*2"),
     ({"measurements": GOOD}, r"measurements: expected a sequence with one entry per robot \(3\)"),
@@ -87,8 +90,9 @@ def test_a_refused_step_leaves_every_robot_as_it_was(arguments: dict[str, Any], 
     with pytest.raises(ValueError, match=message):
         team.step(**({"odometry": STILL, "measurements": FRAMES} | arguments))
     assert_same(team.get_state(), twin.get_state())
-    move = np.array([0.1, 0.0, 0.05])
-    assert_same(team.step([move] * 3, FRAMES), twin.step([move] * 3, FRAMES))
+    moves = np.array([[0.1, 0.0, 0.05]] * 3)
+    assert_same(team.step(list(moves.copy()), FRAMES), twin.step(moves, FRAMES))
+    moves[:] = 7.0  # of no matter any more
     assert_same(team.get_state(), twin.get_state())
 
 
