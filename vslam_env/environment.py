@@ -123,7 +123,7 @@ class ExplorationEnv(EnvKnowledge):
         self._drivers = Drivers(self.config)
         self._standing = self._episode.standing()
         nothing = dict.fromkeys((term.name for term in self._terms), self._nothing)
-        return self._observations(), self._infos(nothing, [0] * len(self.agents))
+        return self._told(self._episode, nothing, [0] * len(self.agents))
 
     def step(
         self, actions: Mapping[AgentID, Any]
@@ -160,12 +160,13 @@ class ExplorationEnv(EnvKnowledge):
         goal = self.config.stop_at_recall
         terminated = goal is not None and bool(self._standing.map_recalls.min() >= goal)
         truncated = not terminated and self._cycle >= self.max_cycles
+        observations, infos = self._told(episode, terms, invalid)
         results = (
-            self._observations(),
+            observations,
             dict(zip(agents, totals(terms), strict=True)),
             dict.fromkeys(agents, terminated),
             dict.fromkeys(agents, truncated),
-            self._infos(terms, invalid),
+            infos,
         )
         if terminated or truncated:
             self.agents = []
@@ -251,15 +252,13 @@ class ExplorationEnv(EnvKnowledge):
 
     # ------------------------------------------------------------------ within
 
-    def _observations(self) -> dict[AgentID, Any]:
-        """Return each agent's observation after the last tick."""
-        episode = self._running_episode("step")
-        return observations_of(self.possible_agents, episode.belief, episode.readings, *self._shown_as)
-
-    def _infos(self, terms: Mapping[str, Sequence[float]], invalid: list[int]) -> dict[AgentID, dict[str, Any]]:
-        """Return each agent's figures after a step that paid `terms`."""
-        groups = self._running_episode("step").belief.known_groups
-        return infos_of(self.agents, groups, self._standing, terms, invalid)
+    def _told(
+        self, episode: Episode, terms: Mapping[str, Sequence[float]], invalid: list[int]
+    ) -> tuple[dict[AgentID, Any], dict[AgentID, dict[str, Any]]]:
+        """Return each agent's observation after the last tick, and its figures after a step that paid `terms`."""
+        agents, belief = self.possible_agents, episode.belief
+        observations = observations_of(agents, belief, episode.readings, *self._shown_as)
+        return observations, infos_of(agents, belief.known_groups, self._standing, terms, invalid)
 
 
 def _unpickled(made_from: tuple[Any, ...], max_cycles: int, state: EnvState) -> ExplorationEnv:

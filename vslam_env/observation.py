@@ -63,15 +63,15 @@ def observed(view: View, scans: FloatArray, goal_actions: bool) -> list[Observat
     Returns:
         Per robot what `observe` returns, in memory that nothing else uses.
     """
-    count = len(view.robots)
-    numbers, candidates = np.empty((count, 12), np.float32), view.features
-    teammates, present = np.zeros((count, MOST_TEAMMATES, 5), np.float32), np.zeros((count, MOST_TEAMMATES), np.int8)
+    count, candidates = len(view.robots), view.features
+    numbers, ranges = np.empty((count, 12), np.float32), np.empty(scans.shape, np.float32)
+    teammates, present = np.empty((count, MOST_TEAMMATES, 5), np.float32), np.empty((count, MOST_TEAMMATES), np.int8)
     points, (rows, parts) = view.points, view.outlines
     _fill(
         view.robots, points.poses, points.sigmas, points.own, points.covariances, points.ess,
-        rows.variances, rows.counts, parts, numbers, candidates, teammates, present,
+        rows.variances, rows.counts, parts, scans, numbers, ranges, candidates, teammates, present,
     )  # fmt: skip
-    pictures, ranges = local_grids(view), scans.astype(np.float32)
+    pictures = local_grids(view)
     observations: list[Observation] = [
         {
             "pose": numbers[k, :3],
@@ -148,19 +148,22 @@ def _clip(value: float, low: float, high: float) -> Any:
 @jit
 def _fill(
     robots: Any, poses: Any, sigmas: Any, own: Any, covariances: Any, ess: Any, variances: Any, counts: Any, parts: Any,
-    numbers: Any, candidates: Any, teammates: Any, present: Any,
+    scans: Any, numbers: Any, ranges: Any, candidates: Any, teammates: Any, present: Any,
 ) -> None:  # fmt: skip
-    """Write the parts of observations that are neither pictures nor scans.
+    """Write the parts of observations that are no pictures.
 
     Args:
         robots: As in `View`.
         poses, sigmas, own, covariances, ess: Of its points.
         variances, counts, parts: (N,) float64 [m^2], (N,) int64, (n, 2) int64. Of its outlines.
+        scans: (n, R) float64 [m].
         numbers: (n, 12) float32: `pose`, `pose_std`, `map_stats`. Written to, as all that follow.
+        ranges: (n, R) float32: `scan`.
         candidates: (n, 16, 5) float32, as they are without bounds.
-        teammates: (n, 7, 5) float32, zeros before.
-        present: (n, 7) int8, zeros before.
+        teammates: (n, 7, 5) float32.
+        present: (n, 7) int8: `teammates_mask`.
     """
+    ranges[:], teammates[:], present[:] = scans, 0.0, 0
     for k in range(len(robots)):
         row, pose = numbers[k], own[k]
         for i in range(3):

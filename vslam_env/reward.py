@@ -3,8 +3,6 @@
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import reduce
-from operator import add
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -168,5 +166,8 @@ def evaluate(
 
 
 def totals(rewards: Mapping[str, Sequence[float]]) -> list[float]:
-    """Return the sum of all terms of `evaluate` for each robot."""
-    return [reduce(add, paid) for paid in zip(*rewards.values(), strict=True)]
+    """Return the sum of all terms of `evaluate`, one at least, for each robot."""
+    total, *others = rewards.values()
+    for paid in others:
+        total = [so_far + more for so_far, more in zip(total, paid, strict=True)]
+    return list(total)
