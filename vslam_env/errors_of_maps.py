@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from slam_backend._jit import jit
 from slam_backend.errors import FloatArray, IntArray, check_float
 from slam_backend.landmark_map import TeamOutlines
 from slam_backend.reports import LandmarksCreated, MapCopied, MapDropped, Renaming, TeamReport
@@ -13,6 +14,29 @@ from slam_backend.standpoints import Standpoints
 from vslam_env.scoring import FALSE, UNCOUNTED, score_team
 
 UNUSED = -3  # an id that no landmark has had so far
+
+
+@jit
+def _note_claims(book: IntArray, ids: IntArray, true_ids: IntArray, claim_of: IntArray) -> int:
+    """Note what new landmarks claim, if there is room for all of them.
+
+    Args:
+        book: (n,) int64. What the landmark of each id claims; changed.
+        ids: (m,) int64. Of the landmarks that measurements created, -1 = none.
+        true_ids: (m,) int64. The landmark behind each measurement; -1 for a false point.
+        claim_of: (N',) int64. What is noted of each of these.
+
+    Returns:
+        How long the book has to be; where it is shorter nothing is noted.
+    """
+    needed = 0
+    for i in range(len(ids)):
+        needed = max(needed, ids[i] + 1)
+    if needed <= len(book):
+        for i in range(len(ids)):
+            if ids[i] >= 0:
+                book[ids[i]] = claim_of[true_ids[i]] if true_ids[i] >= 0 else FALSE
+    return needed
 
 
 class ClaimLedger:
@@ -44,8 +68,7 @@ class ClaimLedger:
         self._seen[report.step] = true_ids
         for entry in report.entries:
             if isinstance(entry, LandmarksCreated):
-                new = entry.ids >= 0
-                self._enter(entry.number, entry.ids[new], self._claims_from(self._seen[entry.step][entry.robot][new]))
+                self._enter(entry.number, entry.ids, self._seen[entry.step][entry.robot])
             elif isinstance(entry, MapCopied):
                 self._copy(entry.source, entry.copy)
             elif isinstance(entry, MapDropped):
@@ -68,9 +91,9 @@ class ClaimLedger:
         self._copy(map_a, joint)
         self._go_by(tuple([joint if number in (map_a, map_b) else number for number in self._map_of]))
         old, new = renaming.ids_b.T
-        self._make_room(new)
+        self._make_room(int(new.max(initial=-1)) + 1)
         own = self._books[self._row_of[joint], new] == UNUSED  # the others were fused into landmarks of a
-        self._enter(joint, new[own], self._books[self._row_of[map_b], old[own]])
+        self._books[self._row_of[joint], new[own]] = self._books[self._row_of[map_b], old[own]]
 
     def claims(self, robot: int, ids: IntArray) -> IntArray:
         """Return the claims (n,) int64 of landmarks of a robot's map: index of the true one, -1 false, -2 no matter."""
@@ -118,12 +141,6 @@ class ClaimLedger:
         self._map_of = map_of
         self._book_of = np.array([self._row_of[number] for number in map_of])
 
-    def _claims_from(self, true_ids: IntArray) -> IntArray:
-        claims = np.full(len(true_ids), FALSE)
-        real = true_ids >= 0
-        claims[real] = self._claim_of[true_ids[real]]
-        return claims
-
     def _copy(self, source: int, copy: int) -> None:
         """Begin the book of a new map with that of another."""
         taken = set(self._row_of.values())
@@ -133,14 +150,17 @@ class ClaimLedger:
         self._books[row] = self._books[self._row_of[source]]
         self._row_of[copy] = row
 
-    def _make_room(self, ids: IntArray) -> None:
-        """Widen the books where these ids have no place in them."""
-        room, needed = self._books.shape[1], int(ids.max(initial=-1)) + 1
+    def _make_room(self, needed: int) -> None:
+        """Make the books so long, or twice as long as they are, if they are shorter."""
+        room = self._books.shape[1]
         if needed > room:
             more = max(needed - room, room)
             self._books = np.pad(self._books, ((0, 0), (0, more)), constant_values=UNUSED)
 
-    def _enter(self, number: int, ids: IntArray, claims: IntArray) -> None:
-        """Note claims under new ids of a map."""
-        self._make_room(ids)
-        self._books[self._row_of[number], ids] = claims
+    def _enter(self, number: int, ids: IntArray, true_ids: IntArray) -> None:
+        """Note what measurements (m,) of landmarks (m,) created in a map."""
+        row = self._row_of[number]
+        needed = _note_claims(self._books[row], ids, true_ids, self._claim_of)
+        if needed > self._books.shape[1]:
+            self._make_room(needed)
+            _note_claims(self._books[row], ids, true_ids, self._claim_of)
