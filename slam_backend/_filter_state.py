@@ -128,17 +128,18 @@ class FilterState(FilterArrays):
 
     def _write_down(self, frames: Frames, inputs: Sequence[RobotInput], report: StepReport) -> None:
         """Log what the robots did and measured in the step before `_steps`, and what that was taken for."""
-        step, buffers, smoother, masks, first = self._steps - 1, self._buffers, self._rejuvenation, frames.masks, 0
-        for robot, (move, frame, names, exact) in enumerate(inputs):
-            ids, last = report.associations[robot], frames.ends[robot]
+        step, sightings, smoother, first = self._steps - 1, self._buffers.sightings, self._rejuvenation, 0
+        means = self._estimates.means
+        rows = zip(inputs, report.associations, frames.ends, self._logs, strict=True)
+        for robot, ((move, frame, names, exact), ids, last, log) in enumerate(rows):
             if len(ids) or move is not None or exact is not None:
+                used = ids[frames.masks[robot]] if robot in frames.masks else ids
                 covered = frame is not None and frame.covariances is not None and len(ids) > 0
-                self._logs[robot].append(
-                    step, move, exact, buffers.points[first:last], ids[masks[robot]] if robot in masks else ids,
-                    buffers.noises[first:last] if covered else None,
-                )  # fmt: skip
+                log.append(
+                    step, move, exact, sightings[first:last, :3], used, sightings[first:last, 3:] if covered else None
+                )
                 if smoother is not None:
-                    smoother.note(robot, step, self._estimates.means[robot], exact is not None)
+                    smoother.note(robot, step, means[robot], exact is not None)
                     if names is None and frame is not None and report.num_rejected:
                         smoother.note_refused(robot, step, ids, frame.descriptors)
             first = last

@@ -60,8 +60,8 @@ class FrameBuffers:
 
     Attributes:
         turns: (K, 4) int64, moves: (K, 3). What each robot did, as `_kernels.take_turns` takes it.
-        sightings: (n', 9) the measurements in robot axes: `points` (n', 3) relative to the camera centre, and `noises`
-            (n', 6), their covariances, zeros for those that have none.
+        sightings: (n', 9) the measurements in robot axes: points (3) relative to the camera centre, and their
+            covariances (6), zeros for those that have none.
         found: (n', P) int32. Slot to which each particle gave each measurement, -1 = none.
         distances: (n', P) squared Mahalanobis distances of matches, else NaN.
         space: Of the kernels.
@@ -80,16 +80,6 @@ class FrameBuffers:
         self.sightings: FloatArray = np.zeros((most, 9))
         self.found: NDArray[np.int32] = np.zeros((most, self._padded), dtype=np.int32)
         self.distances: FloatArray = np.zeros((most, self._padded))
-
-    @property
-    def points(self) -> FloatArray:
-        """See `sightings`."""
-        return self.sightings[:, :3]
-
-    @property
-    def noises(self) -> FloatArray:
-        """See `sightings`."""
-        return self.sightings[:, 3:]
 
     def take(self, inputs: Sequence[RobotInput]) -> Frames:
         """Begin a step: take what all robots read, and provide for what becomes of it."""

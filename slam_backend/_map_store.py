@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from slam_backend import _kernels
 from slam_backend._kernels import LANES
-from slam_backend._kernels.layout import FREE_SLOTS, IDENTITIES, IDS, MAP_OF, ROW_OF
+from slam_backend._kernels.layout import FREE_SLOTS, IDENTITIES, IDS, LAST_SEEN, MAP_OF, ROW_OF
 from slam_backend.errors import FloatArray, IntArray
 
 LINE = 64  # [bytes]; vectors that straddle cache lines are slow
@@ -40,7 +40,8 @@ class MapStore:
         values: (rows * 9 * P,) float64 [m, m^2], map frame, each row
             [block][x, y, z, Sxx, Sxy, Sxz, Syy, Syz, Szz][lane].
         counts: (rows, P) int32. How often the particle matched the landmark, its start included; 0: it lacks it.
-        table: (5, slots) int64. Per slot `row_of`, `map_of`, `ids` and `identities`; and the stack `free_slots`.
+        table: (6, slots) int64. Per slot `row_of`, `map_of`, `ids`, `identities` and `last_seen`; and the stack
+            `free_slots`.
         maps: (maps, P) int32. users: (maps,) int64, how many slots read by each.
         odds: (slots, P) float64. Log-odds that the landmark exists, read through its map as a row is; (0, P) without.
         descriptors: (slots, d) float32. heads: (h, slots) every (d / h)-th component of them, `FAR` where free.
@@ -60,7 +61,7 @@ class MapStore:
         self.odds: FloatArray = aligned((0, self.padded), np.float64)
         self.maps: NDArray[np.int32] = np.zeros((1, self.padded), dtype=np.int32)
         self.users: IntArray = np.zeros(1, dtype=np.int64)
-        self.table: IntArray = np.zeros((5, 0), dtype=np.int64)
+        self.table: IntArray = np.zeros((6, 0), dtype=np.int64)
         self.descriptors: NDArray[np.float32] = np.zeros((0, 0), dtype=np.float32)
         self.heads: NDArray[np.float32] = np.zeros((0, 0), dtype=np.float32)
         self._free_maps = 0
@@ -86,6 +87,11 @@ class MapStore:
     def identities(self) -> IntArray:
         """(slots,) the caller's own names, -1 = none."""
         return np.asarray(self.table[IDENTITIES])
+
+    @property
+    def last_seen(self) -> IntArray:
+        """(slots,) steps of the smoother in which the most probable particle matched landmarks last, 0 = never."""
+        return np.asarray(self.table[LAST_SEEN])
 
     @property
     def free_slots(self) -> IntArray:

@@ -116,7 +116,7 @@ class ParticleMaps(MapStore):
 
     def load(
         self, values: FloatArray, counts: NDArray[np.integer[Any]], descriptors: NDArray[np.float32], ids: IntArray,
-        identities: IntArray, next_id: int, odds: FloatArray | None = None,
+        identities: IntArray, next_id: int, odds: FloatArray | None = None, last_seen: IntArray | None = None,
     ) -> None:  # fmt: skip
         """Replace all landmarks by these; those that no particle holds are left out.
 
@@ -127,23 +127,28 @@ class ParticleMaps(MapStore):
             ids, identities: (n,) int64. Stable names, and the caller's own, -1 = none.
             next_id: The name that the next landmark will get.
             odds: (n, M) float64, log-odds of existence; None: where existence is kept, landmarks get the prior.
+            last_seen: (n,) int64, see `MapStore`; None: never.
         """
         keep = (counts > 0).any(axis=1)
         padded = np.zeros((int(keep.sum()), 9, self.padded))
         padded[:, :, : self.num_particles] = values[keep]
         tiles = padded.reshape(len(padded), 9, -1, LANES).transpose(0, 2, 1, 3)
         odds = None if odds is None else odds[keep]
-        self.load_tiles(tiles, counts[keep], descriptors[keep], ids[keep], identities[keep], next_id, odds)
+        last_seen = None if last_seen is None else last_seen[keep]
+        self.load_tiles(
+            tiles, counts[keep], descriptors[keep], ids[keep], identities[keep], next_id, odds, last_seen=last_seen
+        )  # fmt: skip
 
     def load_tiles(
         self, tiles: FloatArray, counts: NDArray[np.integer[Any]], descriptors: NDArray[np.float32], ids: IntArray,
         identities: IntArray, next_id: int, odds: FloatArray | None = None, chosen: IntArray | None = None,
+        last_seen: IntArray | None = None,
     ) -> None:  # fmt: skip
         """Replace all landmarks by these, each held by a particle: `load` with values as `blocks` holds them.
 
         Args:
             tiles: (n, P / lanes, 9, lanes) float64.
-            counts, descriptors, ids, identities, next_id, odds: As of `load`.
+            counts, descriptors, ids, identities, next_id, odds, last_seen: As of `load`.
             chosen: (n,) rows of `tiles`; all else is of these, in their order. None: all of them.
         """
         n, m = len(ids), self.num_particles
@@ -160,6 +165,8 @@ class ParticleMaps(MapStore):
         self.counts[rows, :m] = counts
         self.row_of[slots], self.map_of[slots] = rows, 0
         self.ids[slots], self.identities[slots] = ids, identities
+        if last_seen is not None:
+            self.last_seen[slots] = last_seen
         self.descriptors[slots] = descriptors
         if self.log_odds_prior is not None:
             self.odds[slots, :m] = self.log_odds_prior if odds is None else odds
@@ -175,7 +182,7 @@ class ParticleMaps(MapStore):
         result = ParticleMaps(len(ancestors), self.log_odds_prior)
         result.load(
             values[:, :, ancestors], counts[:, ancestors], self.descriptors[slots], self.ids[slots],
-            self.identities[slots], self.next_id, None if odds is None else odds[:, ancestors],
+            self.identities[slots], self.next_id, None if odds is None else odds[:, ancestors], self.last_seen[slots],
         )  # fmt: skip
         return result
 
@@ -198,6 +205,7 @@ class ParticleMaps(MapStore):
             "map_of": number[of],
             "ids": self.ids[used],
             "identities": self.identities[used],
+            "last_seen": self.last_seen[used],
             "descriptors": self.descriptors[used],
             "next_id": self.next_id,
         }
@@ -219,6 +227,7 @@ class ParticleMaps(MapStore):
         for name, fill in (("ids", -1), ("identities", -1)):
             getattr(self, name)[:n] = state[name]
             getattr(self, name)[n:] = fill
+        self.last_seen[:n] = state["last_seen"]
         self.descriptors[:n] = state["descriptors"]
         self._set_heads(n)
         self.maps = np.concatenate([np.zeros((1, self.padded), dtype=np.int32), maps])

@@ -33,7 +33,7 @@ def write_maps(maps: ParticleMaps, best: int, particles: Particles, walk: float)
         odds = np.broadcast_to(mean[:, None], (len(mean), m))
     maps.load_tiles(
         particles.tiles, np.broadcast_to(particles.counts[rows, None], (len(rows), m)), maps.descriptors[slots],
-        maps.ids[slots], maps.identities[slots], maps.next_id, odds, rows,
+        maps.ids[slots], maps.identities[slots], maps.next_id, odds, rows, maps.last_seen[slots],
     )  # fmt: skip
     for row in DIAGONAL:
         maps.blocks[: len(rows), :, row] += walk  # (7) of docs/smoothing.md

@@ -53,8 +53,7 @@ class RejuvenationStep:
         self._failures = 0  # descents in a row
         self._exact = False  # a pose was given as exact: there never will be
         self._last_closing = 0  # step in which landmarks not seen for long were matched
-        self._last_seen: dict[int, int] = {}  # landmark -> step of the filter's own count
-        self._count = 0
+        self._count = 0  # of all steps
         self._guesses: list[dict[int, FloatArray]] = [{} for _ in range(num_robots)]
         self._refused: list[dict[int, Refused]] = [{} for _ in range(num_robots)]
 
@@ -77,18 +76,17 @@ class RejuvenationStep:
             rows = np.array(refused)
             self._refused[robot][step] = Refused(rows, descriptors[rows])
 
-    def count(self, associations: Sequence[IntArray]) -> None:
-        """Count a step, in which each robot saw these landmarks (n_i,)."""
-        self._count = now = self._count + 1
+    def begin_step(self) -> int:
+        """Count a step, and return its number, 1 for the first."""
+        self._count += 1
         self._waited += 1
-        after, long_ago, last_seen = self._options.smoothing.closure_after, 0, self._last_seen
-        for ids in associations:
-            for name in ids.tolist():
-                if name >= 0:
-                    long_ago += now - last_seen.get(name, now) > after
-                    last_seen[name] = now
-                    self._read += 1
-        if after > 0 and long_ago >= CLOSURE:
+        return self._count
+
+    def count(self, matched: int, long_unseen: int) -> None:
+        """Count what was matched or started in this step, and how much of it to landmarks not seen for long."""
+        self._read += matched
+        after = self._options.smoothing.closure_after
+        if after > 0 and long_unseen >= CLOSURE:
             self._closed |= 2 * (self._count - self._last_closing) > after  # else it is the same one that goes on
             self._last_closing = self._count
 
@@ -289,7 +287,6 @@ class RejuvenationStep:
             "graph": None if self._graph is None else self._graph.to_mapping(),
             "draft": None if draft is None else (draft.graph.to_mapping(), draft.damping, draft.steps),
             "schedule": {name: getattr(self, name) for name in SCHEDULE},
-            "last_seen": dict(self._last_seen),
             "guesses": tuple(dict(guesses) for guesses in self._guesses),
             "refused": tuple(dict(refused) for refused in self._refused),
         }
@@ -303,7 +300,6 @@ class RejuvenationStep:
             self._draft = Draft(graph=PathGraph(**graph), damping=damping, steps=steps)
         for name, value in state["schedule"].items():
             setattr(self, name, value)
-        self._last_seen = dict(state["last_seen"])
         self._guesses = [dict(guesses) for guesses in state["guesses"]]
         self._refused = [dict(refused) for refused in state["refused"]]
 

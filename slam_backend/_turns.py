@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import astuple
-from itertools import pairwise
 
 import numpy as np
 
@@ -17,11 +16,11 @@ from slam_backend.geometry import compose
 from slam_backend.reports import PoseEstimates, StepReport
 
 # What `_kernels.take_turns` returns.
-Summary = tuple[float, int, int, int, int, float, int]
+Summary = tuple[float, int, int, int, int, int, float, int]
 
 
 def assumed(options: FilterOptions) -> FloatArray:
-    """Return what a filter assumes, (26,) float64, as `_kernels.layout` names the numbers.
+    """Return what a filter assumes, (27,) float64, as `_kernels.layout` names the numbers.
 
     The noise of the odometry (6,), see `OdometryModel`; of the camera (7,) the focal length [px], the baseline [m], the
     sigmas of image coordinates and of the disparity [px], and the mount [m]; the sigmas (3,) [m, m, rad] of the prior
@@ -36,6 +35,7 @@ def assumed(options: FilterOptions) -> FloatArray:
         options.dead_radius, options.ambiguity,
         np.log(options.new_landmark_density), options.landmark_walk,
         options.proposal == "fastslam2", options.one_to_one,
+        options.smoothing.closure_after,
     ])  # fmt: skip
 
 
@@ -47,13 +47,14 @@ def place(arrays: FilterArrays, robot: int, exact: FloatArray) -> None:
 
 
 def take_turns(
-    low: int, high: int, numbers: FloatArray, arrays: FilterArrays, maps: ParticleMaps, buffers: FrameBuffers,
+    low: int, high: int, now: int, numbers: FloatArray, arrays: FilterArrays, maps: ParticleMaps, buffers: FrameBuffers,
     frames: Frames, normals: FloatArray, told: IntArray, estimates: PoseEstimates,
 ) -> Summary:  # fmt: skip
     """Move robots `low` to `high` - 1 in all particles, match what they saw, weigh and update (Algorithm 1, l. 6-8).
 
     Args:
         low, high: Whose turns are taken; with the last one the particles are weighed, and the step is summed up.
+        now: Number of the step for the smoother, 0 if there is none.
         numbers: What the filter assumes.
         arrays: Its poses and weights, changed; robots that were told their poses are `place`d already.
         maps: Of all particles, changed; there is room for all that may start.
@@ -64,7 +65,7 @@ def take_turns(
         estimates: Of the robots' poses, written with the last turn.
     """
     return _kernels.take_turns(
-        low, high, numbers, buffers.turns, buffers.moves, normals,
+        low, high, now, numbers, buffers.turns, buffers.moves, normals,
         arrays._of_robots, arrays._blind, arrays._of_particles, arrays._frame,
         maps.values, maps.counts, maps.odds, maps.table, maps.maps, maps.users,
         maps.free_rows, maps.tops, maps.descriptors, maps.heads,
@@ -82,21 +83,26 @@ def report_of(frames: Frames, told: IntArray, summary: Summary, threshold: float
         summary: Of `take_turns`.
         threshold: Particles are to be resampled where the effective sample size is not above it.
     """
-    ess, _, num_created, num_new, num_matched, squares, judged = summary
+    ess, _, num_created, num_new, num_matched, _, squares, judged = summary
+    associated, created = told[ASSOCIATED], told[CREATED]
+    alone = len(frames.ends) == 1 and not frames.masks
     nis = squares / judged if judged else math.nan
     num_rejected = frames.given - num_new - num_matched
+    resampled = frames.ends[-1] > 0 and ess <= threshold
     return StepReport(
-        _by_robot(told[ASSOCIATED], frames), _by_robot(told[CREATED], frames),
-        num_created, num_new, num_matched, num_rejected, ess, nis, frames.ends[-1] > 0 and ess <= threshold,
+        (associated,) if alone else _by_robot(associated, frames),
+        (created,) if alone else _by_robot(created, frames),
+        num_created, num_new, num_matched, num_rejected, ess, nis, resampled,
     )  # fmt: skip
 
 
 def _by_robot(values: IntArray, frames: Frames) -> tuple[IntArray, ...]:
     """Return what became of each robot's measurements (n_i,), -1 for those that were not used."""
-    if len(frames.ends) == 1 and not frames.masks:
-        return (values,)
-    own = [values[first:end] for first, end in pairwise((0, *frames.ends))]
-    for robot, mask in frames.masks.items():
-        own[robot], used = np.full(len(mask), REJECTED), own[robot]
-        own[robot][mask] = used
+    own, first = [], 0
+    for robot, end in enumerate(frames.ends):
+        used, mask, first = values[first:end], frames.masks.get(robot), end
+        if mask is not None:
+            used, rest = np.full(len(mask), REJECTED), used
+            used[mask] = rest
+        own.append(used)
     return tuple(own)

@@ -167,7 +167,7 @@ class FastSlam(FilterKnowledge):
         """Do what `step` does with readings that `check_step` returned; none of them is written to."""
         maps, num_robots = self._maps, len(inputs)
         frames = self._buffers.take(inputs)
-        told = np.empty((3, len(frames.points)), dtype=np.int64)
+        told = np.empty((3, frames.ends[-1]), np.int64)
         self._estimates = PoseEstimates(np.empty((num_robots, 3)), np.empty((num_robots, 3, 3)))
         summary, deserted = self._take_turns(inputs, frames, told)
         self._steps, self._best = self._steps + 1, summary[1]
@@ -179,7 +179,7 @@ class FastSlam(FilterKnowledge):
         if report.resampled:
             self._resample()
         if self._rejuvenation is not None:
-            self._rejuvenation.count(report.associations)
+            self._rejuvenation.count(report.num_new + report.num_matched, summary[5])
             if self.may_smooth and (news := self._rejuvenate(self._rejuvenation)) is not None:
                 return report._replace(rejuvenation=news)
         return report
@@ -242,10 +242,11 @@ class FastSlam(FilterKnowledge):
         for robot, reading in enumerate(inputs):
             if reading.pose is not None:
                 place(self, robot, reading.pose)
-        if used := len(frames.points):
+        if used := frames.ends[-1]:
             maps.make_room(used, frames.descriptors.shape[1])
         normals = self._rng.standard_normal((frames.active, maps.num_particles, 3))
-        step = (self._assumed, self, maps, buffers, frames, normals, told, self._estimates)
+        now = 0 if self._rejuvenation is None else self._rejuvenation.begin_step()
+        step = (now, self._assumed, self, maps, buffers, frames, normals, told, self._estimates)
         if self._existence is None:
             return take_turns(0, len(inputs), *step), []
         deserted, best, first = [], self._best, 0

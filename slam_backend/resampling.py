@@ -30,12 +30,12 @@ def _invert(weights: FloatArray, uniforms: FloatArray) -> IntArray:
 
 
 @jit
-def _strata(weights: FloatArray, offsets: FloatArray, count: int) -> IntArray:
-    """Return the ancestors of (i + offset) / count, i = 0 .. count - 1; `offsets` has one for all or one for each."""
+def _write_strata(weights: FloatArray, offsets: FloatArray, ancestors: IntArray) -> None:
+    """Write the ancestors of (i + offset) / count, i = 0 .. count - 1; `offsets` has one for all or one for each."""
+    count = len(ancestors)
     total = 0.0
     for m in range(len(weights)):
         total += weights[m]
-    ancestors = np.empty(count, dtype=np.int64)
     m, edge = 0, weights[0]
     for i in range(count):
         u = (i + offsets[i if len(offsets) > 1 else 0]) / count * total
@@ -43,6 +43,12 @@ def _strata(weights: FloatArray, offsets: FloatArray, count: int) -> IntArray:
             m += 1
             edge += weights[m]
         ancestors[i] = m
+
+
+def _strata(weights: FloatArray, offsets: FloatArray, count: int) -> IntArray:
+    """Return the ancestors that `_write_strata` writes."""
+    ancestors = np.empty(count, dtype=np.int64)
+    _write_strata(weights, offsets, ancestors)
     return ancestors
 
 

@@ -26,8 +26,10 @@ from slam_backend._kernels.layout import (
     IS_ONE_TO_ONE,
     IS_SIGHTING,
     LANES,
+    LAST_SEEN,
     LOG_LIKELIHOOD,
     LOG_P0,
+    LONG,
     MAP_OF,
     MEANS,
     NAMED,
@@ -58,21 +60,22 @@ def write_sigmas(noise: FloatArray, move: FloatArray, sigmas: FloatArray) -> Non
 
 @jit
 def take_turns(
-    low: int, high: int, assumed: FloatArray, turns: IntArray, moves: FloatArray, normals: FloatArray,
+    low: int, high: int, now: int, assumed: FloatArray, turns: IntArray, moves: FloatArray, normals: FloatArray,
     robots: FloatArray, blind: BoolArray, weights: FloatArray, frame: FloatArray,
     values: FloatArray, counts: Int32Array, odds: FloatArray, table: IntArray, maps: Int32Array, users: IntArray,
     free_rows: IntArray, tops: IntArray, stored: Float32Array, heads: Float32Array,
     measured: FloatArray, spreads: FloatArray, descriptors: Float32Array, names: IntArray,
     sightings: FloatArray, space: FloatArray, found: Int32Array, distances: FloatArray, told: IntArray,
     mean: FloatArray, covariance: FloatArray,
-) -> tuple[float, int, int, int, int, float, int]:  # fmt: skip
+) -> tuple[float, int, int, int, int, int, float, int]:  # fmt: skip
     """Move robots `low` to `high` - 1 in all particles, match, weigh and update landmarks (Algorithm 1, l. 6-8).
 
     What belongs together comes in one array, whose rows `layout` names: it is the number of arrays that a call costs.
 
     Args:
         low, high: Whose turns are taken; the step begins with the first robot, and with the last one it is concluded.
-        assumed: (26,) noise of the odometry, camera, and the rest, see `Assumed`.
+        now: Number of the step, above 0 if anyone asks when landmarks were seen last.
+        assumed: (27,) noise of the odometry, camera, and the rest, see `layout`.
         turns: (K, 4) int64. What each robot did: `IDLE`, `STOOD`, `MOVED`, or `PLACED`, with the pose already written;
             where its measurements end among all n; whether these come with covariances, and with names.
         moves: (K, 3) odometry [m, m, rad] of those that moved.
@@ -151,7 +154,8 @@ def take_turns(
             was_blind = True
         blind[robot] = was_blind
     if high < num_robots:
-        return 0.0, 0, 0, 0, 0, 0.0, 0
+        return 0.0, 0, 0, 0, 0, 0, 0.0, 0
     return conclude(
-        weights, num_particles, means, covariances, frame, mean, covariance, found, distances, told, ids
+        weights, num_particles, means, covariances, frame, mean, covariance, found, distances, told, ids,
+        table[LAST_SEEN], now, assumed[LONG],
     )  # fmt: skip

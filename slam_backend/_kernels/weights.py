@@ -127,8 +127,9 @@ def add_share(scatter: FloatArray, poses: FloatArray, covariances: FloatArray) -
 
 @jit
 def summarise(
-    found: Int32Array, distances: FloatArray, told: IntArray, best: int, ids: IntArray
-) -> tuple[int, int, int, float, int]:
+    found: Int32Array, distances: FloatArray, told: IntArray, best: int, ids: IntArray, last_seen: IntArray, now: int,
+    long: float,
+) -> tuple[int, int, int, int, float, int]:  # fmt: skip
     """Tell what became of measurements.
 
     Args:
@@ -139,20 +140,29 @@ def summarise(
             particle, -1 = none.
         best: The most probable particle.
         ids: (slots,) stable names.
+        last_seen: (slots,) number of the step in which the most probable particle last matched a landmark, 0 = it never
+            did. Changed.
+        now: That of this step.
+        long: Steps after which a landmark was not seen for long.
 
     Returns:
-        How many started a landmark in any particle, how many the most probable particle started and matched, and the
-        sum and number of its squared distances, without what it predicted behind the camera.
+        How many started a landmark in any particle; how many the most probable particle started, and matched; how many
+        of the latter to landmarks not seen for long; and the sum and number of its squared distances, without what it
+        predicted behind the camera.
     """
     associated, created, new_slots = told[ASSOCIATED], told[CREATED], told[NEW_SLOTS]
-    num_created, num_new, num_matched, squares, judged = 0, 0, 0, 0.0, 0
+    num_created, num_new, num_matched, num_long_unseen, squares, judged = 0, 0, 0, 0, 0.0, 0
     for b in range(len(new_slots)):
         slot, new = found[b, best], new_slots[b]
         associated[b] = ids[slot] if slot >= 0 else REJECTED
         created[b] = ids[new] if new >= 0 else REJECTED
-        num_created += new >= 0
+        if new >= 0:
+            num_created += 1
+            last_seen[new] = 0
         if slot < 0:
             continue
+        num_long_unseen += 0 < last_seen[slot] < now - long
+        last_seen[slot] = now
         if slot == new:
             num_new += 1
         else:
@@ -160,14 +170,15 @@ def summarise(
             if distances[b, best] < np.inf:
                 squares += distances[b, best]
                 judged += 1
-    return num_created, num_new, num_matched, squares, judged
+    return num_created, num_new, num_matched, num_long_unseen, squares, judged
 
 
 @jit
 def conclude(
     weights: FloatArray, count: int, means: FloatArray, covariances: FloatArray, frame: FloatArray,
     mean: FloatArray, covariance: FloatArray, found: Int32Array, distances: FloatArray, told: IntArray, ids: IntArray,
-) -> tuple[float, int, int, int, int, float, int]:  # fmt: skip
+    last_seen: IntArray, now: int, long: float,
+) -> tuple[float, int, int, int, int, int, float, int]:  # fmt: skip
     """Do what `weigh`, `mixture` and `add_share` for each of K robots and, for their measurements, `summarise` do.
 
     Args:
@@ -188,5 +199,7 @@ def conclude(
     if frame[0, 0] != 0.0 or frame[2, 2] != 0.0:
         add_share(frame, mean, covariance)
     best = int(path_log_weights.argmax())
-    num_created, num_new, num_matched, squares, judged = summarise(found, distances, told, best, ids)
-    return ess, best, num_created, num_new, num_matched, squares, judged
+    created, new, matched, long_unseen, squares, judged = summarise(
+        found, distances, told, best, ids, last_seen, now, long
+    )  # fmt: skip
+    return ess, best, created, new, matched, long_unseen, squares, judged

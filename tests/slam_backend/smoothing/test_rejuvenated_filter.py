@@ -5,7 +5,10 @@ import pytest
 from same_bits import assert_same
 from small_problems import small_run
 
+from slam_backend.adaptation import AdaptiveParticles
+from slam_backend.existence import ExistenceModel
 from slam_backend.filter import FastSlam
+from slam_backend.measurements import Measurements
 from slam_backend.motion import OdometryModel
 from slam_backend.smoothing import rejuvenation, solving
 from slam_backend.smoothing.options import SmoothingOptions
@@ -58,6 +61,42 @@ def test_a_closed_loop_is_smoothed_sooner():
         assert slam.step(**back).rejuvenation is None
     assert slam.step([np.zeros(3)], readings[7]["measurements"], readings[7]["identities"]).rejuvenation is not None
     assert slam.step([np.zeros(3)], readings[7]["measurements"], readings[7]["identities"]).rejuvenation is None
+
+
+def with_false_points(frame, rng):
+    """Return a frame with one more point, of something that is not there, a little ahead."""
+    point, look = [0.3 * rng.normal(), 0.0, 1.5 + rng.random()], rng.normal(size=frame.descriptors.shape[1])
+    look /= np.linalg.norm(look)
+    return Measurements(np.vstack([frame.points, point]), np.vstack([frame.descriptors, look]))
+
+
+@pytest.mark.parametrize("adaptive", [None, AdaptiveParticles(min_particles=20, max_particles=60)])
+def test_when_a_landmark_was_seen_last_is_told_by_the_reports(adaptive):
+    """Each landmark bears the last step in which the most probable particle matched or started it.
+
+    That outlives resamplings, rejuvenations, another number of particles and snapshots; where landmarks turn out not to
+    exist others take their slots, and begin anew.
+    """
+    run, rng = small_run(), np.random.default_rng(7)
+    slam = rejuvenated(run, adaptive=adaptive, existence=ExistenceModel())
+    seen, owners, renewed, sizes, taken_over = {}, {}, 0, set(), 0
+    for step, reading in enumerate(run.readings(), start=1):
+        if step % 5 == 0:
+            twin = FastSlam()
+            twin.set_state(slam.get_state())
+            slam = twin
+        report = slam.step(reading["odometry"], [with_false_points(reading["measurements"][0], rng)])
+        seen |= {name: step for name in report.associations[0].tolist() if name >= 0}
+        slots = slam._maps.used_slots()
+        names = slam._maps.ids[slots].tolist()
+        assert slam._maps.last_seen[slots].tolist() == [seen.get(name, 0) for name in names]
+        taken_over += sum(owners.get(slot, name) != name for slot, name in zip(slots, names, strict=True))
+        owners |= dict(zip(slots, names, strict=True))
+        renewed += report.rejuvenation is not None
+        sizes.add(slam.num_particles)
+    assert renewed == 2
+    assert taken_over > 5
+    assert (len(sizes) > 1) == (adaptive is not None)
 
 
 def test_all_particles_then_hold_the_same_landmarks_and_names_stay():
