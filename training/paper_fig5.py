@@ -122,15 +122,8 @@ def _as_seen(env: ExplorationEnv) -> Fig5:
     assert marks is not None
     assert isinstance(episode.setting.sensor, LandmarkSensor)
     nowhere = np.array([[1e6, 1e6, 1e6 + 1.0, 1e6]])  # a wall that hides nothing
-    in_view = np.vstack(
-        [
-            visible_landmarks(
-                pose[None], marks.positions, marks.normals, np.full(len(marks), -1), nowhere, env.config.robot_radius,
-                np.array(sight.camera.mount), view_limits(sight.camera, sight.max_incidence),
-            )
-            for pose in poses
-        ]
-    )  # fmt: skip
+    view, radius = view_limits(sight.camera, sight.max_incidence), env.config.robot_radius
+    in_view = np.vstack([visible_landmarks(pose[None], marks, nowhere, radius, view) for pose in poses])
     measured = np.zeros_like(in_view)
     for robot, frame in enumerate(episode.frames):
         measured[robot, frame.true_ids[frame.true_ids >= 0]] = True

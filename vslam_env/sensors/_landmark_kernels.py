@@ -1,60 +1,10 @@
-"""The compiled part of the landmark sensor: which visible landmarks are reported, and what is measured of them."""
+"""The compiled part of the landmark sensor: what is measured of the landmarks that are reported."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend._jit import jit
-from slam_backend.errors import BoolArray, FloatArray, IntArray
-
-
-@jit
-def choose(
-    visible: BoolArray,
-    keys: FloatArray,
-    detection_probability: float,
-    num_false: IntArray,
-    most: int,
-    chosen: IntArray,
-    counts: IntArray,
-) -> tuple[int, int]:
-    """Detect landmarks and choose among the detected ones.
-
-    A landmark with a uniform key in [0, 1) is detected if the key is below the probability. The detected ones with the
-    smallest keys are then a uniform choice in uniformly random order.
-
-    Args:
-        visible: (K, N) bool.
-        keys: (K, N) float64, uniform.
-        detection_probability: Of a visible landmark.
-        num_false: (K,) int64. Places that false points take in the frame of each robot; changed to `most` where larger.
-        most: Places in each frame.
-        chosen: (K most,) int64. Written to: the chosen landmarks of all robots one after the other.
-        counts: (K,) int64. Written to: the number for each robot.
-
-    Returns:
-        How many are chosen, and how many false points there are.
-    """
-    total = extra = 0
-    for k in range(len(visible)):
-        num_false[k] = min(num_false[k], most)
-        extra += num_false[k]
-        begin, places = total, most - num_false[k]
-        for n in range(visible.shape[1]):
-            if not visible[k, n] or keys[k, n] >= detection_probability:
-                continue
-            if total - begin < places:
-                at = total
-                total += 1
-            elif total > begin and keys[k, n] < keys[k, chosen[total - 1]]:
-                at = total - 1
-            else:
-                continue
-            while at > begin and keys[k, chosen[at - 1]] > keys[k, n]:
-                chosen[at] = chosen[at - 1]
-                at -= 1
-            chosen[at] = n
-        counts[k] = total - begin
-    return total, extra
+from slam_backend.errors import FloatArray, IntArray
 
 
 @jit

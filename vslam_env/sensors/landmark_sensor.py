@@ -9,9 +9,10 @@ import numpy as np
 from slam_backend.camera import StereoCamera
 from slam_backend.errors import BoolArray, FloatArray, IntArray, bad_argument, check_array, check_float, check_int
 from slam_backend.measurements import Measurements
-from vslam_env.sensors import _landmark_kernels as kernels
+from vslam_env.sensors._landmark_kernels import measure
+from vslam_env.world.sight_kernels import detect
 from vslam_env.world.spec import Landmarks
-from vslam_env.world.visibility import see, view_limits
+from vslam_env.world.visibility import view_limits, visible_landmarks
 
 NEAREST_FALSE_POINT = 0.5  # [m]
 
@@ -80,7 +81,6 @@ class LandmarkSensor:
         self._points = np.hstack([landmarks.positions, descriptors])
         self._robot_radius = check_float("robot_radius", robot_radius, "Give metres.", at_least=0.0)
         camera = config.camera
-        self._mount = np.array(camera.mount)
         lens = camera.focal_px, camera.baseline, camera.sigma_px, camera.sigma_disparity_px
         self._optics = np.array([*camera.mount, *lens])
         self._view = view_limits(camera, config.max_incidence)
@@ -91,11 +91,7 @@ class LandmarkSensor:
 
     def visible(self, poses: FloatArray) -> BoolArray:
         """Tell which landmarks (K, N) the robots at `poses` (K, 3) [m, m, rad], world frame, can see."""
-        marks = self._landmarks
-        seen = np.empty((len(poses), len(marks)), np.bool_)
-        on_walls = marks.positions, marks.normals, marks.walls, self._walls
-        see(poses, *on_walls, self._robot_radius, self._mount, self._view, seen)
-        return seen
+        return visible_landmarks(poses, self._landmarks, self._walls, self._robot_radius, self._view)
 
     def measure(self, poses: FloatArray, rng: np.random.Generator) -> list[Frame]:
         """Take a frame with each robot's camera.
@@ -110,14 +106,16 @@ class LandmarkSensor:
         Returns:
             One frame for each robot. Nothing in the order of its points tells anything about them.
         """
-        config = self.config
+        config, marks = self.config, self._landmarks
         poses = np.ascontiguousarray(poses, dtype=np.float64)
         robots, most, size = len(poses), config.max_measurements, self._points.shape[1]
-        visible = self.visible(poses)
         num_false = rng.poisson(config.false_points, robots)
-        keys = rng.random(visible.shape)
+        keys = rng.random((robots, len(self._points)))
         ids, counts = np.empty(robots * most, np.int64), np.empty(robots, np.int64)
-        total, extra = kernels.choose(visible, keys, config.detection_probability, num_false, most, ids, counts)
+        total, extra = detect(
+            poses, marks.positions, marks.normals, marks.walls, self._walls, self._robot_radius, self._view,
+            keys, config.detection_probability, num_false, most, ids, counts,
+        )  # fmt: skip
         false_points = self._no_false_points
         if extra:
             false_points = np.hstack([self._false_points(extra, rng), self._false_descriptors(extra, rng)])
@@ -128,7 +126,7 @@ class LandmarkSensor:
         noise = rng.standard_normal((total, size))
         points, looks = np.empty((total, 3)), np.empty((total, size - 3), np.float32)
         truth = ids, counts, poses, self._points, false_points
-        kernels.measure(*truth, noise, self._optics, config.descriptor_noise, points, looks)
+        measure(*truth, noise, self._optics, config.descriptor_noise, points, looks)
         each = counts.tolist()
         ends = list(accumulate(each))
         own_ids = map(ids.__getitem__, map(slice, [0, *ends], ends))
@@ -138,7 +136,8 @@ class LandmarkSensor:
         """Draw points (count, 3) [m], camera frame, in the view: uniform in the image and in depth."""
         camera = self.config.camera
         right, down, depth = rng.uniform(-1.0, 1.0, count), rng.uniform(-1.0, 1.0, count), rng.random(count)
-        rays = np.stack([right * self._view[1], down * self._view[2], np.ones(count)], axis=1)
+        across, upright = self._view[4:6]
+        rays = np.stack([right * across, down * upright, np.ones(count)], axis=1)
         farthest = camera.max_range / np.linalg.norm(rays, axis=1)
         nearest = min(NEAREST_FALSE_POINT, camera.max_range)
         return np.asarray(rays * np.maximum(nearest, depth * farthest)[:, None])

@@ -6,7 +6,7 @@ import numpy as np
 
 from slam_backend.camera import StereoCamera
 from slam_backend.errors import FloatArray, check_array, check_float, check_int
-from vslam_env.world.visibility import cast_scans, rays_at
+from vslam_env.world.sight_kernels import cast_scans, rays_at
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -11,7 +11,7 @@ from slam_backend.errors import Float32Array, FloatArray, IntArray, check_float,
 from slam_backend.frontend.images import Image
 from vslam_env.sensors.stereo_render import expose, render, trace
 from vslam_env.sensors.stereo_textures import WallTextures
-from vslam_env.world.visibility import walls_in_wedge
+from vslam_env.world.sight_kernels import walls_in_wedge
 
 VIEW = 60.0  # [m] farther walls are not drawn
 

@@ -120,10 +120,7 @@ class StereoSensor:
 
     def visible(self, poses: FloatArray) -> BoolArray:
         """Tell which true landmarks (K, N) the robots at `poses` (K, 3) [m, m, rad], world frame, can see."""
-        marks, mount = self.landmarks, np.array(self.config.camera.mount)
-        return visible_landmarks(
-            poses, marks.positions, marks.normals, marks.walls, self._walls, self._robot_radius, mount, self._view
-        )
+        return visible_landmarks(poses, self.landmarks, self._walls, self._robot_radius, self._view)
 
     def measure(self, poses: FloatArray, rng: np.random.Generator) -> list[EyeFrame]:
         """Take and measure a pair of images with each robot's eyes.

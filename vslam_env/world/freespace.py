@@ -9,14 +9,9 @@ from slam_backend.camera import StereoCamera
 from slam_backend.errors import BoolArray, FloatArray, bad_argument, check_array, check_float, check_int
 from slam_backend.geometry import wrap_angle
 from vslam_env.world.clearance import clearance_raster, distances_to_walls
+from vslam_env.world.sight_kernels import cast_scans, rays_at, seen_from_somewhere
 from vslam_env.world.spec import Landmarks, World
-from vslam_env.world.visibility import (
-    cast_scans,
-    rays_at,
-    seen_from_somewhere,
-    view_limits,
-    visible_landmarks,
-)
+from vslam_env.world.visibility import view_limits, visible_landmarks
 
 CELL = 0.1  # [m] side of a raster cell
 AREA_STEP = 2  # free area is counted in squares of 2 x 2 raster cells
@@ -112,7 +107,6 @@ class FreeSpace:
             self.reachable,
             self.origin,
             CELL,
-            camera.mount[2],
             view_limits(camera, max_incidence),
         )
 
@@ -157,16 +151,7 @@ class FreeSpace:
                 pose = np.array([*position, self._draw_heading(position, rng)])
                 if landmarks is not None and no_shared_view is not None:
                     view = view_limits(no_shared_view, max_incidence)
-                    seen = visible_landmarks(
-                        pose[None],
-                        landmarks.positions,
-                        landmarks.normals,
-                        landmarks.walls,
-                        self.world.walls,
-                        self.radius,
-                        np.asarray(no_shared_view.mount),
-                        view,
-                    )[0]
+                    seen = visible_landmarks(pose[None], landmarks, self.world.walls, self.radius, view)[0]
                     if np.any(seen & taken):
                         continue
                     taken |= seen

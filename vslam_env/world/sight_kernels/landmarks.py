@@ -1,0 +1,208 @@
+"""Which landmarks cameras see and detect, and which can be seen at all.
+
+A camera at (x, y) with axis theta looks along its own x axis; `ahead` and `left` are coordinates in that frame.
+"""
+
+import numpy as np
+
+from slam_backend._jit import jit
+from slam_backend.errors import BoolArray, FloatArray, IntArray
+from vslam_env.world.sight_kernels.rays import EPSILON, ray_to_disc, ray_to_wall, walls_in_wedge
+
+TOUCH = 1e-6  # [m] what a ray meets this close to its target does not hide the target
+
+
+@jit
+def _hidden(x: float, y: float, dx: float, dy: float, own_wall: int, walls: FloatArray, indices: IntArray) -> bool:
+    """Tell whether a wall other than `own_wall` crosses the sight line from (x, y) to (x + dx, y + dy)."""
+    length = np.sqrt(dx * dx + dy * dy)
+    for i in range(len(walls)):
+        if indices[i] != own_wall:
+            t = ray_to_wall(dx, dy, walls[i, 0] - x, walls[i, 1] - y, walls[i, 2] - x, walls[i, 3] - y)
+            if t * length < length - TOUCH:
+                return True
+    return False
+
+
+@jit
+def see(
+    poses: FloatArray,
+    positions: FloatArray,
+    normals: FloatArray,
+    own_walls: IntArray,
+    walls: FloatArray,
+    robot_radius: float,
+    view: FloatArray,
+    seen: BoolArray,
+) -> None:
+    """Write down which landmarks each robot's camera sees.
+
+    A landmark is seen if it lies in range and in the image, if its face is seen at less than the largest incidence,
+    and if neither another wall nor another robot stands between. Its own wall does not hide it.
+
+    Args:
+        poses: (K, 3) float64 [m, m, rad], world frame. Robots.
+        positions: (N, 3) float64 [m], world frame.
+        normals: (N, 2) float64 [-], world frame.
+        own_walls: (N,) int64. Index of the wall that carries each landmark.
+        walls: (S, 4) float64 [m], world frame.
+        robot_radius: Of the other robots [m]; robots are as tall as their cameras.
+        view: (7,) float64. See `view_limits`.
+        seen: (K, N) bool. Written to.
+    """
+    forward, aside, height, max_range, tan_half, tan_vertical, cos_incidence = view
+    seen[:] = False
+    camera = np.empty(3)
+    for k in range(len(poses)):
+        c, s = np.cos(poses[k, 2]), np.sin(poses[k, 2])
+        camera[0] = poses[k, 0] + c * forward - s * aside
+        camera[1] = poses[k, 1] + s * forward + c * aside
+        camera[2] = poses[k, 2]
+        near, indices = walls_in_wedge(camera, walls, tan_half + EPSILON, max_range)
+        for n in range(len(positions)):
+            dx, dy, dz = positions[n, 0] - camera[0], positions[n, 1] - camera[1], positions[n, 2] - height
+            ahead, left = c * dx + s * dy, c * dy - s * dx
+            if ahead <= TOUCH or abs(left) > tan_half * ahead or abs(dz) > tan_vertical * ahead:
+                continue
+            distance = np.sqrt(dx * dx + dy * dy + dz * dz)
+            if distance > max_range or -(dx * normals[n, 0] + dy * normals[n, 1]) <= cos_incidence * distance:
+                continue
+            if _hidden(0.0, 0.0, ahead, left, own_walls[n], near, indices):
+                continue
+            length = np.sqrt(ahead * ahead + left * left)
+            free = True
+            for j in range(len(poses)):
+                if j != k and free:
+                    ox, oy = poses[j, 0] - camera[0], poses[j, 1] - camera[1]
+                    x, y = c * ox + s * oy, c * oy - s * ox
+                    free = ray_to_disc(ahead / length, left / length, x, y, robot_radius) >= length
+            seen[k, n] = free
+
+
+@jit
+def choose(
+    visible: BoolArray,
+    keys: FloatArray,
+    detection_probability: float,
+    num_false: IntArray,
+    most: int,
+    chosen: IntArray,
+    counts: IntArray,
+) -> tuple[int, int]:
+    """Detect landmarks and choose among the detected ones.
+
+    A landmark with a uniform key in [0, 1) is detected if the key is below the probability. The detected ones with the
+    smallest keys are then a uniform choice in uniformly random order.
+
+    Args:
+        visible: (K, N) bool.
+        keys: (K, N) float64, uniform.
+        detection_probability: Of a visible landmark.
+        num_false: (K,) int64. Places that false points take in the frame of each robot; changed to `most` where larger.
+        most: Places in each frame.
+        chosen: (K most,) int64. Written to: the chosen landmarks of all robots one after the other.
+        counts: (K,) int64. Written to: the number for each robot.
+
+    Returns:
+        How many are chosen, and how many false points there are.
+    """
+    total = extra = 0
+    for k in range(len(visible)):
+        num_false[k] = min(num_false[k], most)
+        extra += num_false[k]
+        begin, places = total, most - num_false[k]
+        for n in range(visible.shape[1]):
+            if not visible[k, n] or keys[k, n] >= detection_probability:
+                continue
+            if total - begin < places:
+                at = total
+                total += 1
+            elif total > begin and keys[k, n] < keys[k, chosen[total - 1]]:
+                at = total - 1
+            else:
+                continue
+            while at > begin and keys[k, chosen[at - 1]] > keys[k, n]:
+                chosen[at] = chosen[at - 1]
+                at -= 1
+            chosen[at] = n
+        counts[k] = total - begin
+    return total, extra
+
+
+@jit
+def detect(
+    poses: FloatArray,
+    positions: FloatArray,
+    normals: FloatArray,
+    own_walls: IntArray,
+    walls: FloatArray,
+    robot_radius: float,
+    view: FloatArray,
+    keys: FloatArray,
+    detection_probability: float,
+    num_false: IntArray,
+    most: int,
+    chosen: IntArray,
+    counts: IntArray,
+) -> tuple[int, int]:
+    """Choose among the landmarks that each camera sees and detects: `see` and `choose`, whose arguments these are."""
+    seen = np.empty(keys.shape, dtype=np.bool_)
+    see(poses, positions, normals, own_walls, walls, robot_radius, view, seen)
+    return choose(seen, keys, detection_probability, num_false, most, chosen, counts)
+
+
+@jit
+def seen_from_somewhere(
+    positions: FloatArray,
+    normals: FloatArray,
+    own_walls: IntArray,
+    walls: FloatArray,
+    reachable: BoolArray,
+    origin: FloatArray,
+    cell: float,
+    view: FloatArray,
+) -> BoolArray:
+    """Tell which landmarks a camera sees from at least one reachable place, turned towards them.
+
+    Places are tried on circles around each landmark, 0.2 m apart and from near to far, so that the search ends early
+    for nearly all.
+
+    Args:
+        positions: (N, 3) float64 [m], world frame.
+        normals: (N, 2) float64 [-], world frame.
+        own_walls: (N,) int64.
+        walls: (S, 4) float64 [m], world frame.
+        reachable: (H, W) bool, row = y upwards. Cells in which a robot can stand.
+        origin: (2,) float64 [m], world frame. Lower left corner of cell (0, 0).
+        cell: Side of a cell [m].
+        view: As in `see`.
+
+    Returns:
+        (N,) bool.
+    """
+    spacing = 0.2
+    _, _, height, max_range, _, tan_vertical, cos_incidence = view
+    seen = np.zeros(len(positions), dtype=np.bool_)
+    indices = np.arange(len(walls))
+    for n in range(len(positions)):
+        dz = abs(positions[n, 2] - height)
+        facing = np.arctan2(normals[n, 1], normals[n, 0])
+        radius = spacing
+        while radius <= max_range and not seen[n]:
+            distance = np.sqrt(radius * radius + dz * dz)
+            widest = np.arccos(min(1.0, cos_incidence * distance / radius))  # incidence counts the height, too
+            if distance <= max_range and dz <= tan_vertical * radius and widest > 0.0:
+                half = int(np.ceil(widest * radius / spacing))
+                for i in range(-half + 1, half):
+                    bearing = facing + i * widest / half
+                    dx, dy = radius * np.cos(bearing), radius * np.sin(bearing)
+                    column = int(np.floor((positions[n, 0] + dx - origin[0]) / cell))
+                    row = int(np.floor((positions[n, 1] + dy - origin[1]) / cell))
+                    if row < 0 or column < 0 or row >= reachable.shape[0] or column >= reachable.shape[1]:
+                        continue
+                    x, y = positions[n, 0], positions[n, 1]
+                    if reachable[row, column] and not _hidden(x + dx, y + dy, -dx, -dy, own_walls[n], walls, indices):
+                        seen[n] = True
+                        break
+            radius += spacing
+    return seen

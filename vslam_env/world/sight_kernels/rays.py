@@ -1,0 +1,127 @@
+"""What rays hit: walls in a wedge, other robots' discs, and whole scans."""
+
+import numpy as np
+
+from slam_backend._jit import jit
+from slam_backend.errors import FloatArray, IntArray
+
+EPSILON = 1e-9  # walls that share an end point leave no gap between them
+
+
+@jit
+def walls_in_wedge(pose: FloatArray, walls: FloatArray, tan_half: float, reach: float) -> tuple[FloatArray, IntArray]:
+    """Return the walls that may cut a wedge ahead.
+
+    A wall is dropped only if both its ends lie beyond the same side of the wedge or of the circle's bounding box, so
+    none that matters is lost.
+
+    Args:
+        pose: (3,) float64 [m, m, rad], world frame. Where the wedge begins; its axis is the pose's x axis.
+        walls: (S, 4) float64 [m], world frame.
+        tan_half: The wedge opens by +-atan of this around its axis; <= 0 stands for all round.
+        reach: Its length [m].
+
+    Returns:
+        Walls (n, 4) float64 [m], in the frame of `pose`, and their indices (n,) int64.
+    """
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    local = np.empty((len(walls), 4))
+    indices = np.empty(len(walls), dtype=np.int64)
+    n = 0
+    for i in range(len(walls)):
+        dx1, dy1 = walls[i, 0] - pose[0], walls[i, 1] - pose[1]
+        dx2, dy2 = walls[i, 2] - pose[0], walls[i, 3] - pose[1]
+        x1, y1 = c * dx1 + s * dy1, c * dy1 - s * dx1
+        x2, y2 = c * dx2 + s * dy2, c * dy2 - s * dx2
+        if min(x1, x2) > reach or max(x1, x2) < -reach or min(y1, y2) > reach or max(y1, y2) < -reach:
+            continue
+        if tan_half > 0.0:
+            if y1 > tan_half * x1 and y2 > tan_half * x2:
+                continue
+            if -y1 > tan_half * x1 and -y2 > tan_half * x2:
+                continue
+        local[n, 0], local[n, 1], local[n, 2], local[n, 3] = x1, y1, x2, y2
+        indices[n] = i
+        n += 1
+    return local[:n], indices[:n]
+
+
+@jit
+def ray_to_wall(dx: float, dy: float, x1: float, y1: float, x2: float, y2: float) -> float:
+    """Solve t (dx, dy) = p1 + u (p2 - p1) for t >= 0 with u in [0, 1]; infinity when there is no such t."""
+    ex, ey = x2 - x1, y2 - y1
+    cross = dx * ey - dy * ex
+    if cross == 0.0:
+        return np.inf
+    u = (x1 * dy - y1 * dx) / cross
+    if u < -EPSILON or u > 1.0 + EPSILON:
+        return np.inf
+    t = (x1 * ey - y1 * ex) / cross
+    return t if t >= 0.0 else np.inf
+
+
+@jit
+def ray_to_disc(dx: float, dy: float, x: float, y: float, radius: float) -> float:
+    """Return the distance along the unit vector (dx, dy) to a disc at (x, y) ahead; infinity if the ray misses it."""
+    along = x * dx + y * dy
+    inside = radius * radius - (x * x + y * y - along * along)
+    if along <= 0.0 or inside <= 0.0:
+        return np.inf
+    return float(max(0.0, along - np.sqrt(inside)))
+
+
+@jit
+def rays_at(angles: FloatArray) -> tuple[FloatArray, float]:
+    """Return unit vectors (R, 2) at angles (R,) [rad], and the tangent of the wedge that holds them all.
+
+    The wedge is that of `walls_in_wedge`; the tangent is 0, for all round, where it is not much less than a half plane.
+    """
+    rays = np.empty((len(angles), 2))
+    for r in range(len(angles)):
+        rays[r, 0], rays[r, 1] = np.cos(angles[r]), np.sin(angles[r])
+    widest = np.max(np.abs(angles))
+    return rays, np.tan(widest) + EPSILON if widest < 1.5 else 0.0
+
+
+@jit
+def cast_scans(
+    poses: FloatArray,
+    rays: FloatArray,
+    tan_half: float,
+    walls: FloatArray,
+    robot_radius: float,
+    max_range: float,
+    sigma: float,
+    ranges: FloatArray,
+) -> None:
+    """Read how far each robot can look along each of its rays.
+
+    Args:
+        poses: (K, 3) float64 [m, m, rad], world frame.
+        rays, tan_half: Of `rays_at`, robot frame. The same for all robots.
+        walls: (S, 4) float64 [m], world frame.
+        robot_radius: Of the other robots, which stop rays [m].
+        max_range: Where rays end [m]; what ends there is read without error.
+        sigma: Standard deviation of a reading, as a share of the distance.
+        ranges: (K, R) float64. Standard normal draws; the readings [m], from 0 to `max_range`, take their places.
+    """
+    others = np.empty((len(poses), 2))
+    for k in range(len(poses)):
+        near, _ = walls_in_wedge(poses[k], walls, tan_half, max_range)
+        c, s = np.cos(poses[k, 2]), np.sin(poses[k, 2])
+        num_others = 0
+        for j in range(len(poses)):
+            ox, oy = poses[j, 0] - poses[k, 0], poses[j, 1] - poses[k, 1]
+            if j != k and max(abs(ox), abs(oy)) <= max_range + robot_radius:
+                others[num_others, 0], others[num_others, 1] = c * ox + s * oy, c * oy - s * ox
+                num_others += 1
+        for r in range(len(rays)):
+            dx, dy = rays[r]
+            nearest = max_range
+            for i in range(len(near)):
+                nearest = min(nearest, ray_to_wall(dx, dy, near[i, 0], near[i, 1], near[i, 2], near[i, 3]))
+            for j in range(num_others):
+                nearest = min(nearest, ray_to_disc(dx, dy, others[j, 0], others[j, 1], robot_radius))
+            if nearest < max_range:
+                nearest = min(max(nearest * (1.0 + sigma * ranges[k, r]), 0.0), max_range)
+            ranges[k, r] = nearest
