@@ -137,6 +137,25 @@ class MapStore:
         if rows < new + 1:
             self._grow_rows(max(64, len(self.counts) // 2, new + 1))
 
+    def _begin(self, new: int, descriptor_size: int) -> None:
+        """Begin with `new` landmarks in the lowest slots and rows, yet to be written, in the same arrays if they do.
+
+        Args:
+            new: How many.
+            descriptor_size: d.
+        """
+        if min(len(self.ids), len(self.counts)) < new or self.descriptors.shape[1] != descriptor_size:
+            self._clear(self.num_particles)
+            if new or descriptor_size:
+                self.make_room(max(new, 1), descriptor_size)
+        slots, rows = len(self.ids), len(self.counts)
+        self.row_of[:new], self.map_of[:new] = np.arange(new), 0
+        self.ids[new:] = self.identities[new:] = -1
+        self.users[:], self._free_maps = 0, len(self.users) - 1
+        self.free_rows[: rows - new] = np.arange(rows - 1, new - 1, -1)  # the lowest is taken first
+        self.free_slots[: slots - new] = np.arange(slots - 1, new - 1, -1)
+        self.tops[:2] = rows - new, slots - new
+
     def _grow_slots(self, extra: int, descriptor_size: int) -> None:
         """Provide so many more slots, with room for descriptors of that size."""
         old = len(self.ids)

@@ -152,27 +152,18 @@ class ParticleMaps(MapStore):
             chosen: (n,) rows of `tiles`; all else is of these, in their order. None: all of them.
         """
         n, m = len(ids), self.num_particles
-        self._clear(m)
+        self._begin(n, descriptors.shape[1] if n else self.descriptors.shape[1])
         self.tops[2] = next_id
-        if not n:
-            return
-        self.make_room(n, descriptors.shape[1])
-        slots, rows = np.arange(n), np.arange(n)
         if chosen is None:
             self.blocks[:n] = tiles
         else:
             np.take(tiles, chosen, axis=0, out=self.blocks[:n], mode="clip")  # else it would go through a buffer
-        self.counts[rows, :m] = counts
-        self.row_of[slots], self.map_of[slots] = rows, 0
-        self.ids[slots], self.identities[slots] = ids, identities
-        if last_seen is not None:
-            self.last_seen[slots] = last_seen
-        self.descriptors[slots] = descriptors
+        self.counts[:n, :m], self.counts[:n, m:] = counts, 0
+        self.ids[:n], self.identities[:n], self.last_seen[:n] = ids, identities, 0 if last_seen is None else last_seen
+        self.descriptors[:n] = descriptors
         if self.log_odds_prior is not None:
-            self.odds[slots, :m] = self.log_odds_prior if odds is None else odds
+            self.odds[:n, :m] = self.log_odds_prior if odds is None else odds
         self._set_heads(n)
-        self.tops[0] -= n  # the lowest rows and slots lie on top of the stacks
-        self.tops[1] -= n
 
     def taken(self, ancestors: IntArray) -> "ParticleMaps":
         """Return maps of as many particles as there are ancestors (M',), each a copy of its ancestor's."""
@@ -213,26 +204,17 @@ class ParticleMaps(MapStore):
     def set_state(self, state: dict[str, Any]) -> None:
         """Go on as the maps that gave `state`; rows already allocated are used again."""
         n, m, maps = len(state["ids"]), int(state["num_particles"]), state["maps"]
-        size = state["descriptors"].shape[1]
-        if m != self.num_particles or len(self.counts) < n or len(self.ids) < n or self.descriptors.shape[1] != size:
+        if m != self.num_particles:
             self._clear(m)
-            if n:
-                self.make_room(n, size)
-        slots, rows = len(self.ids), len(self.counts)
+        self._begin(n, state["descriptors"].shape[1])
         self.values.reshape(-1, 9 * self.padded)[:n] = state["values"]
         self.counts[:n] = state["counts"]
         if self.log_odds_prior is not None:
             self.odds[:n] = state["odds"]
-        self.row_of[:n], self.map_of[:n] = np.arange(n), state["map_of"]
-        for name, fill in (("ids", -1), ("identities", -1)):
+        for name in ("map_of", "ids", "identities", "last_seen", "descriptors"):
             getattr(self, name)[:n] = state[name]
-            getattr(self, name)[n:] = fill
-        self.last_seen[:n] = state["last_seen"]
-        self.descriptors[:n] = state["descriptors"]
         self._set_heads(n)
         self.maps = np.concatenate([np.zeros((1, self.padded), dtype=np.int32), maps])
         self.users = np.bincount(state["map_of"], minlength=len(maps) + 1).astype(np.int64)
         self.users[0], self._free_maps = 0, 0
-        self.free_rows[: rows - n] = np.arange(rows - 1, n - 1, -1)
-        self.free_slots[: slots - n] = np.arange(slots - 1, n - 1, -1)
-        self.tops[:] = rows - n, slots - n, state["next_id"]
+        self.tops[2] = state["next_id"]

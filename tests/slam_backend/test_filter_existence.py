@@ -132,6 +132,19 @@ def test_a_landmark_given_up_within_a_step_keeps_its_name_in_the_report() -> Non
     np.testing.assert_array_equal(slam.map().ids, [1])
 
 
+def test_a_filter_that_has_given_up_all_landmarks_goes_on_from_its_state() -> None:
+    """Nothing is left but what descriptors look like and the name of the next landmark."""
+    slam, twin = (standing(ExistenceModel(), resample_threshold=0.0) for _ in range(2))
+    slam.step([None], [Measurements(POINTS[:1], np.eye(5, dtype=np.float32)[:1])])
+    while slam.num_landmarks:
+        slam.step([None], [Measurements.empty(5)])
+    twin.set_state(slam.get_state())
+    assert twin.descriptor_size == 5
+    for filter_ in (slam, twin):
+        report = filter_.step([None], [Measurements(POINTS[1:2], np.eye(5, dtype=np.float32)[1:2])])
+        assert report.created[0].tolist() == [1]
+
+
 @PROPOSALS
 def test_what_is_given_up_leaves_its_memory_to_others(proposal: Any) -> None:
     """Two hundred landmarks, one after the other and each seen once, never need more room than a few."""
