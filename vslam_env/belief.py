@@ -187,8 +187,8 @@ class TeamBelief:
 
     def view(self) -> View:
         """Return what observations show of all robots' beliefs; it shares memory with the grids."""
-        features, valid = self._candidates.described(self._points.poses)
-        return View(self._robots, self._points, self.outlines, self._grids.team.cells, features, valid)
+        features = self._candidates.features(self._points.poses)
+        return View(self._robots, self._points, self.outlines, self._grids.team.cells, features)
 
     def get_state(self) -> dict[str, Any]:
         """Return all that decides how the beliefs go on; it shares nothing with them."""

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from slam_backend._jit import jit
 from slam_backend.errors import FloatArray
 from vslam_env.local_grid import CHANNELS, MARK, SIZE, local_grids
-from vslam_env.navigation.candidate_slots import NUM_SLOTS
+from vslam_env.navigation.candidate_slots import FRONTIER_SIZE, NUM_FEATURES, NUM_SLOTS
 from vslam_env.robot_belief import Belief, View
 
 MOST_TEAMMATES = 7
@@ -86,15 +86,15 @@ def observed(view: View, scans: FloatArray, goal_actions: bool) -> list[Observat
         for k in range(count)
     ]
     if goal_actions:
-        for observation, valid in zip(observations, view.valid, strict=True):
-            observation["action_mask"] = action_mask(valid)
+        for observation in observations:
+            observation["action_mask"] = action_mask(observation["candidates"])
     return observations
 
 
-def action_mask(valid: NDArray[np.int8]) -> NDArray[np.int8]:
-    """Return which `goal` actions are valid (17,) int8: staying always is, the others where `valid` (16,) says so."""
+def action_mask(candidates: NDArray[np.float32]) -> NDArray[np.int8]:
+    """Return which `goal` actions are valid (17,) int8: staying always is, the others where there is a candidate."""
     mask = np.ones(NUM_ACTIONS, np.int8)
-    mask[1:] = valid
+    mask[1:] = candidates[:, FRONTIER_SIZE] > 0.0
     return mask
 
 
@@ -126,7 +126,7 @@ def observation_space(num_rays: int, scan_range: float, goal_actions: bool, flat
         "map_stats": _box(np.zeros(6), MAP_STATS_LIMIT),
         "local_grid": spaces.Box(0, MARK, (len(CHANNELS), SIZE, SIZE), np.uint8),
         "scan": _box(np.zeros(num_rays), np.full(num_rays, scan_range)),
-        "candidates": _box(np.full((NUM_SLOTS, 5), -FAR), np.full((NUM_SLOTS, 5), FAR)),
+        "candidates": _box(np.full((NUM_SLOTS, NUM_FEATURES), -FAR), np.full((NUM_SLOTS, NUM_FEATURES), FAR)),
         "teammates": _box(np.full((MOST_TEAMMATES, 5), -FAR), np.full((MOST_TEAMMATES, 5), FAR)),
         "teammates_mask": spaces.Box(0, 1, (MOST_TEAMMATES,), np.int8),
     }

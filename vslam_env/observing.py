@@ -24,16 +24,13 @@ def observations_of(
         By agent fresh arrays by name, as `vslam_env.observation` says; flat ones as one vector, or as
         `{"observation", "action_mask"}` where actions are masked.
     """
-    observations: dict[str, Any] = {}
     shown = observed(belief.view(), readings.scans, goal)
     if readings.images is not None:
         for observation, image in zip(shown, readings.images, strict=True):
             observation["image"] = image[:, :, None].copy()
-    for agent, observation in zip(agents, shown, strict=True):
-        if not flat:
-            observations[agent] = observation
-        elif goal:
-            observations[agent] = {"observation": flatten(observation), "action_mask": observation["action_mask"]}
-        else:
-            observations[agent] = flatten(observation)
-    return observations
+    if not flat:
+        return dict(zip(agents, shown, strict=True))
+    return {
+        agent: {"observation": flatten(each), "action_mask": each["action_mask"]} if goal else flatten(each)
+        for agent, each in zip(agents, shown, strict=True)
+    }

@@ -175,7 +175,6 @@ class View(NamedTuple):
         outlines: Of the confirmed landmarks in the map frames.
         cells: (n, 300, 300) uint8. Of the seen grids.
         features: (n, 16, 5) float32 [m], robot frames. Of the candidates; the reader's own.
-        valid: (n, 16) int8. Which candidates there are.
     """
 
     robots: IntArray
@@ -183,7 +182,6 @@ class View(NamedTuple):
     outlines: TeamOutlines
     cells: NDArray[np.uint8]
     features: NDArray[np.float32]
-    valid: NDArray[np.int8]
 
     @classmethod
     def of(cls, belief: Belief) -> "View":
@@ -207,7 +205,6 @@ class View(NamedTuple):
             outlines=TeamOutlines.joined([belief.group_map.outline]),
             cells=belief.grid.cells[None],
             features=belief.candidates.features[None].copy(),
-            valid=belief.candidates.valid[None].astype(np.int8),
         )
 
 

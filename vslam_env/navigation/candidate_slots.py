@@ -15,7 +15,8 @@ from vslam_env.navigation._search_kernels import HEADING, LENGTH, NUM_COLUMNS, S
 from vslam_env.navigation.frontiers import rows_of
 from vslam_env.navigation.planning import ways_from
 
-NUM_SLOTS = 16
+NUM_SLOTS, NUM_FEATURES = 16, 5
+FRONTIER_SIZE = 3  # the feature that is above 0 where there is a candidate
 ROBOT_RADIUS = 0.2  # [m]
 
 SAME_GOAL = 1.0  # [m] between updates the goal of a living candidate moves less than this
@@ -84,18 +85,17 @@ def _refill(costs: Any, slots: Any, sources: Any, found: Any, visits: Any) -> tu
 
 
 @jit
-def _describe(slots: Any, poses: Any, features: Any, valid: Any) -> None:
-    """Write `CandidateSlots.features` (K, 16, 5) and `valid` (K, 16) of the rows of all slots (K, 16, ...).
+def _describe(slots: Any, poses: Any, features: Any) -> None:
+    """Write `CandidateSlots.features` (K, 16, 5) of the rows of all slots (K, 16, ...).
 
-    Poses (K, n, 3), n >= K, are as in `TeamSlots.described`.
+    Poses (K, n, 3), n >= K, are as in `TeamSlots.features`.
     """
     for robot in range(len(slots)):
         x, y, theta = poses[robot, robot]
         c, s = math.cos(theta), math.sin(theta)
         for i in range(NUM_SLOTS):
             goal_x, goal_y = slots[robot, i, 0], slots[robot, i, 1]
-            valid[robot, i] = not np.isnan(goal_x)
-            if not valid[robot, i]:
+            if np.isnan(goal_x):
                 features[robot, i] = 0.0
                 continue
             u, v = goal_x - x, goal_y - y
@@ -104,7 +104,7 @@ def _describe(slots: Any, poses: Any, features: Any, valid: Any) -> None:
                 if mate != robot and not np.isnan(poses[robot, mate, 0]):
                     nearest = min(nearest, np.hypot(goal_x - poses[robot, mate, 0], goal_y - poses[robot, mate, 1]))
             features[robot, i, 0], features[robot, i, 1] = c * u + s * v, c * v - s * u
-            features[robot, i, 2], features[robot, i, 3] = slots[robot, i, LENGTH], slots[robot, i, SIZE]
+            features[robot, i, 2], features[robot, i, FRONTIER_SIZE] = slots[robot, i, LENGTH], slots[robot, i, SIZE]
             features[robot, i, 4] = nearest
 
 
@@ -211,7 +211,7 @@ class CandidateSlots:
         places = positions_array(teammates, "teammates")
         poses = np.zeros((1, 1 + len(places), 3))
         poses[0, 0], poses[0, 1:, :2] = pose_floats(pose), places
-        return np.asarray(_described(self._rows[None], poses)[0][0])
+        return np.asarray(_described(self._rows[None], poses)[0])
 
     def get_state(self) -> dict[str, Any]:
         """Return a copy of all that `set_state` needs to continue bit by bit."""
@@ -238,7 +238,7 @@ class TeamSlots:
         self._rows = np.empty((num_robots, NUM_SLOTS, NUM_COLUMNS))
         self.slots = list(map(CandidateSlots._of, self._rows))
 
-    def described(self, poses: FloatArray) -> tuple[NDArray[np.float32], NDArray[np.int8]]:
+    def features(self, poses: FloatArray) -> NDArray[np.float32]:
         """Describe all robots' candidates to policies; nothing is checked.
 
         Args:
@@ -246,13 +246,13 @@ class TeamSlots:
                 does not know.
 
         Returns:
-            `CandidateSlots.features` (K, 16, 5), and as (K, 16) int8 which slots hold a candidate. Fresh arrays.
+            `CandidateSlots.features` (K, 16, 5). A fresh array.
         """
         return _described(self._rows, poses)
 
 
-def _described(rows: FloatArray, poses: FloatArray) -> tuple[NDArray[np.float32], NDArray[np.int8]]:
-    """Return what `TeamSlots.described` does, of slots with these rows (K, 16, ...)."""
-    features, valid = np.empty((len(rows), NUM_SLOTS, 5), np.float32), np.empty((len(rows), NUM_SLOTS), np.int8)
-    _describe(rows, poses, features, valid)
-    return features, valid
+def _described(rows: FloatArray, poses: FloatArray) -> NDArray[np.float32]:
+    """Return what `TeamSlots.features` does, of slots with these rows (K, 16, ...)."""
+    features = np.empty((len(rows), NUM_SLOTS, NUM_FEATURES), np.float32)
+    _describe(rows, poses, features)
+    return features
