@@ -1,5 +1,6 @@
 """The readings of one step, checked before anything is changed, so that a refused step leaves no trace."""
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -37,14 +38,15 @@ def check_step(
     exact = none if poses is None else _one_each("poses", poses, k)
     limit = min(FARTHEST_POINT, FLATTEST * camera.baseline * camera.sigma_px / camera.sigma_disparity_px)
     inputs = []
-    for robot, move, frame, own_names, pose in zip(range(k), moves, frames, names, exact, strict=True):
+    for robot in range(k):
+        frame, own_names, pose = frames[robot], names[robot], exact[robot]
         if frame is not None:
             size = _check_frame(robot, frame, size, limit)
         if own_names is not None:
             own_names = _check_names(robot, own_names, 0 if frame is None else len(frame))
         if pose is not None:
             pose = _check_pose(robot, pose)
-        inputs.append(RobotInput(move, frame, own_names, pose))
+        inputs.append(RobotInput(moves[robot], frame, own_names, pose))
     return inputs
 
 
@@ -59,12 +61,12 @@ def _one_each(name: str, value: Any, k: int) -> Any:
     return value
 
 
-def _check_moves(odometry: Any, k: int) -> Sequence[FloatArray | None]:
-    """Return the odometry of k robots, None where there is none, as checked arrays."""
+def _check_moves(odometry: Any, k: int) -> FloatArray | Sequence[FloatArray | None]:
+    """Return the odometry of k robots, checked, as one array or as many, None where there is none."""
     if type(odometry) is np.ndarray and odometry.dtype == np.float64 and odometry.shape == (k, 3):
         moves: FloatArray = odometry.copy()
-        if _are_near(moves.ravel().tolist()):
-            return list(moves)
+        if math.hypot(*moves.ravel().tolist()) <= FARTHEST_MOVE:  # and so each of them; NaN is not
+            return moves
     each = enumerate(_one_each("odometry", odometry, k))
     return [None if move is None else _check_move(robot, move) for robot, move in each]
 
@@ -73,19 +75,14 @@ def _check_move(robot: int, move: Any) -> FloatArray:
     """Return a robot's odometry as a checked array."""
     if type(move) is np.ndarray and move.dtype == np.float64 and move.shape == (3,):
         copied: FloatArray = move.copy()
-        if _are_near(copied.tolist()):
+        if math.hypot(*copied.tolist()) <= FARTHEST_MOVE:
             return copied
     cure = "Give the motion (dx, dy, dtheta) in the previous robot frame, or None."
     checked = check_array(f"odometry[{robot}]", move, (3,), cure)
-    if not _are_near(checked.tolist()):
+    if np.abs(checked).max() > FARTHEST_MOVE:
         cure = "Check the units: metres and radians since the robot's last step."
         raise bad_argument(f"odometry[{robot}]", f"numbers within +-{FARTHEST_MOVE:g}", move, cure)
     return checked
-
-
-def _are_near(numbers: list[float]) -> bool:
-    """Tell whether coordinates of moves are within what robots do in a step; NaN is not."""
-    return False not in [-FARTHEST_MOVE <= number <= FARTHEST_MOVE for number in numbers]
 
 
 def _check_pose(robot: int, pose: Any) -> FloatArray:

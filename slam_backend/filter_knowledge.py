@@ -87,7 +87,7 @@ class FilterKnowledge(FilterState):
 
     def _stand(self, names: tuple[int, ...], live: tuple[int, ...], ess: float, points: Standpoints) -> None:
         """Write where the robots stand, which the team calls by these names, of those that are live; `ess` as it is."""
-        weights = NO_WEIGHTS if self._from_origin else self.weights
+        weights = NO_WEIGHTS if self._from_origin else np.exp(self._log_weights)
         of_filter = self._of_robots, weights, self._best, self._from_origin, *self._estimates
         _kernels.stand(*of_filter, *filter_rows(names, live), ess, *points)
 
