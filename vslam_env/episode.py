@@ -188,7 +188,8 @@ class Episode:
             self._tap.recorder(self.readings.of_each())
         report = self.belief.step(self.readings)
         self.ledger.record(report, true_ids)
-        self.merge_ticks += [(self.tick, made.robots_a, made.robots_b) for made in report.renamings]
+        for made in report.renamings:
+            self.merge_ticks.append((self.tick, made.robots_a, made.robots_b))
         if config.oracle_merge:
             self._merge_by_oracle(reach(heard, config.num_robots))
         self.true_path.append(poses)

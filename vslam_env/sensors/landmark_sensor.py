@@ -76,7 +76,7 @@ class LandmarkSensor:
     ) -> None:
         self.config = config
         self._walls = check_array("walls", walls, (None, 4), "Give rows x1 y1 x2 y2 in metres.")
-        self._landmarks = landmarks
+        self._landmarks, self._places = landmarks, landmarks.positions.T.copy()
         descriptors = landmarks.descriptors.astype(np.float64)
         self._points = np.hstack([landmarks.positions, descriptors])
         self._robot_radius = check_float("robot_radius", robot_radius, "Give metres.", at_least=0.0)
@@ -107,13 +107,12 @@ class LandmarkSensor:
             One frame for each robot. Nothing in the order of its points tells anything about them.
         """
         config, marks = self.config, self._landmarks
-        poses = np.ascontiguousarray(poses, dtype=np.float64)
         robots, most, size = len(poses), config.max_measurements, self._points.shape[1]
         num_false = rng.poisson(config.false_points, robots)
         keys = rng.random((robots, len(self._points)))
         ids, counts = np.empty(robots * most, np.int64), np.empty(robots, np.int64)
         total, extra = detect(
-            poses, marks.positions, marks.normals, marks.walls, self._walls, self._robot_radius, self._view,
+            poses, self._places, marks.normals, marks.walls, self._walls, self._robot_radius, self._view,
             keys, config.detection_probability, num_false, most, ids, counts,
         )  # fmt: skip
         false_points = self._no_false_points

@@ -43,5 +43,5 @@ def visible_landmarks(
         view: From `view_limits`.
     """
     seen = np.empty((len(poses), len(landmarks)), dtype=np.bool_)
-    see(poses, landmarks.positions, landmarks.normals, landmarks.walls, walls, robot_radius, view, seen)
+    see(poses, landmarks.positions.T.copy(), landmarks.normals, landmarks.walls, walls, robot_radius, view, seen)
     return seen

@@ -25,9 +25,19 @@ def _hidden(x: float, y: float, dx: float, dy: float, own_wall: int, walls: Floa
 
 
 @jit
+def _those(flags: BoolArray, rows: IntArray) -> IntArray:
+    """Return which flags (N,) are up, at the beginning of `rows` (N,); no branches, for none could be foreseen."""
+    count = 0
+    for n in range(len(flags)):
+        rows[count] = n
+        count += flags[n]
+    return rows[:count]
+
+
+@jit
 def see(
     poses: FloatArray,
-    positions: FloatArray,
+    places: FloatArray,
     normals: FloatArray,
     own_walls: IntArray,
     walls: FloatArray,
@@ -42,7 +52,7 @@ def see(
 
     Args:
         poses: (K, 3) float64 [m, m, rad], world frame. Robots.
-        positions: (N, 3) float64 [m], world frame.
+        places: (3, N) float64 [m], world frame. Where the landmarks are; by rows, for vector instructions.
         normals: (N, 2) float64 [-], world frame.
         own_walls: (N,) int64. Index of the wall that carries each landmark.
         walls: (S, 4) float64 [m], world frame.
@@ -52,6 +62,7 @@ def see(
     """
     forward, aside, height, max_range, tan_half, tan_vertical, cos_incidence = view
     seen[:] = False
+    in_image, rows = np.empty(places.shape[1], dtype=np.bool_), np.empty(places.shape[1], dtype=np.int64)
     camera = np.empty(3)
     for k in range(len(poses)):
         c, s = np.cos(poses[k, 2]), np.sin(poses[k, 2])
@@ -59,11 +70,13 @@ def see(
         camera[1] = poses[k, 1] + s * forward + c * aside
         camera[2] = poses[k, 2]
         near, indices = walls_in_wedge(camera, walls, tan_half + EPSILON, max_range)
-        for n in range(len(positions)):
-            dx, dy, dz = positions[n, 0] - camera[0], positions[n, 1] - camera[1], positions[n, 2] - height
+        for n in range(places.shape[1]):
+            dx, dy, dz = places[0, n] - camera[0], places[1, n] - camera[1], places[2, n] - height
             ahead, left = c * dx + s * dy, c * dy - s * dx
-            if ahead <= TOUCH or abs(left) > tan_half * ahead or abs(dz) > tan_vertical * ahead:
-                continue
+            in_image[n] = (ahead > TOUCH) & (abs(left) <= tan_half * ahead) & (abs(dz) <= tan_vertical * ahead)
+        for n in _those(in_image, rows):
+            dx, dy, dz = places[0, n] - camera[0], places[1, n] - camera[1], places[2, n] - height
+            ahead, left = c * dx + s * dy, c * dy - s * dx
             distance = np.sqrt(dx * dx + dy * dy + dz * dz)
             if distance > max_range or -(dx * normals[n, 0] + dy * normals[n, 1]) <= cos_incidence * distance:
                 continue
@@ -132,7 +145,7 @@ def choose(
 @jit
 def detect(
     poses: FloatArray,
-    positions: FloatArray,
+    places: FloatArray,
     normals: FloatArray,
     own_walls: IntArray,
     walls: FloatArray,
@@ -147,7 +160,7 @@ def detect(
 ) -> tuple[int, int]:
     """Choose among the landmarks that each camera sees and detects: `see` and `choose`, whose arguments these are."""
     seen = np.empty(keys.shape, dtype=np.bool_)
-    see(poses, positions, normals, own_walls, walls, robot_radius, view, seen)
+    see(poses, places, normals, own_walls, walls, robot_radius, view, seen)
     return choose(seen, keys, detection_probability, num_false, most, chosen, counts)
 
 

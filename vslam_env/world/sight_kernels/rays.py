@@ -33,16 +33,12 @@ def walls_in_wedge(pose: FloatArray, walls: FloatArray, tan_half: float, reach: 
         dx2, dy2 = walls[i, 2] - pose[0], walls[i, 3] - pose[1]
         x1, y1 = c * dx1 + s * dy1, c * dy1 - s * dx1
         x2, y2 = c * dx2 + s * dy2, c * dy2 - s * dx2
-        if min(x1, x2) > reach or max(x1, x2) < -reach or min(y1, y2) > reach or max(y1, y2) < -reach:
-            continue
-        if tan_half > 0.0:
-            if y1 > tan_half * x1 and y2 > tan_half * x2:
-                continue
-            if -y1 > tan_half * x1 and -y2 > tan_half * x2:
-                continue
+        beyond = (x1 > reach) & (x2 > reach) | (x1 < -reach) & (x2 < -reach)
+        beyond |= (y1 > reach) & (y2 > reach) | (y1 < -reach) & (y2 < -reach)
+        beside = (y1 > tan_half * x1) & (y2 > tan_half * x2) | (-y1 > tan_half * x1) & (-y2 > tan_half * x2)
         local[n, 0], local[n, 1], local[n, 2], local[n, 3] = x1, y1, x2, y2
         indices[n] = i
-        n += 1
+        n += not (beyond | ((tan_half > 0.0) & beside))  # no branches, for none could be foreseen
     return local[:n], indices[:n]
 
 
@@ -105,7 +101,7 @@ def cast_scans(
         sigma: Standard deviation of a reading, as a share of the distance.
         ranges: (K, R) float64. Standard normal draws; the readings [m], from 0 to `max_range`, take their places.
     """
-    others = np.empty((len(poses), 2))
+    others, nearest = np.empty((len(poses), 2)), np.empty(len(rays))
     for k in range(len(poses)):
         near, _ = walls_in_wedge(poses[k], walls, tan_half, max_range)
         c, s = np.cos(poses[k, 2]), np.sin(poses[k, 2])
@@ -115,13 +111,17 @@ def cast_scans(
             if j != k and max(abs(ox), abs(oy)) <= max_range + robot_radius:
                 others[num_others, 0], others[num_others, 1] = c * ox + s * oy, c * oy - s * ox
                 num_others += 1
+        nearest[:] = max_range
+        for i in range(len(near)):
+            x1, y1, x2, y2 = near[i]
+            for r in range(len(rays)):
+                nearest[r] = min(nearest[r], ray_to_wall(rays[r, 0], rays[r, 1], x1, y1, x2, y2))
+        for j in range(num_others):
+            for r in range(len(rays)):
+                hit = ray_to_disc(rays[r, 0], rays[r, 1], others[j, 0], others[j, 1], robot_radius)
+                nearest[r] = min(nearest[r], hit)
         for r in range(len(rays)):
-            dx, dy = rays[r]
-            nearest = max_range
-            for i in range(len(near)):
-                nearest = min(nearest, ray_to_wall(dx, dy, near[i, 0], near[i, 1], near[i, 2], near[i, 3]))
-            for j in range(num_others):
-                nearest = min(nearest, ray_to_disc(dx, dy, others[j, 0], others[j, 1], robot_radius))
-            if nearest < max_range:
-                nearest = min(max(nearest * (1.0 + sigma * ranges[k, r]), 0.0), max_range)
-            ranges[k, r] = nearest
+            read = nearest[r]
+            if read < max_range:
+                read = min(max(read * (1.0 + sigma * ranges[k, r]), 0.0), max_range)
+            ranges[k, r] = read
