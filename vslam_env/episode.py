@@ -76,7 +76,8 @@ class Episode:
 
         self.tick = 0
         self._collisions = np.zeros(config.num_robots, np.int64)
-        self._distances = np.zeros(config.num_robots)
+        self._figures = np.zeros((NUM_FIGURES, config.num_robots))  # of `Standing`; ways are added up in their row
+        self._found, self._distances = self._figures[FOUND], self._figures[DISTANCES]
         self.true_path: list[FloatArray] = []
         self.estimated_path: list[FloatArray] = []
         self.merge_ticks: list[tuple[int, tuple[int, ...], tuple[int, ...]]] = []
@@ -121,12 +122,15 @@ class Episode:
     def standing(self) -> Standing:
         """Return how the team stands now: its maps and poses are scored."""
         belief, poses = self.belief, self.true_path[-1]
-        figures = np.empty((NUM_FIGURES, len(poses)))
-        self.ledger.score(belief.outlines, belief.points, self.true_starts, poses, figures)
-        coverage = self._coverage.update(belief.grids, poses, figures[FOUND])
-        figures[DISTANCES] = self._distances
+        self.ledger.score(belief.outlines, belief.points, self.true_starts, poses, self._figures)
+        coverage = self._coverage.update(belief.grids, poses, self._found)
         return Standing(
-            figures, self._collisions.copy(), belief.bytes_sent, coverage, len(self.merge_ticks), self.tick * TICK
+            figures=self._figures.copy(),
+            collisions=self._collisions.copy(),
+            bytes_sent=belief.bytes_sent,
+            coverage=coverage,
+            merges=len(self.merge_ticks),
+            time=self.tick * TICK,
         )
 
     # ------------------------------------------------------------------ snapshots
@@ -161,7 +165,7 @@ class Episode:
         self.ledger.set_state(state["ledger"])
         self._coverage.set_state(state["coverage"])
         self.tick = state["tick"]
-        self._collisions, self._distances = (counts.copy() for counts in state["counts"])
+        self._collisions[:], self._distances[:] = state["counts"]
         self.readings, self.frames = state["last"][0], list(state["last"][1])
         self.true_path, self.estimated_path, self.merge_ticks = (list(path) for path in state["paths"])
 

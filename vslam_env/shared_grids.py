@@ -110,8 +110,8 @@ class SharedGrids:
             elif isinstance(entry, MapDropped):
                 self._kept = [kept for kept in self._kept if entry.number not in kept.maps[:2]]
         if self._strokes:
-            oldest = min((kept.tick for kept in self._kept), default=tick)
-            while self._strokes and self._strokes[0].tick < oldest:  # they stand in order of time
+            oldest = self._kept[0].tick if self._kept else tick  # both stand in order of time
+            while self._strokes and self._strokes[0].tick < oldest:
                 self._strokes.popleft()
 
     def _undo(self, undone: MergeUndone) -> None:
