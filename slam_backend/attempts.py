@@ -91,8 +91,9 @@ class AttemptSchedule:
         self.straightening: Straightening | None = None
 
     def is_due(self, step: int) -> bool:
-        """Tell whether a pair may try at this step."""
-        return self._options.enabled and step % self._options.every == self._options.every - 1
+        """Tell whether a pair may try at this step, or an attempt goes on."""
+        options = self._options
+        return self.straightening is not None or (options.enabled and step % options.every == options.every - 1)
 
     def may_try(self, pair: PairKey, step: int) -> bool:
         """Tell whether the pair's wait is over, and nothing bars it."""

@@ -77,12 +77,11 @@ class TeamSlam(TeamKnowledge):
             ValueError: If an argument is ill-formed; the team is then as before.
         """
         networks = reach(check_contacts(contacts, self._num_robots), self._num_robots)
-        camera = self._groups[0].trunk.filter.options.camera
-        size = self._descriptor_size()
+        lineup, size = self.lineup, self._descriptor_size()
+        camera = lineup.branches[0].filter.options.camera
         inputs = check_step(self._num_robots, size, camera, odometry, measurements, identities, poses)
         records, before = self._records, len(self._events)
         records.log.record(self._step, inputs)
-        lineup = self.lineup
         if contacts is not None or lineup.is_split:
             lineup = self._regrouped(networks)
         associations: list[IntArray] = [NO_IDS] * self._num_robots
@@ -96,7 +95,7 @@ class TeamSlam(TeamKnowledge):
                 if robot in branch.live:
                     associations[robot], created[robot] = found, made
         self._doubt()
-        renamings = self._attempt(networks)
+        renamings = self._attempt(networks) if self._schedule.is_due(self._step) else ()
         lineup = self.lineup
         oldest = self._step + 1 if lineup.oldest is None else lineup.oldest
         records.log.forget_before(oldest)
@@ -214,7 +213,7 @@ class TeamSlam(TeamKnowledge):
         self._schedule.bar(pair, self._step + self._merging.barred_steps)
 
     def _attempt(self, networks: IntArray) -> tuple[Renaming, ...]:
-        """Let a pair of groups try, if it is time, and merge those whose attempt is a success."""
+        """Let a pair of groups try, and merge those whose attempt is a success."""
         options = self._schedule, self._alignment, self._merging
         event = attempt(self._groups, networks, self._step, *options, self._records, self._rng)
         if event is None:

@@ -33,7 +33,7 @@ def attempt(
     groups: Sequence[Group], networks: IntArray, step: int, schedule: AttemptSchedule, alignment: AlignmentOptions,
     merging: MergeOptions, records: Records, rng: np.random.Generator,
 ) -> MergeEvent | None:  # fmt: skip
-    """Let the most promising pair of groups try, if it is time, or go on with an attempt whose maps are straightened.
+    """Let the most promising pair of groups try, or go on with an attempt whose maps are straightened; when it is due.
 
     Args:
         groups: Of the team, by their robots. Filters of a pair that tries are straightened.
@@ -69,8 +69,8 @@ def _begun(
     groups: Sequence[Group], networks: IntArray, step: int, schedule: AttemptSchedule, options: AlignmentOptions,
     merging: MergeOptions, records: Records, rng: np.random.Generator,
 ) -> MergeEvent | None:  # fmt: skip
-    """Choose a pair, if it is time, and align its maps as the filters have bent them."""
-    if not schedule.is_due(step) or len(groups) < 2:
+    """Choose a pair and align its maps as the filters have bent them."""
+    if len(groups) < 2:
         return None
     able = (pair for pair in _pairs(groups) if _in_touch(pair, networks))
     pairs = {_key(pair): pair for pair in able if schedule.may_try(_key(pair), step)}

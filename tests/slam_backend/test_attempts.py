@@ -3,8 +3,8 @@ import pytest
 from mapped_once import looks
 from simulated_team import SimulatedTeam
 
-from slam_backend.alignment import AlignmentOptions
-from slam_backend.attempts import AttemptOptions, AttemptSchedule, PairKey
+from slam_backend.alignment import Alignment, AlignmentOptions
+from slam_backend.attempts import AttemptOptions, AttemptSchedule, PairKey, Straightening
 from slam_backend.landmark_map import LandmarkMap
 from slam_backend.team import TeamSlam
 
@@ -31,8 +31,11 @@ def pair_of(names: list[int]) -> tuple[LandmarkMap, LandmarkMap]:
 
 
 def test_one_step_in_so_many_is_due() -> None:
-    """With every = 25, the last step of each 25 is due, and no other."""
-    assert [step for step in range(100) if schedule().is_due(step)] == [24, 49, 74, 99]
+    """With every = 25, the last step of each 25 is due, and no other but while an attempt goes on."""
+    plan = schedule()
+    assert [step for step in range(100) if plan.is_due(step)] == [24, 49, 74, 99]
+    plan.straightening = Straightening(((0,), (1,)), (0, 1), Alignment.refused("too few matches"), 24)
+    assert all(plan.is_due(step) for step in range(25, 49))
 
 
 def test_a_refused_pair_waits_twice_as_long_each_time() -> None:
