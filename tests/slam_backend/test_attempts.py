@@ -34,7 +34,7 @@ def test_one_step_in_so_many_is_due() -> None:
     """With every = 25, the last step of each 25 is due, and no other but while an attempt goes on."""
     plan = schedule()
     assert [step for step in range(100) if plan.is_due(step)] == [24, 49, 74, 99]
-    plan.straightening = Straightening(((0,), (1,)), (0, 1), Alignment.refused("too few matches"), 24)
+    plan.straightening = Straightening(((0,), (1,)), (0, 1), Alignment.refused("too few inliers"), 24)
     assert all(plan.is_due(step) for step in range(25, 49))
 
 
