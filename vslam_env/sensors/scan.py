@@ -63,6 +63,6 @@ class Scan:
             (K, R) float64 [m] in [0, max_range]. A ray that meets nothing reads exactly `max_range`.
         """
         limits = self._robot_radius, self.config.max_range, self.config.sigma
-        ranges = rng.standard_normal((len(poses), len(self._rays)))
+        ranges = rng.standard_normal((len(poses), len(self.ray_angles)))
         cast_scans(poses, self._rays, self._tan_half, self._walls, *limits, ranges)
         return ranges

@@ -90,7 +90,7 @@ class Simulator:
             body.position = place
             self._space.add(body, pymunk.Circle(body, radius + SKIN))
             self._bodies.append(body)
-        self._bumped = np.zeros(len(self._bodies), dtype=np.bool_)
+        self._bumped = self._nobody = np.zeros(len(self._bodies), dtype=np.bool_)  # replaced, never written to
 
     @property
     def poses(self) -> FloatArray:
@@ -121,7 +121,7 @@ class Simulator:
         goals = np.empty((len(self._bodies), 3))
         clear = _drive_freely(self._poses, commands, self.tick, self._walls, self.radius + SKIN, goals)
         if clear:
-            self._bumped = np.zeros(len(goals), np.bool_)
+            self._bumped = self._nobody
         else:
             check_array("commands", commands, shape, cure)  # for only finite ones are surely free
             way = goals[:, :2] - self._poses[:, :2]

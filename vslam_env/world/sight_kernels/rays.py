@@ -47,13 +47,10 @@ def ray_to_wall(dx: float, dy: float, x1: float, y1: float, x2: float, y2: float
     """Solve t (dx, dy) = p1 + u (p2 - p1) for t >= 0 with u in [0, 1]; infinity when there is no such t."""
     ex, ey = x2 - x1, y2 - y1
     cross = dx * ey - dy * ex
-    if cross == 0.0:
-        return np.inf
-    u = (x1 * dy - y1 * dx) / cross
-    if u < -EPSILON or u > 1.0 + EPSILON:
-        return np.inf
-    t = (x1 * ey - y1 * ex) / cross
-    return t if t >= 0.0 else np.inf
+    divisor = cross if cross != 0.0 else 1.0  # the compiler then sees that it needs no branch
+    u, t = (x1 * dy - y1 * dx) / divisor, (x1 * ey - y1 * ex) / divisor
+    meets = (cross != 0.0) & (u >= -EPSILON) & (u <= 1.0 + EPSILON) & (t >= 0.0)
+    return t if meets else np.inf
 
 
 @jit
@@ -68,13 +65,13 @@ def ray_to_disc(dx: float, dy: float, x: float, y: float, radius: float) -> floa
 
 @jit
 def rays_at(angles: FloatArray) -> tuple[FloatArray, float]:
-    """Return unit vectors (R, 2) at angles (R,) [rad], and the tangent of the wedge that holds them all.
+    """Return unit vectors (2, R) at angles (R,) [rad], and the tangent of the wedge that holds them all.
 
     The wedge is that of `walls_in_wedge`; the tangent is 0, for all round, where it is not much less than a half plane.
     """
-    rays = np.empty((len(angles), 2))
+    rays = np.empty((2, len(angles)))
     for r in range(len(angles)):
-        rays[r, 0], rays[r, 1] = np.cos(angles[r]), np.sin(angles[r])
+        rays[0, r], rays[1, r] = np.cos(angles[r]), np.sin(angles[r])
     widest = np.max(np.abs(angles))
     return rays, np.tan(widest) + EPSILON if widest < 1.5 else 0.0
 
@@ -101,7 +98,7 @@ def cast_scans(
         sigma: Standard deviation of a reading, as a share of the distance.
         ranges: (K, R) float64. Standard normal draws; the readings [m], from 0 to `max_range`, take their places.
     """
-    others, nearest = np.empty((len(poses), 2)), np.empty(len(rays))
+    others, nearest = np.empty((len(poses), 2)), np.empty(rays.shape[1])
     for k in range(len(poses)):
         near, _ = walls_in_wedge(poses[k], walls, tan_half, max_range)
         c, s = np.cos(poses[k, 2]), np.sin(poses[k, 2])
@@ -114,13 +111,13 @@ def cast_scans(
         nearest[:] = max_range
         for i in range(len(near)):
             x1, y1, x2, y2 = near[i]
-            for r in range(len(rays)):
-                nearest[r] = min(nearest[r], ray_to_wall(rays[r, 0], rays[r, 1], x1, y1, x2, y2))
+            for r in range(rays.shape[1]):
+                nearest[r] = min(nearest[r], ray_to_wall(rays[0, r], rays[1, r], x1, y1, x2, y2))
         for j in range(num_others):
-            for r in range(len(rays)):
-                hit = ray_to_disc(rays[r, 0], rays[r, 1], others[j, 0], others[j, 1], robot_radius)
+            for r in range(rays.shape[1]):
+                hit = ray_to_disc(rays[0, r], rays[1, r], others[j, 0], others[j, 1], robot_radius)
                 nearest[r] = min(nearest[r], hit)
-        for r in range(len(rays)):
+        for r in range(rays.shape[1]):
             read = nearest[r]
             if read < max_range:
                 read = min(max(read * (1.0 + sigma * ranges[k, r]), 0.0), max_range)
