@@ -10,6 +10,7 @@ import numpy as np
 from slam_backend.alignment import AlignmentOptions
 from slam_backend.attempts import AttemptOptions, AttemptSchedule
 from slam_backend.branches import Branch
+from slam_backend.contacts import reach
 from slam_backend.errors import bad_argument, check_int, check_seed
 from slam_backend.filter import FastSlam
 from slam_backend.filter_options import FilterOptions
@@ -30,6 +31,7 @@ class TeamState:
         _records: What they write down in common.
         _events: All attempts, merges and undos so far, in order.
         _lineup: What the groups come to; None while they change. Ask `lineup` for it.
+        _together: (K,) int64. Networks of robots that are all in contact.
         _numbers: Of all maps that are in use, as of the lineup `_numbered`.
         _step: Number of the next step.
         _epoch: How many merges and undos there were.
@@ -74,6 +76,7 @@ class TeamState:
         self._groups, self._records, self._num_robots = groups, Records(count, of_forks), count
         self._events: list[MergeEvent] = []
         self._lineup: Lineup | None = None
+        self._together = reach(None, count)
         self._numbers = frozenset(range(count))
         self._numbered: Lineup | None = None
         self._step = 0

@@ -7,8 +7,8 @@ from scipy.sparse.csgraph import connected_components
 from slam_backend.errors import BoolArray, IntArray, bad_argument, check_array
 
 
-def check_contacts(contacts: ArrayLike | None, num_robots: int) -> BoolArray | None:
-    """Return contacts as a checked array; None = all.
+def check_contacts(contacts: ArrayLike, num_robots: int) -> BoolArray:
+    """Return contacts as a checked array.
 
     Args:
         contacts: (K, K) bool, symmetric; the diagonal means nothing.
@@ -17,8 +17,6 @@ def check_contacts(contacts: ArrayLike | None, num_robots: int) -> BoolArray | N
     Raises:
         ValueError: If they are no symmetric array of bools.
     """
-    if contacts is None:
-        return None
     cure = "Say for each pair of robots whether it can exchange data."
     touch = check_array("contacts", contacts, (num_robots, num_robots), cure, dtype=None, finite=False)
     if touch.dtype != np.bool_ or not np.array_equal(touch, touch.T):

@@ -76,15 +76,17 @@ class TeamSlam(TeamKnowledge):
         Raises:
             ValueError: If an argument is ill-formed; the team is then as before.
         """
-        networks = reach(check_contacts(contacts, self._num_robots), self._num_robots)
-        lineup, size = self.lineup, self._descriptor_size()
+        count, networks = self._num_robots, self._together
+        if contacts is not None:
+            networks = reach(check_contacts(contacts, count), count)
+        lineup, size = self.lineup, self._size or self._descriptor_size()
         camera = lineup.branches[0].filter.options.camera
-        inputs = check_step(self._num_robots, size, camera, odometry, measurements, identities, poses)
+        inputs = check_step(count, size, camera, odometry, measurements, identities, poses)
         records, before = self._records, len(self._events)
         records.log.record(self._step, inputs)
         if contacts is not None or lineup.is_split:
             lineup = self._regrouped(networks)
-        associations: list[IntArray] = [NO_IDS] * self._num_robots
+        associations: list[IntArray] = [NO_IDS] * count
         created = list(associations)
         rejuvenations: list[tuple[tuple[int, ...], RejuvenationReport]] = []
         for branch in lineup.branches:
@@ -99,6 +101,8 @@ class TeamSlam(TeamKnowledge):
         lineup = self.lineup
         oldest = self._step + 1 if lineup.oldest is None else lineup.oldest
         records.log.forget_before(oldest)
+        if lineup is not self._numbered:
+            self._note_dropped(lineup)
         report = TeamReport(
             step=self._step,
             associations=tuple(associations),
@@ -107,7 +111,7 @@ class TeamSlam(TeamKnowledge):
             events=tuple(self._events[before:]),
             renamings=renamings,
             maps=lineup.maps,
-            entries=(*records.entries, *self._dropped(lineup)),
+            entries=tuple(records.entries),
             oldest_step=oldest,
             rejuvenations=tuple(rejuvenations),
         )
@@ -224,16 +228,12 @@ class TeamSlam(TeamKnowledge):
         groups = self._group_of(event.robots_a[0]), self._group_of(event.robots_b[0])
         return (self.merge(*speakers(groups), event.alignment),)
 
-    def _dropped(self, lineup: Lineup) -> list[MapDropped]:
-        """Return the maps that are gone since this was asked last."""
-        if lineup is self._numbered:
-            return []
-        gone = sorted(self._numbers - lineup.numbers)
+    def _note_dropped(self, lineup: Lineup) -> None:
+        """Write down which maps are gone since the last lineup."""
+        self._records.entries += [MapDropped(number) for number in sorted(self._numbers - lineup.numbers)]
         self._numbered, self._numbers = lineup, lineup.numbers
-        return [MapDropped(number) for number in gone]
 
     def _descriptor_size(self) -> int:
         """Return the length of the descriptors in use, 0 before the first one; it stays the same from there on."""
-        if not self._size:
-            self._size = max([branch.filter.descriptor_size for branch in self.lineup.branches])
+        self._size = max([branch.filter.descriptor_size for branch in self.lineup.branches])
         return self._size
