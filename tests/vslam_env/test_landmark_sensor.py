@@ -11,6 +11,7 @@ from slam_backend.geometry import compose
 from vslam_env.sensors import LandmarkSensor, LandmarkSensorConfig
 from vslam_env.sensors._landmark_kernels import measure
 from vslam_env.world import FreeSpace, Landmarks, World, make_world, place_landmarks
+from vslam_env.world.sight_kernels import choose
 
 SHARP = StereoCamera(sigma_px=1e-9, sigma_disparity_px=1e-9)
 PERFECT = LandmarkSensorConfig(
@@ -167,6 +168,22 @@ def test_a_frame_is_the_plain_definition() -> None:
     assert ids[:4].tolist() == [-1, 4, 0, 3]
     np.testing.assert_allclose(got_points[:4], camera.triangulate(pixels), rtol=1e-9)
     np.testing.assert_allclose(got_looks[:4], disturbed / np.linalg.norm(disturbed, axis=1, keepdims=True), rtol=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_choice_is_that_of_the_smallest_keys(seed: int) -> None:
+    """Of what is visible and detected the smallest keys are taken, in their order, as false points leave places."""
+    rng = np.random.default_rng(seed)
+    visible, keys, most = rng.random((4, 30)) < 0.4, rng.random((4, 30)), 6
+    num_false, counts, chosen = np.array([0, 2, 6, 9]), np.empty(4, np.int64), np.empty(24, np.int64)
+    detected = [np.flatnonzero(seen & (own < 0.7)) for seen, own in zip(visible, keys, strict=True)]
+    places = np.maximum(most - num_false, 0)
+    expected = [n[np.argsort(own[n])][:left] for n, own, left in zip(detected, keys, places, strict=True)]
+    total, extra = choose(visible, keys, 0.7, num_false, most, chosen, counts)
+    assert chosen[:total].tolist() == np.concatenate(expected).tolist()
+    assert counts.tolist() == [len(own) for own in expected]
+    assert num_false.tolist() == [0, 2, 6, 6]
+    assert extra == 14
 
 
 def test_descriptor_noise_has_the_stated_length() -> None:
