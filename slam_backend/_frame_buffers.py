@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 
 from slam_backend import _kernels
 from slam_backend._kernels import LANES
-from slam_backend._kernels.layout import ACT, END, GIVEN, NAMED
 from slam_backend._map_store import aligned
 from slam_backend.errors import BoolArray, FloatArray, IntArray
 from slam_backend.input_log import RobotInput
@@ -83,13 +82,12 @@ class FrameBuffers:
 
     def take(self, inputs: Sequence[RobotInput]) -> Frames:
         """Begin a step: take what all robots read, and provide for what becomes of it."""
-        turns = self.turns
         masks: dict[int, BoolArray] = {}
         ends: list[int] = []
         used: list[Readings] = []  # of each robot that has measurements
         given = total = active = 0
         for robot, (move, frame, names, exact) in enumerate(inputs):
-            act = _kernels.IDLE
+            act, covered = _kernels.IDLE, False
             if frame is not None and (size := len(frame.points)):
                 given += size
                 own: Readings = (frame.points, frame.covariances, frame.descriptors, names)
@@ -101,12 +99,12 @@ class FrameBuffers:
                     act = _kernels.STOOD
                     used.append(own)
                     total += size
-                turns[robot, GIVEN], turns[robot, NAMED] = frame.covariances is not None, names is not None
+                covered = frame.covariances is not None
             if exact is not None:
                 act = _kernels.PLACED
             elif move is not None:
                 act, self.moves[robot] = _kernels.MOVED, move
-            turns[robot, ACT], turns[robot, END] = act, total
+            self.turns[robot] = act, total, covered, names is not None
             active += act != _kernels.IDLE
             ends.append(total)
         if total > len(self.found):

@@ -138,7 +138,7 @@ class MapStore:
             self._grow_rows(max(64, len(self.counts) // 2, new + 1))
 
     def _begin(self, new: int, descriptor_size: int) -> None:
-        """Begin with `new` landmarks in the lowest slots and rows, yet to be written, in the same arrays if they do.
+        """Begin with `new` landmarks in the lowest slots and rows, yet to be written; arrays with room are used again.
 
         Args:
             new: How many.

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import astuple
+from typing import Final
 
 import numpy as np
 
@@ -15,8 +16,10 @@ from slam_backend.filter_options import FilterOptions
 from slam_backend.geometry import compose
 from slam_backend.reports import PoseEstimates, StepReport
 
-# What `_kernels.take_turns` returns.
+# What `_kernels.take_turns` returns; `report_of` takes it apart.
 Summary = tuple[float, int, int, int, int, int, float, int]
+BEST: Final = 1
+LONG_UNSEEN: Final = 5
 
 
 def assumed(options: FilterOptions) -> FloatArray:

@@ -16,7 +16,7 @@ from slam_backend._frame_buffers import Frames
 from slam_backend._kernels.layout import NEW_SLOTS
 from slam_backend._rejuvenation_step import RejuvenationStep
 from slam_backend._step_input import check_step
-from slam_backend._turns import Summary, place, report_of, take_turns
+from slam_backend._turns import BEST, LONG_UNSEEN, Summary, place, report_of, take_turns
 from slam_backend.adaptation import AdaptiveParticles, next_num_particles
 from slam_backend.camera import StereoCamera
 from slam_backend.errors import IntArray, check_array
@@ -170,7 +170,7 @@ class FastSlam(FilterKnowledge):
         told = np.empty((3, frames.ends[-1]), np.int64)
         self._estimates = PoseEstimates(np.empty((num_robots, 3)), np.empty((num_robots, 3, 3)))
         summary, deserted = self._take_turns(inputs, frames, told)
-        self._steps, self._best = self._steps + 1, summary[1]
+        self._steps, self._best = self._steps + 1, summary[BEST]
         threshold = self.options.resample_threshold * maps.num_particles * (1.0 + 1e-9)
         report = report_of(frames, told, summary, threshold)
         self._write_down(frames, inputs, report)
@@ -179,7 +179,7 @@ class FastSlam(FilterKnowledge):
         if report.resampled:
             self._resample()
         if self._rejuvenation is not None:
-            self._rejuvenation.count(report.num_new + report.num_matched, summary[5])
+            self._rejuvenation.count(report.num_new + report.num_matched, summary[LONG_UNSEEN])
             if self.may_smooth and (news := self._rejuvenate(self._rejuvenation)) is not None:
                 return report._replace(rejuvenation=news)
         return report
