@@ -16,7 +16,7 @@ from slam_backend.reports import MergeEvent, Renaming, TeamReport
 from slam_backend.standpoints import Standpoints
 from slam_backend.team import TeamSlam
 from vslam_env.navigation import TeamGrids, TeamSlots
-from vslam_env.readings import TeamReadings
+from vslam_env.readings import Readings, TeamReadings
 from vslam_env.robot_belief import Belief, BeliefConfig, Body, Candidates, Teammate, View
 from vslam_env.shared_grids import SharedGrids
 
@@ -98,12 +98,16 @@ class TeamBelief:
         """(K, 3) float64 [m, m, rad]. Where each robot believes to be, in its own start frame. A copy."""
         return self._points.own.copy()
 
-    def step(self, readings: TeamReadings) -> TeamReport:
+    def step(self, readings: TeamReadings | Sequence[Readings]) -> TeamReport:
         """Take in one tick's readings of all K robots; the first ones are those of the reset.
 
+        Args:
+            readings: As `env.readings` and recorders give them, or in one piece.
+
         Raises:
-            ValueError: If a reading is ill-formed.
+            ValueError: If a reading is ill-formed, or some robots have a kind of reading that others have not.
         """
+        readings = TeamReadings.gathered(readings)
         shape = len(self._robots), len(self._body.ray_angles)
         if readings.scans.shape != shape:
             got, cure = f"shape {readings.scans.shape}", "Give a range for each ray of each robot."

@@ -76,12 +76,16 @@ class TeamReadings(NamedTuple):
         )
 
     @classmethod
-    def gathered(cls, readings: Sequence[Readings]) -> "TeamReadings":
-        """Return the readings of all K robots as those of a team.
+    def gathered(cls, readings: "TeamReadings | Sequence[Readings]") -> "TeamReadings":
+        """Return the readings of all K robots as those of a team; such that are so already as they are.
 
         Raises:
             ValueError: If some robots have a kind of reading that others have not, or scans of another length.
         """
+        if isinstance(readings, TeamReadings):
+            return readings
+        if not readings:
+            raise bad_argument("readings", "those of each robot", readings, "Give one for each robot.")
         columns = list(zip(*readings, strict=True))
         for name, column in zip(Readings._fields, columns, strict=True):
             missing = [reading is None for reading in column]

@@ -15,7 +15,6 @@ from vslam_env import ExplorationEnv
 from vslam_env.belief import TeamBelief
 from vslam_env.communication import contacts, crosses_wall
 from vslam_env.observation import observe
-from vslam_env.readings import TeamReadings
 
 POSES = np.array([[1.0, 1.0, 0.3], [4.0, 5.0, 2.0], [1.0, 9.0, -1.0]])  # the wall at y = 7 cuts the third off
 
@@ -128,7 +127,7 @@ def test_beliefs_with_contact_now_and_then_follow_from_readings_alone(options: A
     assert [event.kind for event in env.events if event.kind != "attempt"] == ["merge"]
     belief = TeamBelief(env.config.belief, 2, episode.belief_seed, episode.body)
     for readings, expected in zip(log, observed, strict=True):
-        belief.step(TeamReadings.gathered(readings))
+        belief.step(readings)
         for robot, agent in enumerate(env.possible_agents):
             again = observe(belief.belief(robot), readings[robot].scan, False)
             for name, value in expected[agent].items():

@@ -40,7 +40,7 @@ def test_observations_are_rebuilt_from_readings_alone(action_type: str, steps: i
     episode = env.episode
     belief = TeamBelief(env.config.belief, 2, episode.belief_seed, episode.body, decision_ticks=ticks if goal else None)
     for tick, now in enumerate(readings):
-        belief.step(TeamReadings.gathered(now))
+        belief.step(now)
         if tick % ticks:
             continue
         for robot, agent in enumerate(env.possible_agents):
@@ -61,6 +61,10 @@ def test_scans_of_another_length_are_refused_before_anything_changes() -> None:
         short = now._replace(scans=now.scans[:, 1:])
         with pytest.raises(ValueError, match=r"readings.scans: .* shape \(2, 32\), got shape \(2, 31\)"):
             refusing.step(short)
+        with pytest.raises(ValueError, match=r"readings.scans: .* shape \(2, 32\), got shape \(1, 32\)"):
+            refusing.step(now.of_each()[:1])
+        with pytest.raises(ValueError, match=r"readings: expected those of each robot"):
+            refusing.step([])
         whole.step(now), refusing.step(now)
         np.testing.assert_array_equal(refusing.poses, whole.poses)
 
