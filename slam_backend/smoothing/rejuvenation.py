@@ -1,7 +1,7 @@
 """`rejuvenate`: new particles from the posterior of whole paths, in place of those that resampling has impoverished."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -123,13 +123,12 @@ def rejuvenate(
     if any((log.kinds == EXACT).any() for log in logs):
         return Rejuvenation(graph, "poses that were given as exact", float("nan"), 0, None)
     share = max(1, 2 * options.most_keys(len(logs)) // len(logs))
-    near = replace(options, tolerance=NEAR * options.tolerance)
     rest = list(logs)
     while True:
         last = all(len(log) <= share for log in rest)
         first = [first_rows(log, share) for log in rest]
         grown = extended(graph, first, motion, camera[4:], guesses, options.rigid_within, places)
-        mode = find_mode(grown, camera, options if last else near)
+        mode = find_mode(grown, camera, options, looseness=1.0 if last else NEAR)
         if mode.reason == NO_POSE:
             unmoved = at_given_poses(grown, camera, options)
             if last:

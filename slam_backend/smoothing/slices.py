@@ -83,8 +83,7 @@ class Smoother:
         Returns:
             The graph if that ended the descent, how it now stands if not, or what is wrong.
         """
-        near = replace(self.options, tolerance=NEAR * self.options.tolerance)
-        mode = find_mode(draft.graph, self.camera, near, STEPS, draft.damping)
+        mode = find_mode(draft.graph, self.camera, self.options, STEPS, draft.damping, NEAR)
         return self._after(draft, mode)
 
     @on_one_thread

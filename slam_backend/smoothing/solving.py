@@ -87,8 +87,9 @@ class Mode:
 
 
 def find_mode(
-    graph: PathGraph, camera: FloatArray, options: SmoothingOptions, most: int | None = None, damping: float = 0.0
-) -> Mode:
+    graph: PathGraph, camera: FloatArray, options: SmoothingOptions, most: int | None = None, damping: float = 0.0,
+    looseness: float = 1.0,
+) -> Mode:  # fmt: skip
     """Descend from where the graph stands.
 
     A step that does not lower the cost is tried again with more damping (Levenberg, Marquardt). Where measurements lie
@@ -102,6 +103,7 @@ def find_mode(
         options: Kernel, scale of the noise, tolerance, iterations.
         most: Iterations; None: as in the options.
         damping: Of the first one.
+        looseness: Times the tolerance of the options.
     """
     sought = graph.previous >= 0
     columns = np.where(sought, 3 * np.cumsum(sought) - 3, FREE)
@@ -109,6 +111,7 @@ def find_mode(
     sightings = Sightings.of(graph)
     poses, landmarks = graph.poses.copy(), graph.landmarks.copy()
     informations = np.zeros_like(graph.noises)
+    tolerance = looseness * options.tolerance
     creep = CREEP if most is None else 1.0
     most = options.max_iterations if most is None else most
 
@@ -134,7 +137,7 @@ def find_mode(
         expected = -0.5 * float((system.vector * change).sum()) - system.eased  # if the cost were a parabola
         trial_poses, trial_landmarks = poses.copy(), landmarks + change[size:]
         trial_poses[sought] += change[:size]
-        near = creep * options.tolerance if iteration == most else options.tolerance
+        near = creep * tolerance if iteration == most else tolerance
         if expected <= near and damping == 0.0:
             return Mode(
                 trial_poses, trial_landmarks, columns, sightings, informations, cost - expected, iteration, damping,

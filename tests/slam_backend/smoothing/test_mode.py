@@ -113,6 +113,9 @@ def test_a_descent_that_creeps_has_ended_in_the_last_iteration():
     mode = find_mode(graph, camera, near)
     assert mode.reason == ""
     np.testing.assert_array_equal(mode.poses, rough.poses)
+    loose = find_mode(graph, camera, replace(near, tolerance=promise / 50.0), looseness=10.0)
+    assert loose.reason == ""
+    np.testing.assert_array_equal(loose.poses, rough.poses)
     assert find_mode(graph, camera, near, 3).reason == "no convergence in 3 iterations"
     assert find_mode(graph, camera, replace(near, tolerance=promise / 20.0)).reason == "no convergence in 3 iterations"
 

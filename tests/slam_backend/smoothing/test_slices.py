@@ -54,8 +54,8 @@ def test_no_step_does_more_than_its_slice(monkeypatch):
     slam = run.build_filter(30, "fastslam2", 1, rejuvenate_every=25, smoothing=IN_SLICES)
     solved = []
 
-    def noted(graph, camera, options, most, damping=0.0):
-        mode = find_mode(graph, camera, options, most, damping)
+    def noted(graph, *arguments):
+        mode = find_mode(graph, *arguments)
         solved.append((graph.num_keys, mode.iterations))
         return mode
 
