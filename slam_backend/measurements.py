@@ -83,10 +83,26 @@ class Measurements:
             begin = end
         return frames
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Let copies and what was pickled be read-only, too: else the extent would not follow what is written there."""
+        return _restored, (self.points, self.descriptors, self.covariances, self.extent)
+
     @classmethod
     def empty(cls, descriptor_size: int = 64) -> "Measurements":
         """Return a frame in which nothing was seen."""
         return cls(np.empty((0, 3)), np.empty((0, descriptor_size), dtype=np.float32))
+
+
+def _restored(
+    points: FloatArray, descriptors: NDArray[np.float32], covariances: FloatArray | None, extent: tuple[float, float]
+) -> Measurements:
+    """Return the copy of a frame that holds these arrays, its own."""
+    frame, put = object.__new__(Measurements), object.__setattr__
+    for name, value in zip(Measurements.__slots__, (points, descriptors, covariances, extent), strict=True):
+        if isinstance(value, np.ndarray):
+            value.setflags(write=False)
+        put(frame, name, value)
+    return frame
 
 
 def _check_covariances(covariances: FloatArray) -> None:

@@ -1,4 +1,5 @@
 import copy
+import pickle
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,19 @@ def test_frames_share_no_memory_and_cannot_be_written() -> None:
         with pytest.raises(ValueError, match="read-only"):
             array[0] = 0.0
     assert (len(frame), frame.points.dtype, frame.descriptors.dtype) == (2, np.float64, np.float32)
+
+
+def test_copies_cannot_be_written_either() -> None:
+    """Be they deep or from a file, of one frame or of one built with others: what was found of them stays so."""
+    frame = Measurements(POINTS, LOOKS, np.tile(np.eye(3), (2, 1, 1)))
+    _, part = Measurements._trusted_frames(np.array(POINTS), LOOKS.copy(), [1, 1])
+    for one in (frame, part):
+        for other in (copy.copy(one), copy.deepcopy(one), pickle.loads(pickle.dumps(one))):
+            assert other.extent == one.extent
+            for name in ("points", "descriptors", "covariances"):
+                array, own = getattr(one, name), getattr(other, name)
+                np.testing.assert_array_equal(own, array)
+                assert own is None or not own.flags.writeable
 
 
 def test_nothing_seen_is_a_frame_too() -> None:
