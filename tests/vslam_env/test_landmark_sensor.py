@@ -259,13 +259,15 @@ def test_an_empty_view_gives_an_empty_frame() -> None:
 
 
 def test_very_noisy_disparities_give_no_points_behind_the_camera() -> None:
-    """Where noise swallows the disparity, the point is dropped; all that are reported lie ahead."""
+    """Where noise swallows the disparity, the point is dropped; all that reported lie ahead, and they alone count."""
     camera = StereoCamera(sigma_px=10.0, sigma_disparity_px=8.0)
     sensor = LandmarkSensor(replace(PERFECT, camera=camera), WALL, on_wall([[0.0, 0.0], [1.0, 0.0]]))
     rng = np.random.default_rng(9)
     frames = [sensor.measure(np.zeros((1, 3)), rng)[0] for _ in range(200)]
     assert all(np.all(frame.measurements.points[:, 2] > 0) for frame in frames)
     assert 200 < sum(len(frame.true_ids) for frame in frames) < 400
+    for points, extent in [(frame.measurements.points, frame.measurements.extent) for frame in frames]:
+        assert extent == (points[:, 2].min(initial=np.inf), np.abs(points).max(initial=0.0))
 
 
 @pytest.mark.parametrize(

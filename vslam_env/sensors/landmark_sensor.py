@@ -129,7 +129,8 @@ class LandmarkSensor:
         each = counts.tolist()
         ends = list(accumulate(each))
         own_ids = map(ids.__getitem__, map(slice, [0, *ends], ends))
-        return list(map(Frame, Measurements._trusted_frames(points, looks, each), own_ids))
+        measured = points[: ends[-1]], looks[: ends[-1]]
+        return list(map(Frame, Measurements._trusted_frames(*measured, each), own_ids))
 
     def _false_points(self, count: int, rng: np.random.Generator) -> FloatArray:
         """Draw points (count, 3) [m], camera frame, in the view: uniform in the image and in depth."""
