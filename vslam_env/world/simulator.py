@@ -38,9 +38,10 @@ def _drive_freely(
     clear = True
     for k in range(len(poses)):
         turn = commands[k, 1] * tick
-        chord = commands[k, 0] * tick * (np.sin(0.5 * turn) / (0.5 * turn) if turn != 0.0 else 1.0)
-        goals[k, 0] = poses[k, 0] + chord * np.cos(poses[k, 2] + 0.5 * turn)
-        goals[k, 1] = poses[k, 1] + chord * np.sin(poses[k, 2] + 0.5 * turn)
+        half = 0.5 * turn  # 0 also of the least turn that there is
+        chord = commands[k, 0] * tick * (np.sin(half) / half if half != 0.0 else 1.0)
+        goals[k, 0] = poses[k, 0] + chord * np.cos(poses[k, 2] + half)
+        goals[k, 1] = poses[k, 1] + chord * np.sin(poses[k, 2] + half)
         goals[k, 2] = (poses[k, 2] + turn + np.pi) % (2.0 * np.pi) - np.pi
         reach[k] = radius + abs(chord)
         clear &= np.isfinite(reach[k])
