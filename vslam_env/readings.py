@@ -38,6 +38,8 @@ class Readings(NamedTuple):
 class TeamReadings(NamedTuple):
     """The `Readings` of all K robots in one tick, in one piece each.
 
+    Who takes them in may keep them: nobody is to write to them afterwards.
+
     Attributes:
         odometry: (K, 3) float64 [m, m, rad], or None at a reset.
         measurements: Per robot.
@@ -71,7 +73,7 @@ class TeamReadings(NamedTuple):
                 nothing if self.poses is None else self.poses.copy(),
                 nothing if self.identities is None else [names.copy() for names in self.identities],
                 nothing if self.heard is None else self.heard.copy(),
-                nothing if self.images is None else self.images,
+                nothing if self.images is None else [image.copy() for image in self.images],
             )
         )
 

@@ -102,17 +102,22 @@ def test_impossible_eyes_are_refused() -> None:
 
 
 def test_images_can_be_observed() -> None:
-    """An image observation is a copy of the robot's last left image, inside its space; the rest is as without."""
+    """An image observation is a copy of the robot's last left image, inside its space; the rest is as without.
+
+    So is the image of its readings.
+    """
     plain, seeing = _env(), _env(observe_images=True)
     expected, _ = plain.reset(seed=6)
     observed, _ = seeing.reset(seed=6)
     for _ in range(3):
-        for agent, frame in zip(seeing.agents, seeing.episode.frames, strict=True):
+        for agent, frame, reading in zip(seeing.agents, seeing.episode.frames, seeing.readings, strict=True):
             assert isinstance(frame, EyeFrame)
+            assert reading.image is not None
             assert seeing.observation_space(agent).contains(observed[agent])
             image = observed[agent]["image"]
             np.testing.assert_array_equal(image[:, :, 0], frame.left)
-            image[:] = 0
+            np.testing.assert_array_equal(reading.image, frame.left)
+            image[:] = reading.image[:] = 0
             assert frame.left.any()
             assert set(observed[agent]) == {*expected[agent], "image"}
             np.testing.assert_array_equal(observed[agent]["pose"], expected[agent]["pose"])
