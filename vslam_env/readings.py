@@ -1,12 +1,12 @@
 """`Readings`: all that robots perceive in one tick, and so all that their beliefs and observations can depend on."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend.errors import BoolArray, FloatArray, IntArray, bad_argument
+from slam_backend.errors import BoolArray, FloatArray, IntArray, bad_argument, check_array
 from slam_backend.measurements import Measurements
 
 
@@ -82,7 +82,8 @@ class TeamReadings(NamedTuple):
         """Return the readings of all K robots as those of a team; such that are so already as they are.
 
         Raises:
-            ValueError: If some robots have a kind of reading that others have not, or scans of another length.
+            ValueError: If some robots have a kind of reading that others have not, or scans of another length, or a
+                reading is no array of its shape.
         """
         if isinstance(readings, TeamReadings):
             return readings
@@ -95,17 +96,29 @@ class TeamReadings(NamedTuple):
                 cure = "Give this reading of all robots or of none."
                 raise bad_argument(f"readings[{missing.index(True)}].{name}", "an array", None, cure)
         odometry, measurements, scans, bumps, poses, identities, heard, images = columns
-        for robot, scan in enumerate(scans):
-            if np.shape(scan) != np.shape(scans[0]):
-                name, expected = f"readings[{robot}].scan", f"an array of shape {np.shape(scans[0])}"
-                raise bad_argument(name, expected, f"shape {np.shape(scan)}", "Give a range for each ray.")
+        each = (len(readings),)
         return cls(
-            odometry=None if odometry[0] is None else np.array(odometry, np.float64),
+            odometry=None if odometry[0] is None else _stacked("odometry", odometry, (3,)),
             measurements=measurements,
-            scans=np.array(scans, np.float64),
-            bumps=np.array(bumps, np.bool_),
-            poses=None if poses[0] is None else np.array(poses, np.float64),
+            scans=_stacked("scan", scans, np.shape(scans[0]), finite=False),
+            bumps=_stacked("bump", bumps, (), np.bool_),
+            poses=None if poses[0] is None else _stacked("pose", poses, (3,)),
             identities=None if identities[0] is None else identities,
-            heard=None if heard[0] is None else np.array(heard, np.bool_),
+            heard=None if heard[0] is None else _stacked("heard", heard, each, dtype=None, finite=False),
             images=None if images[0] is None else images,
         )
+
+
+def _stacked(
+    name: str, column: Sequence[Any], shape: tuple[int, ...], dtype: Any = np.float64, finite: bool = True
+) -> NDArray[Any]:
+    """Return one kind of reading of all K robots as one array (K, ...), or raise by name of the robot's that is wrong.
+
+    A fresh array; `dtype`, None for any, and `finite` as `check_array` takes them.
+    """
+    cure = "Give what env.readings holds of each robot."
+    checked = [
+        check_array(f"readings[{robot}].{name}", value, shape, cure, dtype=dtype, finite=finite)
+        for robot, value in enumerate(column)
+    ]
+    return np.array(checked)

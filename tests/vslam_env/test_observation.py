@@ -85,6 +85,34 @@ def test_readings_of_a_team_are_those_of_its_robots() -> None:
         TeamReadings.gathered([first._replace(heard=None), second])
 
 
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("odometry", np.zeros(2), r"readings\[1\]\.odometry: expected an array of shape \(3,\), got shape \(2,\)"),
+        ("odometry", "ahead", r"readings\[1\]\.odometry: expected an array of shape \(3,\), got 'ahead'"),
+        ("odometry", [0.0, np.nan, 0.0], r"readings\[1\]\.odometry: expected finite numbers, got NaN"),
+        ("measurements", None, r"readings\[1\]\.measurements: expected an array, got None"),
+        ("scan", "far", r"readings\[1\]\.scan: expected an array of shape \(32,\), got 'far'"),
+        ("bump", np.zeros(2, np.bool_), r"readings\[1\]\.bump: expected an array of shape \(\), got shape \(2,\)"),
+        ("pose", np.zeros(2), r"readings\[1\]\.pose: expected an array of shape \(3,\), got shape \(2,\)"),
+        ("heard", np.ones(3, np.bool_), r"readings\[1\]\.heard: expected an array of shape \(2,\), got shape \(3,\)"),
+        ("heard", np.ones(2, np.int64), r"contacts: expected a symmetric array of bools, got"),
+    ],
+)
+def test_readings_that_make_no_sense_are_refused(name: str, value: Any, message: str) -> None:
+    """The error names the reading and its robot, and the beliefs are as before."""
+    env = small_env(comm_loss=0.5, oracle_pose=True)
+    readings, _ = _record(env, 2)
+    episode = env.episode
+    whole, refusing = (TeamBelief(env.config.belief, 2, episode.belief_seed, episode.body) for _ in range(2))
+    whole.step(readings[0]), refusing.step(readings[0])
+    first, second = readings[1]
+    with pytest.raises(ValueError, match=message):
+        refusing.step([first, second._replace(**{name: value})])
+    whole.step(readings[1]), refusing.step(readings[1])
+    np.testing.assert_array_equal(refusing.poses, whole.poses)
+
+
 @pytest.mark.parametrize("observation_type", ["dict", "flat"])
 @pytest.mark.parametrize("action_type", ["continuous", "discrete", "goal"])
 def test_observations_are_inside_their_spaces(action_type: str, observation_type: str) -> None:
