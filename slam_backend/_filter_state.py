@@ -12,7 +12,7 @@ from slam_backend._frame_buffers import FrameBuffers, Frames
 from slam_backend._kernels import add_share
 from slam_backend._kernels.layout import CAMERA, RECOVERY
 from slam_backend._mixtures import pose_mixtures
-from slam_backend._particle_maps import ParticleMaps
+from slam_backend._particle_maps import MAPS_KEPT, ParticleMaps
 from slam_backend._rejuvenated_maps import write_maps
 from slam_backend._rejuvenation_step import RejuvenationStep
 from slam_backend._turns import assumed
@@ -162,6 +162,7 @@ class FilterState(FilterArrays):
             ValueError: If `state` is not one of `get_state`.
         """
         missing = [name for name in (*KEPT, *OTHERS_KEPT) if name not in state]
+        missing = missing or [f"maps.{name}" for name in MAPS_KEPT if name not in state["maps"]]
         if missing:
             raise bad_argument("state", "a dict from FastSlam.get_state", f"no {missing[0]!r}", "Pass it unchanged.")
         shapes = [state[name].shape == getattr(self, name).shape for name in ("_poses", "_weights")]

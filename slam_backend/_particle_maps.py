@@ -19,6 +19,10 @@ from slam_backend._map_store import MapStore
 from slam_backend.errors import FloatArray, IntArray
 
 MAX_MAPS = 512  # slots whose map is the oldest are brought up to date rather than keep more maps than this
+MAPS_KEPT = (  # in a state
+    "num_particles", "values", "counts", "odds", "maps", "map_of", "ids", "identities", "last_seen", "descriptors",
+    "next_id",
+)  # fmt: skip
 
 
 class ParticleMaps(MapStore):

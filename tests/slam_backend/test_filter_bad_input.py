@@ -117,6 +117,10 @@ def test_unknown_estimates_and_states_are_refused() -> None:
         part = {key: value for key, value in state.items() if key != name}
         with pytest.raises(ValueError, match=rf"^state: expected a dict from FastSlam\.get_state, got no '{name}'\."):
             slam.set_state(part)
+    for name in state["maps"]:
+        maps = {key: value for key, value in state["maps"].items() if key != name}
+        with pytest.raises(ValueError, match=rf"^state: expected a dict from .*, got no 'maps\.{name}'\."):
+            slam.set_state(state | {"maps": maps})
     assert_same(slam.get_state(), state)
 
 
