@@ -78,6 +78,7 @@ class Episode:
         self._collisions = np.zeros(config.num_robots, np.int64)
         self._figures = np.zeros((NUM_FIGURES, config.num_robots))  # of `Standing`; ways are added up in their row
         self._found, self._distances = self._figures[FOUND], self._figures[DISTANCES]
+        self._poses: FloatArray  # (K, 3) after the last tick, world frame; set by `begin`
         self.true_path: list[FloatArray] = []
         self.estimated_path: list[FloatArray] = []
         self.merge_ticks: list[tuple[int, tuple[int, ...], tuple[int, ...]]] = []
@@ -105,7 +106,7 @@ class Episode:
 
     def advance(self, commands: Any) -> None:
         """Drive all robots with velocity commands (K, 2) [m/s, rad/s] for a tick, and let them perceive and believe."""
-        before = self.true_path[-1]
+        before = self._poses
         touched = self._simulator.step(commands)
         self.tick += 1
         after, bumped = self._simulator.poses, self._simulator.bumped
@@ -121,7 +122,7 @@ class Episode:
 
     def standing(self) -> Standing:
         """Return how the team stands now: its maps and poses are scored."""
-        belief, poses = self.belief, self.true_path[-1]
+        belief, poses = self.belief, self._poses
         self.ledger.score(belief.outlines, belief.points, self.true_starts, poses, self._figures)
         coverage = self._coverage.update(belief.grids, poses, self._found)
         return Standing(
@@ -159,6 +160,7 @@ class Episode:
         if state["setting"] is not self.setting:
             self._settle(state["setting"])
         self._simulator.set_state(state["simulator"])
+        self._poses = self._simulator.poses
         for name, stream in state["streams"].items():
             self._streams[name].bit_generator.state = stream
         self.belief.set_state(state["belief"])
@@ -196,7 +198,8 @@ class Episode:
             self.merge_ticks.append((self.tick, made.robots_a, made.robots_b))
         if config.oracle_merge:
             self._merge_by_oracle(reach(heard, config.num_robots))
-        self.true_path.append(poses)
+        self._poses = poses
+        self.true_path.append(poses.copy())  # whoever writes to that moves no robot
         self.estimated_path.append(self.belief.poses)
 
     def _contacts(self, poses: FloatArray) -> BoolArray | None:

@@ -21,7 +21,7 @@ def _handed_out(env: ExplorationEnv, results: Any) -> list[Any]:
     agents = env.possible_agents
     beliefs = [env.belief(agent) for agent in agents]
     rows = [{f.name: getattr(b, f.name) for f in dataclasses.fields(b) if f.name != "grid"} for b in beliefs]
-    truth = [env.true_poses, env.true_start_poses, env.true_landmarks, env.state()]
+    truth = [env.true_poses, env.true_start_poses, env.true_landmarks, env.state(), env.episode.true_path[-1]]
     return [results, rows, [belief.map for belief in beliefs], truth, env.readings, env.events, env._standing]
 
 
