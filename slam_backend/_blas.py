@@ -4,16 +4,17 @@ from collections.abc import Callable
 from functools import cache, wraps
 from typing import ParamSpec, TypeVar
 
-from threadpoolctl import ThreadpoolController
+from threadpoolctl import LibController, ThreadpoolController
 
 P = ParamSpec("P")
 R = TypeVar("R")
 
 
 @cache
-def _controller() -> ThreadpoolController:
-    """Return what sets the threads of the libraries loaded by now, found once, as finding them takes milliseconds."""
-    return ThreadpoolController()
+def _libraries() -> list[LibController]:
+    """Return what sets the threads of the BLAS loaded by now, found once, as finding it takes milliseconds."""
+    libraries: list[LibController] = ThreadpoolController().select(user_api="blas").lib_controllers
+    return libraries
 
 
 def on_one_thread(function: Callable[P, R]) -> Callable[P, R]:
@@ -21,7 +22,14 @@ def on_one_thread(function: Callable[P, R]) -> Callable[P, R]:
 
     @wraps(function)
     def limited(*args: P.args, **kwargs: P.kwargs) -> R:
-        with _controller().limit(limits=1, user_api="blas"):
+        threads = [(library, library.num_threads) for library in _libraries()]
+        many = [(library, number) for library, number in threads if number != 1]
+        for library, _ in many:
+            library.set_num_threads(1)
+        try:
             return function(*args, **kwargs)
+        finally:
+            for library, number in many:
+                library.set_num_threads(number)
 
     return limited

@@ -261,7 +261,7 @@ class RejuvenationStep:
     def _keep(self, graph: PathGraph) -> None:
         """Go on from a graph at its mode."""
         self._graph, self._failures = graph, 0
-        for guesses, refused, latest in zip(self._guesses, self._refused, graph.latest, strict=True):
+        for guesses, refused, latest in zip(self._guesses, self._refused, graph.latest.tolist(), strict=True):
             for step in [step for step in guesses if step <= latest]:
                 del guesses[step]
                 refused.pop(step, None)

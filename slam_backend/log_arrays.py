@@ -1,7 +1,7 @@
 """`LogArrays`: steps of one robot's run as flat, read-only arrays, the form in which a smoother takes them."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any, Final, NamedTuple, cast
 
 import numpy as np
@@ -65,7 +65,8 @@ class LogArrays:
     descriptor_rows: IntArray | None
 
     def __post_init__(self) -> None:
-        for array in self._columns().values():
+        for name in self.__slots__:
+            array = getattr(self, name)
             if array is not None:
                 array.setflags(write=False)
 
@@ -85,7 +86,7 @@ class LogArrays:
 
     def _columns(self) -> dict[str, Any]:
         """Return all arrays by name."""
-        return {column.name: getattr(self, column.name) for column in fields(self)}
+        return {name: getattr(self, name) for name in self.__slots__}
 
     def row(self, t: int) -> LogStep:
         """Return row t, 0 <= t < T."""

@@ -145,19 +145,20 @@ class RobotLog:
             self._descriptor_rows = np.full(len(self._ids), -1, dtype=np.int64)
         return self._descriptor_rows
 
-    def _unfinished(self) -> LogArrays:
-        """Return a copy of the open chunk, no longer than what it holds."""
-        t, n = self._num_rows, self._num_measurements
+    def _unfinished(self, first: int = 0) -> LogArrays:
+        """Return a copy of the open chunk from a row on, no longer than what it holds."""
+        t, start = self._num_rows, int(self._starts[first])
+        measured = slice(start, self._num_measurements)
         return LogArrays(
-            steps=self._steps[:t].copy(),
-            kinds=self._kinds[:t].copy(),
-            motions=self._motions[:t].copy(),
-            given=self._given[:t].copy(),
-            starts=self._starts[: t + 1].copy(),
-            points=self._points[:n].copy(),
-            ids=self._ids[:n].copy(),
-            covariances=None if self._covariances is None else self._covariances[:n].copy(),
-            descriptor_rows=None if self._descriptor_rows is None else self._descriptor_rows[:n].copy(),
+            steps=self._steps[first:t].copy(),
+            kinds=self._kinds[first:t].copy(),
+            motions=self._motions[first:t].copy(),
+            given=self._given[first:t].copy(),
+            starts=self._starts[first : t + 1] - start,
+            points=self._points[measured].copy(),
+            ids=self._ids[measured].copy(),
+            covariances=None if self._covariances is None else self._covariances[measured].copy(),
+            descriptor_rows=None if self._descriptor_rows is None else self._descriptor_rows[measured].copy(),
         )
 
     # ------------------------------------------------------------------ reading
@@ -190,6 +191,8 @@ class RobotLog:
         first = len(self._chunks)
         while first > 0 and self._chunks[first - 1].steps[-1] >= since:
             first -= 1
+        if first == len(self._chunks):
+            return self._unfinished(bisect_left(self._steps, since, 0, self._num_rows))
         return join([*self._chunks[first:], self._unfinished()]).since(since)
 
     @property

@@ -5,7 +5,6 @@ keys than allowed, those neighbours become one whose relative pose is known best
 first, what was measured from it is moved there, and the odometry between them is spent.
 """
 
-from dataclasses import replace
 
 import numpy as np
 
@@ -53,8 +52,7 @@ def coarsened(graph: PathGraph, camera: FloatArray, options: SmoothingOptions) -
         rows, seen.keys, seen.landmarks, seen.centres, seen.infos, seen.slopes, seen.counts, roots, offsets,
         frozen_keys, frozen_landmarks, centres, infos, slopes, counts,
     )  # fmt: skip
-    fewer = replace(
-        graph,
+    fewer = graph.with_columns(
         robots=graph.robots[kept],
         poses=graph.poses[kept],
         previous=previous[kept],
@@ -79,15 +77,14 @@ def coarsened(graph: PathGraph, camera: FloatArray, options: SmoothingOptions) -
 def at_mode(graph: PathGraph, mode: Mode, spreads: FloatArray | None = None) -> PathGraph:
     """Return the graph with the poses and landmarks of the mode, and the spreads (k,) [m^2] of motions there."""
     spreads = graph.spreads if spreads is None else spreads
-    return replace(graph, poses=mode.poses, landmarks=mode.landmarks, spreads=spreads)
+    return graph.with_columns(poses=mode.poses, landmarks=mode.landmarks, spreads=spreads)
 
 
 def compacted(graph: PathGraph) -> PathGraph:
     """Return the graph without the frames from which, and the landmarks of which, nothing was measured."""
     frames, of_frames = _used(len(graph.frame_keys), graph.point_frames)
     landmarks, of_landmarks = _used(len(graph.landmark_ids), graph.point_landmarks, graph.frozen_landmarks)
-    return replace(
-        graph,
+    return graph.with_columns(
         frame_keys=graph.frame_keys[frames],
         frame_offsets=graph.frame_offsets[frames],
         point_frames=of_frames[graph.point_frames],
@@ -115,7 +112,7 @@ def _consistent(
     if options.kernel:
         lost = seen.squares > CONTRADICTION * options.kernel
         if lost.any() and (lost := lost & ~raw[graph.frame_keys[graph.point_frames]]).any():
-            graph = replace(graph, **_of_points(graph, ~lost))
+            graph = graph.with_columns(**_of_points(graph, ~lost))
             seen = _linearised(graph, camera, options)
     return graph, seen
 

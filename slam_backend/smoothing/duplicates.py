@@ -1,6 +1,5 @@
 """Landmarks that a smoothed path reveals to be one: they look alike, lie in one place, and were never seen together."""
 
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,8 +75,7 @@ def without_duplicates(graph: PathGraph, duplicates: IntArray) -> PathGraph:
     known = [(row[int(old)], row[int(kept)]) for old, kept in duplicates if int(old) in row and int(kept) in row]
     for old, kept in known:
         new[old] = kept
-    return replace(
-        graph,
+    return graph.with_columns(
         point_landmarks=new[graph.point_landmarks],
         frozen_landmarks=new[graph.frozen_landmarks],
         aliases=np.concatenate([graph.aliases, duplicates]),

@@ -1,7 +1,6 @@
 """`extended`: a graph takes in what the robots did since; steps without measurements are chained away."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -94,8 +93,7 @@ def extended(
     landmark_ids, landmarks, rows = _with_new(graph, ids, first_seen)
     if places is not None and len(places.ids) and guesses is not None and all(map(_guided, logs, guesses)):
         landmarks = _started(graph, landmark_ids, landmarks, rows, places)
-    return replace(
-        graph,
+    return graph.with_columns(
         robots=np.concatenate([graph.robots, *(np.full(len(part.poses), i) for i, part in enumerate(parts))]),
         poses=poses,
         previous=np.concatenate(previous),

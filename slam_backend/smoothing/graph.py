@@ -1,9 +1,10 @@
 """`PathGraph`: key poses of all robots, the odometry between them, and what was measured there. It never changes."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from slam_backend.errors import BoolArray, FloatArray, IntArray
 from slam_backend.geometry import between, wrap_angle
@@ -24,7 +25,7 @@ def _no_index() -> IntArray:
     return np.zeros(0, dtype=np.int64)
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class PathGraph:
     """What a smoother knows of a run.
 
@@ -84,8 +85,8 @@ class PathGraph:
     latest: IntArray
 
     def __post_init__(self) -> None:
-        for name in self.__dataclass_fields__:
-            getattr(self, name).setflags(write=False)
+        for column in vars(self).values():
+            column.setflags(write=False)
 
     @classmethod
     def at_starts(cls, starts: FloatArray) -> "PathGraph":
@@ -133,7 +134,21 @@ class PathGraph:
         """Return the graph in which robot i is the one that was `order[i]`; (K,) a permutation."""
         robots = self.robots.copy()
         robots[self.robots >= 0] = np.argsort(order)[self.robots[self.robots >= 0]]
-        return replace(self, robots=robots, heads=self.heads[order], tips=self.tips[order], latest=self.latest[order])
+        return self.with_columns(
+            robots=robots, heads=self.heads[order], tips=self.tips[order], latest=self.latest[order]
+        )
+
+    def with_columns(self, **columns: NDArray[Any]) -> "PathGraph":
+        """Return the graph with some columns in place of its own, which cannot be written either from now on.
+
+        As `dataclasses.replace`, but that those that stay are not looked at anew.
+        """
+        assert columns.keys() <= vars(self).keys()
+        for column in columns.values():
+            column.setflags(write=False)
+        other = object.__new__(PathGraph)
+        vars(other).update(vars(self), **columns)
+        return other
 
     def known_as(self, ids: IntArray) -> IntArray:
         """Return the names by which landmarks `ids` (n,) int64 go, `aliases` applied."""
@@ -144,7 +159,7 @@ class PathGraph:
 
     def to_mapping(self) -> dict[str, Any]:
         """Return all arrays by name; they cannot be written."""
-        return {name: getattr(self, name) for name in self.__dataclass_fields__}
+        return dict(vars(self))
 
     @property
     def linked(self) -> BoolArray:
@@ -164,7 +179,7 @@ class PathGraph:
     @property
     def nbytes(self) -> int:
         """Bytes of all arrays."""
-        return sum(getattr(self, name).nbytes for name in self.__dataclass_fields__)
+        return sum(column.nbytes for column in vars(self).values())
 
 
 def mean_pose(poses: FloatArray) -> FloatArray:

@@ -1,7 +1,6 @@
 """Two graphs become one, as their groups do at a merge: nothing of what either has smoothed is done again."""
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -74,7 +73,7 @@ def _moved(graph: PathGraph, motion: FloatArray) -> PathGraph:
     """Return the graph with poses and landmarks in another frame; links from the origin are as they were."""
     landmarks = graph.landmarks.copy()
     landmarks[:, :2] = landmarks[:, :2] @ rotation(motion[2]).T + motion[:2]
-    return replace(graph, poses=compose(motion, graph.poses), landmarks=landmarks)
+    return graph.with_columns(poses=compose(motion, graph.poses), landmarks=landmarks)
 
 
 def _named(graph: PathGraph, names: Mapping[int, int]) -> PathGraph:
@@ -83,8 +82,7 @@ def _named(graph: PathGraph, names: Mapping[int, int]) -> PathGraph:
     kept = new >= 0
     row = np.cumsum(kept) - 1
     aliases = [(names[old], names[by]) for old, by in graph.aliases.tolist() if old in names and by in names]
-    return replace(
-        graph,
+    return graph.with_columns(
         **_rows(graph, OF_POINTS, kept[graph.point_landmarks], row),
         **_rows(graph, OF_FROZEN, kept[graph.frozen_landmarks], row),
         landmark_ids=new[kept],
@@ -113,14 +111,13 @@ def _unpinned(graph: PathGraph, prior: FloatArray) -> tuple[IntArray, PathGraph]
     if len(given):
         motions[given] = between(graph.poses[given[0]], graph.poses[given])
     previous[free], motions[free], noises[free] = NONE, graph.poses[free], prior
-    graph = replace(graph, previous=previous, motions=motions, noises=noises)
+    graph = graph.with_columns(previous=previous, motions=motions, noises=noises)
     if not len(origin):
         return free, graph
     kept = graph.robots >= 0
     number = np.cumsum(kept) - 1
     per_key = ("robots", "poses", "motions", "noises", "spreads", "slack")
-    return number[free], replace(
-        graph,
+    return number[free], graph.with_columns(
         **{name: getattr(graph, name)[kept] for name in per_key},
         previous=np.where(previous >= 0, number[previous], NONE)[kept],
         **{name: number[getattr(graph, name)] for name in ("frame_keys", "frozen_keys", "heads", "tips")},
@@ -129,8 +126,7 @@ def _unpinned(graph: PathGraph, prior: FloatArray) -> tuple[IntArray, PathGraph]
 
 def _with_origin(graph: PathGraph) -> PathGraph:
     """Return the graph with a key at the origin of its frame."""
-    return replace(
-        graph,
+    return graph.with_columns(
         robots=np.append(graph.robots, NONE),
         poses=np.concatenate([graph.poses, np.zeros((1, 3))]),
         previous=np.append(graph.previous, NONE),
