@@ -5,7 +5,6 @@ keys than allowed, those neighbours become one whose relative pose is known best
 first, what was measured from it is moved there, and the odometry between them is spent.
 """
 
-
 import numpy as np
 
 from slam_backend.errors import BoolArray, FloatArray, IntArray

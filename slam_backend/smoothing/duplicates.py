@@ -1,6 +1,5 @@
 """Landmarks that a smoothed path reveals to be one: they look alike, lie in one place, and were never seen together."""
 
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
