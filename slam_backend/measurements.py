@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,31 +58,6 @@ class Measurements:
     def __len__(self) -> int:
         return len(self.points)
 
-    @classmethod
-    def _trusted_frames(
-        cls, points: FloatArray, descriptors: NDArray[np.float32], counts: Sequence[int]
-    ) -> "list[Measurements]":
-        """Build frames in a hot loop: no copies, no checks. The caller must not write to the arrays afterwards.
-
-        Args:
-            points, descriptors: Of several frames, so many (n_i) of each one after the other.
-            counts: These.
-        """
-        points.setflags(write=False)  # and so all views of them
-        descriptors.setflags(write=False)
-        extent = _kernels.extent(points)  # what bounds all bounds those of each
-        frames, begin, put = [], 0, object.__setattr__
-        for count in counts:
-            end = begin + count
-            frame = object.__new__(cls)
-            put(frame, "points", points[begin:end])
-            put(frame, "descriptors", descriptors[begin:end])
-            put(frame, "covariances", None)
-            put(frame, "extent", extent)
-            frames.append(frame)
-            begin = end
-        return frames
-
     def __reduce__(self) -> tuple[Any, ...]:
         """Let copies and what was pickled be read-only, too: else the extent would not follow what is written there."""
         return _restored, (self.points, self.descriptors, self.covariances, self.extent)
@@ -93,10 +68,41 @@ class Measurements:
         return cls(np.empty((0, 3)), np.empty((0, descriptor_size), dtype=np.float32))
 
 
+class TeamMeasurements(NamedTuple):
+    """The frames of several robots in one piece, without covariances; each is cut out for who wants to look at it.
+
+    Attributes:
+        points: (n, 3) float64 [m], read-only. Each in the frame of its camera, robot by robot.
+        descriptors: (n, d) float32, read-only. Likewise.
+        ends: Per robot where its points end; they begin where those before it end.
+        extent: Of all points, as of `Measurements`.
+    """
+
+    points: FloatArray
+    descriptors: NDArray[np.float32]
+    ends: Sequence[int]
+    extent: tuple[float, float]
+
+    @classmethod
+    def trusted(cls, points: FloatArray, descriptors: NDArray[np.float32], ends: Sequence[int]) -> Self:
+        """Build them in a hot loop: no copies, no checks. The caller must not write to the arrays afterwards."""
+        points.setflags(write=False)
+        descriptors.setflags(write=False)
+        return cls(points, descriptors, ends, _kernels.extent(points))
+
+    def of_each(self) -> list[Measurements]:
+        """Return the frame of each robot. They share memory with this, and its extent: what bounds all bounds each."""
+        begins = [0, *self.ends[:-1]]
+        return [
+            _restored(self.points[begin:end], self.descriptors[begin:end], None, self.extent)
+            for begin, end in zip(begins, self.ends, strict=True)
+        ]
+
+
 def _restored(
     points: FloatArray, descriptors: NDArray[np.float32], covariances: FloatArray | None, extent: tuple[float, float]
 ) -> Measurements:
-    """Return the copy of a frame that holds these arrays, its own."""
+    """Return a frame of arrays that were checked before and that nobody else writes to."""
     frame, put = object.__new__(Measurements), object.__setattr__
     for name, value in zip(Measurements.__slots__, (points, descriptors, covariances, extent), strict=True):
         if isinstance(value, np.ndarray):

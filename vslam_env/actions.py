@@ -44,25 +44,29 @@ def checked_actions(actions: Any, agents: Sequence[str], action_type: str) -> li
         gone = next(agent for agent in agents if agent not in actions)
         raise bad_argument("actions", f"an action of {gone!r}", f"no {gone!r}", "All agents act at once.")
     if action_type == "continuous":
-        return [_continuous_command(agent, actions[agent]) for agent in agents]
+        return _continuous_commands(actions, agents)
     if action_type == "discrete":
         limit = len(DISCRETE_COMMANDS)
         return [DISCRETE_COMMANDS[_checked_index(agent, actions[agent], limit)] for agent in agents]
     return [_checked_index(agent, actions[agent], NUM_ACTIONS) for agent in agents]
 
 
-def _continuous_command(agent: str, action: Any) -> tuple[float, float]:
-    """Return the velocity command [m/s, rad/s] of a pair in [-1, 1], or raise.
+def _continuous_commands(actions: Mapping[str, Any], agents: Sequence[str]) -> list[tuple[float, float]]:
+    """Return the velocity commands [m/s, rad/s] of pairs in [-1, 1], or raise.
 
-    It is scaled to the limits of either direction, so that zeros stand still.
+    They are scaled to the limits of either direction, so that zeros stand still.
     """
-    if type(action) is np.ndarray and action.shape == (2,) and action.dtype.kind == "f":  # what nearly all send
-        speed, turn = action.tolist()
-    else:
-        speed, turn = _pair(agent, action)
-    if not (-1.0 <= speed <= 1.0 and -1.0 <= turn <= 1.0):  # false for NaN
-        raise bad_argument(f"actions[{agent!r}]", "two numbers in [-1, 1]", [speed, turn], PAIR_CURE)
-    return speed * (MAX_SPEED if speed > 0.0 else MAX_REVERSE), turn * MAX_TURN
+    commands = []
+    for agent in agents:
+        action = actions[agent]
+        if type(action) is np.ndarray and action.shape == (2,) and action.dtype.kind == "f":  # what nearly all send
+            speed, turn = action.tolist()
+        else:
+            speed, turn = _pair(agent, action)
+        if not (-1.0 <= speed <= 1.0 and -1.0 <= turn <= 1.0):  # false for NaN
+            raise bad_argument(f"actions[{agent!r}]", "two numbers in [-1, 1]", [speed, turn], PAIR_CURE)
+        commands.append((speed * (MAX_SPEED if speed > 0.0 else MAX_REVERSE), turn * MAX_TURN))
+    return commands
 
 
 def _pair(agent: str, action: Any) -> tuple[float, float]:

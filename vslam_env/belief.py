@@ -12,6 +12,7 @@ from slam_backend.errors import FloatArray, IntArray, bad_argument
 from slam_backend.filter_options import FilterOptions
 from slam_backend.geometry import rotate_covariances
 from slam_backend.landmark_map import LandmarkMap, TeamOutlines
+from slam_backend.measurements import TeamMeasurements
 from slam_backend.reports import MergeEvent, Renaming, TeamReport
 from slam_backend.standpoints import Standpoints
 from slam_backend.team import TeamSlam
@@ -54,16 +55,12 @@ class TeamBelief:
         rhythm = config.attempts if attempts else replace(config.attempts, enabled=False)
         merging = config.merging if attempts else replace(config.merging, watch_steps=0)
         self._team = TeamSlam(num_robots, config.alignment, seed, rhythm, merging, **options)
-        self._decision_ticks = decision_ticks
         self._body = body
         self._grids = SharedGrids(num_robots, body)
         self._candidates = TeamSlots(num_robots)
         self._slots = self._candidates.slots
         self._robots = np.arange(num_robots)
-        self._turns = [
-            [robot for robot in range(num_robots) if robot * CANDIDATE_TICKS // num_robots == tick]
-            for tick in range(CANDIDATE_TICKS)
-        ]
+        self._turns = _turns(num_robots, decision_ticks)
         self._tick = -1
         self._confirm_after = config.confirm_after
         self._beliefs: dict[int, Belief] = {}  # of this tick, made when asked for
@@ -107,14 +104,16 @@ class TeamBelief:
         Raises:
             ValueError: If a reading is ill-formed, or some robots have a kind of reading that others have not.
         """
-        readings = TeamReadings.gathered(readings)
+        if not isinstance(readings, TeamReadings):
+            readings = TeamReadings.gathered(readings)
         shape = len(self._robots), len(self._body.ray_angles)
         if readings.scans.shape != shape:
             got, cure = f"shape {readings.scans.shape}", "Give a range for each ray of each robot."
             raise bad_argument("readings.scans", f"an array of shape {shape}", got, cure)
+        frames = readings.measurements
         report = self._team.step(
             [None] * len(self._robots) if readings.odometry is None else readings.odometry,
-            readings.measurements,
+            frames.of_each() if isinstance(frames, TeamMeasurements) else frames,
             readings.heard,
             readings.identities,
             None if readings.poses is None else list(readings.poses),
@@ -125,7 +124,7 @@ class TeamBelief:
         points = self._points
         self._grids.meet(self._lineup.mates, points.starts)
         self._grids.paint(self._tick, points.poses, readings.scans, readings.bumps)
-        for robot in self._whose_candidates_are_due():
+        for robot in self._turns[self._tick % len(self._turns)] if self._tick else range(len(self._robots)):
             self._slots[robot].update(self._grids[robot].cells, points.own[robot], self._mates_around(robot))
         return report
 
@@ -267,11 +266,12 @@ class TeamBelief:
             group_map=self.group_map(robot),
         )
 
-    def _whose_candidates_are_due(self) -> Sequence[int]:
-        """Return the robots whose candidates are to be renewed in this tick."""
-        robots = range(len(self._robots))
-        if self._tick == 0:
-            return robots
-        if self._decision_ticks is not None:
-            return () if self._tick % self._decision_ticks else robots
-        return self._turns[self._tick % CANDIDATE_TICKS]
+
+def _turns(num_robots: int, decision_ticks: int | None) -> Sequence[Sequence[int]]:
+    """Return per tick, after the first one, whose candidates are renewed; then it begins anew."""
+    if decision_ticks is not None:
+        return [range(num_robots), *[()] * (decision_ticks - 1)]
+    return [
+        [robot for robot in range(num_robots) if robot * CANDIDATE_TICKS // num_robots == tick]
+        for tick in range(CANDIDATE_TICKS)
+    ]

@@ -16,7 +16,7 @@ from vslam_env.config import TICK, EnvConfig
 from vslam_env.coverage import Coverage
 from vslam_env.oracle import true_alignment
 from vslam_env.readings import Readings, TeamReadings
-from vslam_env.sensors import EyeFrame, Frame
+from vslam_env.sensors import EyeFrame, EyeFrames, Frame, Frames
 from vslam_env.setting import Setting
 from vslam_env.standing import DISTANCES, FOUND, NUM_FIGURES, Standing
 from vslam_env.world import Simulator, read_odometry
@@ -51,7 +51,6 @@ class Episode:
         ledger: What their landmarks are in truth.
         tick: Ticks since the reset.
         readings: Of the last tick; none before `begin`.
-        frames: Of the last tick, with the true landmarks behind the measurements.
         true_path: Poses (K, 3) after each tick, world frame.
         estimated_path: Poses (K, 3) as estimated after each tick, each in the robot's own start frame.
         merge_ticks: Tick and groups of each merge.
@@ -60,6 +59,7 @@ class Episode:
     def __init__(self, config: EnvConfig, setting: Setting, tap: Tap | None = None) -> None:
         self._config = config
         self._tap = Tap() if tap is None else tap
+        self._all_hear_all = config.always_in_contact
         self._streams = {name: np.random.default_rng(0) for name in setting.stream_states}
         self._settle(setting)
         self.body = Body(
@@ -78,12 +78,11 @@ class Episode:
         self._collisions = np.zeros(config.num_robots, np.int64)
         self._figures = np.zeros((NUM_FIGURES, config.num_robots))  # of `Standing`; ways are added up in their row
         self._found, self._distances = self._figures[FOUND], self._figures[DISTANCES]
-        self._poses: FloatArray  # (K, 3) after the last tick, world frame; set by `begin`
         self.true_path: list[FloatArray] = []
         self.estimated_path: list[FloatArray] = []
         self.merge_ticks: list[tuple[int, tuple[int, ...], tuple[int, ...]]] = []
         self.readings: TeamReadings  # set by `begin`
-        self.frames: Sequence[Frame | EyeFrame] = []
+        self._frames: Frames | EyeFrames  # likewise
 
     def _settle(self, setting: Setting) -> None:
         """Move into a setting, as at its reset."""
@@ -97,24 +96,26 @@ class Episode:
 
     def begin(self) -> None:
         """Let the robots take their first frame."""
-        self._perceive(self._simulator.poses, self._simulator.bumped, None)
+        self._perceive(None)
 
     @property
     def true_poses(self) -> FloatArray:
         """(K, 3) float64 [m, m, rad], world frame. A copy."""
-        return self._simulator.poses
+        return self._simulator.poses.copy()
+
+    @property
+    def frames(self) -> Sequence[Frame | EyeFrame]:
+        """Each robot's frame of the last tick, with the true landmarks behind its measurements."""
+        return self._frames.of_each()
 
     def advance(self, commands: Any) -> None:
         """Drive all robots with velocity commands (K, 2) [m/s, rad/s] for a tick, and let them perceive and believe."""
-        before = self._poses
-        touched = self._simulator.step(commands)
+        simulator, noise, stream = self._simulator, self._config.odometry, self._streams["odometry"]
+        before = simulator.poses
+        if simulator.step(commands):
+            self._collisions = self._collisions + simulator.bumped  # anew, for standings hold what was before
         self.tick += 1
-        after, bumped = self._simulator.poses, self._simulator.bumped
-        if touched:
-            self._collisions += bumped
-        noise, stream = self._config.odometry, self._streams["odometry"]
-        odometry = read_odometry(before, after, self.setting.bias, noise, stream, self._distances)
-        self._perceive(after, bumped, odometry)
+        self._perceive(read_odometry(before, simulator.poses, self.setting.bias, noise, stream, self._distances))
 
     def believed_poses(self) -> FloatArray:
         """Return where the robots believe to be (K, 3) [m, m, rad], laid at their true starts, world frame."""
@@ -122,12 +123,12 @@ class Episode:
 
     def standing(self) -> Standing:
         """Return how the team stands now: its maps and poses are scored."""
-        belief, poses = self.belief, self._poses
+        belief, poses = self.belief, self._simulator.poses
         self.ledger.score(belief.outlines, belief.points, self.true_starts, poses, self._figures)
         coverage = self._coverage.update(belief.grids, poses, self._found)
         return Standing(
             figures=self._figures.copy(),
-            collisions=self._collisions.copy(),
+            collisions=self._collisions,
             bytes_sent=belief.bytes_sent,
             coverage=coverage,
             merges=len(self.merge_ticks),
@@ -146,8 +147,8 @@ class Episode:
             "belief": self.belief.get_state(),
             "ledger": self.ledger.get_state(),
             "coverage": self._coverage.get_state(),
-            "counts": (self._collisions.copy(), self._distances.copy()),
-            "last": (self.readings, tuple(self.frames)),
+            "counts": (self._collisions, self._distances.copy()),
+            "last": (self.readings, self._frames),
             "paths": (tuple(self.true_path), tuple(self.estimated_path), tuple(self.merge_ticks)),
         }
 
@@ -160,53 +161,48 @@ class Episode:
         if state["setting"] is not self.setting:
             self._settle(state["setting"])
         self._simulator.set_state(state["simulator"])
-        self._poses = self._simulator.poses
         for name, stream in state["streams"].items():
             self._streams[name].bit_generator.state = stream
         self.belief.set_state(state["belief"])
         self.ledger.set_state(state["ledger"])
         self._coverage.set_state(state["coverage"])
         self.tick = state["tick"]
-        self._collisions[:], self._distances[:] = state["counts"]
-        self.readings, self.frames = state["last"][0], list(state["last"][1])
+        self._collisions, self._distances[:] = state["counts"]
+        self.readings, self._frames = state["last"]
         self.true_path, self.estimated_path, self.merge_ticks = (list(path) for path in state["paths"])
 
     # ------------------------------------------------------------------ within
 
-    def _perceive(self, poses: FloatArray, bumped: BoolArray, odometry: FloatArray | None) -> None:
-        """Read all sensors at the true poses (K, 3), and let the robots take it in; (K,) `bumped` into something."""
-        config = self._config
-        self.frames = self.setting.sensor.measure(poses, self._streams["sensor"])
+    def _perceive(self, odometry: FloatArray | None) -> None:
+        """Read all other sensors at the true poses, and let the robots take it in."""
+        config, poses = self._config, self._simulator.poses
+        self._frames = frames = self.setting.sensor.measure(poses, self._streams["sensor"])
         scans = self.setting.scan.measure(poses, self._streams["scan"])
-        heard = self._contacts(poses)
-        measurements, true_ids, *images = zip(*self.frames, strict=True)
+        heard = None if self._all_hear_all else self._contacts(poses)
         self.readings = TeamReadings(
             odometry,
-            measurements,
+            frames.measurements,
             scans,
-            bumped,
+            self._simulator.bumped,
             between(self.true_starts, poses) if config.oracle_pose else None,
-            true_ids if config.oracle_association else None,
+            frames.true_ids if config.oracle_association else None,
             heard,
-            images[0] if config.observe_images else None,
+            frames.left if config.observe_images and isinstance(frames, EyeFrames) else None,
         )
         if self._tap.recorder is not None:
             self._tap.recorder(self.readings.of_each())
         report = self.belief.step(self.readings)
-        self.ledger.record(report, true_ids)
+        self.ledger.record(report, frames.true_ids)
         for made in report.renamings:
             self.merge_ticks.append((self.tick, made.robots_a, made.robots_b))
         if config.oracle_merge:
             self._merge_by_oracle(reach(heard, config.num_robots))
-        self._poses = poses
         self.true_path.append(poses.copy())  # whoever writes to that moves no robot
         self.estimated_path.append(self.belief.poses)
 
-    def _contacts(self, poses: FloatArray) -> BoolArray | None:
-        """Return who hears whom (K, K), None if all hear all."""
+    def _contacts(self, poses: FloatArray) -> BoolArray:
+        """Return who hears whom (K, K)."""
         config = self._config
-        if config.always_in_contact:
-            return None
         limits = config.comm_range, config.comm_line_of_sight, config.comm_loss
         return contacts(poses, self.world.walls, *limits, self._streams["radio"])
 

@@ -26,7 +26,6 @@ def infos_of(
     """
     errors, rmses, recalls, precisions, _, pose_errors, heading_errors, _, _, distances = standing.figures.tolist()
     collisions, bytes_sent = standing.collisions.tolist(), standing.bytes_sent.tolist()
-    paid = [(f"reward/{name}", values) for name, values in terms.items()]
     infos: dict[str, dict[str, Any]] = {}
     for robot, agent in enumerate(agents):
         group = groups[robot]
@@ -46,6 +45,6 @@ def infos_of(
             "bytes_sent": bytes_sent[robot],
             "invalid_action": invalid[robot],
         }
-        for name, values in paid:
-            info[name] = values[robot]
+        for name, paid in terms.items():
+            info[f"reward/{name}"] = paid[robot]
     return infos

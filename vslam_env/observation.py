@@ -71,23 +71,23 @@ def observed(view: View, scans: FloatArray, goal_actions: bool) -> list[Observat
         view.robots, points.poses, points.sigmas, points.own, points.covariances, points.ess,
         rows.variances, rows.counts, parts, scans, numbers, ranges, candidates, teammates, present,
     )  # fmt: skip
-    pictures = local_grids(view)
-    observations: list[Observation] = [
-        {
-            "pose": numbers[k, :3],
-            "pose_std": numbers[k, 3:6],
-            "map_stats": numbers[k, 6:],
-            "local_grid": pictures[k],
-            "scan": ranges[k],
-            "candidates": candidates[k],
-            "teammates": teammates[k],
-            "teammates_mask": present[k],
+    observations: list[Observation] = []
+    for row, picture, ahead, slots, mates, mask in zip(
+        numbers, local_grids(view), ranges, candidates, teammates, present, strict=True
+    ):
+        observation: Observation = {
+            "pose": row[:3],
+            "pose_std": row[3:6],
+            "map_stats": row[6:],
+            "local_grid": picture,
+            "scan": ahead,
+            "candidates": slots,
+            "teammates": mates,
+            "teammates_mask": mask,
         }
-        for k in range(count)
-    ]
-    if goal_actions:
-        for observation in observations:
-            observation["action_mask"] = action_mask(observation["candidates"])
+        if goal_actions:
+            observation["action_mask"] = action_mask(slots)
+        observations.append(observation)
     return observations
 
 

@@ -24,7 +24,8 @@ def observations_of(
         By agent fresh arrays by name, as `vslam_env.observation` says; flat ones as one vector, or as
         `{"observation", "action_mask"}` where actions are masked.
     """
-    readings = TeamReadings.gathered(readings)
+    if not isinstance(readings, TeamReadings):
+        readings = TeamReadings.gathered(readings)
     shown = observed(belief.view(), readings.scans, goal)
     if readings.images is not None:
         for observation, image in zip(shown, readings.images, strict=True):

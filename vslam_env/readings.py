@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend.errors import BoolArray, FloatArray, IntArray, bad_argument, check_array
-from slam_backend.measurements import Measurements
+from slam_backend.measurements import Measurements, TeamMeasurements
 
 
 class Readings(NamedTuple):
@@ -42,7 +42,7 @@ class TeamReadings(NamedTuple):
 
     Attributes:
         odometry: (K, 3) float64 [m, m, rad], or None at a reset.
-        measurements: Per robot.
+        measurements: Per robot, or in one piece.
         scans: (K, R) float64 [m].
         bumps: (K,) bool.
         poses: (K, 3) float64 [m, m, rad], or None.
@@ -52,7 +52,7 @@ class TeamReadings(NamedTuple):
     """
 
     odometry: FloatArray | None
-    measurements: Sequence[Measurements]
+    measurements: Sequence[Measurements] | TeamMeasurements
     scans: FloatArray
     bumps: BoolArray
     poses: FloatArray | None = None
@@ -62,12 +62,13 @@ class TeamReadings(NamedTuple):
 
     def of_each(self) -> tuple[Readings, ...]:
         """Return what each robot reads; arrays that can be written are copies."""
-        nothing = [None] * len(self.measurements)
+        frames = self.measurements
+        nothing = [None] * len(self.bumps)
         return tuple(
             map(
                 Readings,
                 nothing if self.odometry is None else self.odometry.copy(),
-                self.measurements,
+                frames.of_each() if isinstance(frames, TeamMeasurements) else frames,
                 self.scans.copy(),
                 self.bumps.tolist(),
                 nothing if self.poses is None else self.poses.copy(),
@@ -78,15 +79,13 @@ class TeamReadings(NamedTuple):
         )
 
     @classmethod
-    def gathered(cls, readings: "TeamReadings | Sequence[Readings]") -> "TeamReadings":
-        """Return the readings of all K robots as those of a team; such that are so already as they are.
+    def gathered(cls, readings: Sequence[Readings]) -> "TeamReadings":
+        """Return the readings of all K robots as those of a team.
 
         Raises:
             ValueError: If some robots have a kind of reading that others have not, or scans of another length, or a
                 reading is no array of its shape.
         """
-        if isinstance(readings, TeamReadings):
-            return readings
         if not readings:
             raise bad_argument("readings", "those of each robot", readings, "Give one for each robot.")
         columns = list(zip(*readings, strict=True))

@@ -29,7 +29,7 @@ from slam_backend.frontend._matching_kernels import LARGEST_PATCH, match_rows, r
 from slam_backend.frontend.corners import CornerOptions, Corners, find_corners, spread_order
 from slam_backend.frontend.descriptors import DESCRIPTORS, KINDS, describe_points
 from slam_backend.frontend.images import Image, check_image
-from slam_backend.measurements import Measurements
+from slam_backend.measurements import Measurements, TeamMeasurements
 
 GUARDS = ("mutual", "patch", "rows", "back", "range")
 LEAST_SCALE, LARGEST_SCALE = 1.0, 8.0  # px; of windows of constant physical size
@@ -196,7 +196,7 @@ class StereoFrontEnd:
             descriptors = describe_points(left, pixels[:, :2], scales, self.options.descriptor)
             known = descriptors.any(axis=1)
             pixels, points, descriptors, kept = pixels[known], points[known], descriptors[known], kept[known]
-        (frame,) = Measurements._trusted_frames(points, descriptors, [len(points)])
+        (frame,) = TeamMeasurements.trusted(points, descriptors, [len(points)]).of_each()
         return StereoFrame(frame, pixels, matches.responses[kept], matches)
 
     def match(self, left: Image, right: Image) -> StereoMatches:

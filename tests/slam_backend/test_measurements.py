@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from slam_backend.measurements import Measurements
+from slam_backend.measurements import Measurements, TeamMeasurements
 
 POINTS = [[0.0, 0.1, 2.0], [1.0, 0.0, 3.0]]
 LOOKS = np.eye(2, 5, dtype=np.float32)
@@ -27,7 +27,7 @@ def test_frames_share_no_memory_and_cannot_be_written() -> None:
 def test_copies_cannot_be_written_either() -> None:
     """Be they deep or from a file, of one frame or of one built with others: what was found of them stays so."""
     frame = Measurements(POINTS, LOOKS, np.tile(np.eye(3), (2, 1, 1)))
-    _, part = Measurements._trusted_frames(np.array(POINTS), LOOKS.copy(), [1, 1])
+    _, part = TeamMeasurements.trusted(np.array(POINTS), LOOKS.copy(), [1, 2]).of_each()
     for one in (frame, part):
         for other in (copy.copy(one), copy.deepcopy(one), pickle.loads(pickle.dumps(one))):
             assert other.extent == one.extent
@@ -51,7 +51,7 @@ def test_an_extent_bounds_all_points() -> None:
     assert frame.extent == (points[:, 2].min(), np.abs(points).max())
     assert copy.deepcopy(frame).extent == frame.extent
     assert Measurements.empty().extent == (np.inf, 0.0)
-    for part in Measurements._trusted_frames(points, looks, [3, 0, 4]):
+    for part in TeamMeasurements.trusted(points, looks, [3, 3, 7]).of_each():
         nearest, farthest = part.extent
         assert (part.points[:, 2] >= nearest).all()
         assert (np.abs(part.points) <= farthest).all()

@@ -10,7 +10,7 @@ from simulated_team import SimulatedTeam
 from standing_team import hand_made, standing_team
 
 from slam_backend.alignment import Alignment
-from slam_backend.measurements import Measurements
+from slam_backend.measurements import Measurements, TeamMeasurements
 from slam_backend.team import TeamSlam
 
 GOOD = Measurements(np.array([[0.1, 0.2, 2.0]]), np.eye(1, 13))
@@ -44,9 +44,11 @@ def test_a_team_that_cannot_be_built_says_why(arguments: dict[str, Any], message
         TeamSlam(**({"num_robots": 3} | arguments))
 
 
-ONE_BEHIND = Measurements._trusted_frames(
-    np.concatenate([GOOD.points, GOOD.points, -GOOD.points]), np.tile(GOOD.descriptors, (3, 1)), [len(GOOD)] * 3
-)
+ONE_BEHIND = TeamMeasurements.trusted(
+    np.concatenate([GOOD.points, GOOD.points, -GOOD.points]),
+    np.tile(GOOD.descriptors, (3, 1)),
+    [len(GOOD), 2 * len(GOOD), 3 * len(GOOD)],
+).of_each()
 ASYMMETRIC = np.array([[True, True, False], [False, True, False], [False, False, True]])
 BAD_STEPS: list[tuple[dict[str, Any], str]] = [
     ({"odometry": STILL[:2]}, r"odometry: expected a sequence with one entry per robot \(3\), got .*2"),

@@ -15,7 +15,7 @@ ROOM = World("room", [[0, 0, 6, 0], [6, 0, 6, 5], [6, 5, 0, 5], [0, 5, 0, 0]])
 def _frame() -> EyeFrame:
     config = StereoSensorConfig(camera=StereoCamera(focal_px=160.0, width=160, height=120))
     sensor = StereoSensor(config, ROOM, FreeSpace(ROOM, 0.2), np.random.default_rng(1))
-    frame = sensor.measure(np.array([[1.5, 2.0, 0.2]]), np.random.default_rng(2))[0]
+    frame = sensor.measure(np.array([[1.5, 2.0, 0.2]]), np.random.default_rng(2)).of_each()[0]
     assert isinstance(frame, EyeFrame)
     return frame
 

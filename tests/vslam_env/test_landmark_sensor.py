@@ -43,7 +43,7 @@ def test_a_perfect_sensor_reports_the_truth() -> None:
     for _ in range(10):
         poses = free.draw_starts(3, rng, 1.0)
         visible = sensor.visible(poses)
-        for pose, seen, frame in zip(poses, visible, sensor.measure(poses, rng), strict=True):
+        for pose, seen, frame in zip(poses, visible, sensor.measure(poses, rng).of_each(), strict=True):
             assert sorted(frame.true_ids.tolist()) == np.flatnonzero(seen).tolist()
             local = camera.robot_from_camera(frame.measurements.points)
             c, s = np.cos(pose[2]), np.sin(pose[2])
@@ -126,7 +126,7 @@ def test_noise_is_the_cameras() -> None:
     camera = StereoCamera(sigma_px=0.3, sigma_disparity_px=0.15)
     sensor = LandmarkSensor(replace(PERFECT, camera=camera), WALL, on_wall([[0.7, 0.4]]))
     rng = np.random.default_rng(3)
-    frames = [sensor.measure(np.zeros((1, 3)), rng)[0] for _ in range(8000)]
+    frames = [sensor.measure(np.zeros((1, 3)), rng).of_each()[0] for _ in range(8000)]
     pixels = np.array([camera.project(frame.measurements.points[0]) for frame in frames])
     true = camera.project(np.array([-0.7, -0.4, 4.0]))
     np.testing.assert_allclose(pixels.std(axis=0), [0.3, 0.3, 0.15], rtol=0.04)
@@ -190,7 +190,7 @@ def test_descriptor_noise_has_the_stated_length() -> None:
     """Descriptors stay unit vectors; they are off by about the stated length."""
     sensor = LandmarkSensor(replace(PERFECT, descriptor_noise=0.17), WALL, on_wall([[0.0, 0.0]], size=64))
     rng = np.random.default_rng(4)
-    vectors = np.array([sensor.measure(np.zeros((1, 3)), rng)[0].measurements.descriptors[0] for _ in range(500)])
+    vectors = np.array([sensor.measure(np.zeros((1, 3)), rng).measurements.descriptors[0] for _ in range(500)])
     np.testing.assert_allclose(np.linalg.norm(vectors, axis=1), 1.0, atol=1e-5)
     assert np.linalg.norm(vectors - np.eye(1, 64), axis=1).mean() == pytest.approx(0.17, rel=0.03)
 
@@ -204,7 +204,7 @@ def test_detection_and_choice_are_uniform() -> None:
     config = replace(PERFECT, detection_probability=0.6, max_measurements=3)
     sensor = LandmarkSensor(config, WALL, on_wall(rows))
     rng = np.random.default_rng(5)
-    frames = [sensor.measure(np.zeros((1, 3)), rng)[0].true_ids for _ in range(6000)]
+    frames = [sensor.measure(np.zeros((1, 3)), rng).of_each()[0].true_ids for _ in range(6000)]
     sizes = np.bincount([len(ids) for ids in frames], minlength=4) / 6000
     few = [(1 - 0.6) ** 7, 7 * 0.6 * 0.4**6, 21 * 0.36 * 0.4**5]
     np.testing.assert_allclose(sizes[:3], few, atol=0.016)
@@ -221,7 +221,7 @@ def test_false_points_come_at_the_stated_rate_and_look_like_the_rest() -> None:
     sensor = LandmarkSensor(config, world.walls, marks)
     rng = np.random.default_rng(6)
     poses = free.draw_starts(3, rng, 2.0)
-    frames = [frame for _ in range(1000) for frame in sensor.measure(poses, rng)]
+    frames = [frame for _ in range(1000) for frame in sensor.measure(poses, rng).of_each()]
     ids = [frame.true_ids for frame in frames]
     assert max(map(len, ids)) <= 5
     false = np.array([(i < 0).sum() for i in ids])
@@ -244,7 +244,7 @@ def test_frames_repeat_with_the_seed() -> None:
     bundles = []
     for seed in (7, 7, 8):
         rng = np.random.default_rng(seed)
-        frames = [frame for _ in range(20) for frame in sensor.measure(poses, rng)]
+        frames = [frame for _ in range(20) for frame in sensor.measure(poses, rng).of_each()]
         bundles.append(b"".join(f.measurements.points.tobytes() + f.true_ids.tobytes() for f in frames))
     assert bundles[0] == bundles[1] != bundles[2]
     assert {frame.measurements.descriptors.dtype for frame in frames} == {np.dtype(np.float32)}
@@ -253,7 +253,7 @@ def test_frames_repeat_with_the_seed() -> None:
 def test_an_empty_view_gives_an_empty_frame() -> None:
     """A robot that looks away reports no points, with descriptors of the usual size."""
     sensor = LandmarkSensor(PERFECT, WALL, on_wall([[0.0, 0.0]]))
-    frame = sensor.measure(np.array([[0, 0, 3.0]]), np.random.default_rng(0))[0]
+    frame = sensor.measure(np.array([[0, 0, 3.0]]), np.random.default_rng(0)).of_each()[0]
     assert frame.measurements.points.shape == (0, 3)
     assert frame.measurements.descriptors.shape == (0, 11)
 
@@ -263,7 +263,7 @@ def test_very_noisy_disparities_give_no_points_behind_the_camera() -> None:
     camera = StereoCamera(sigma_px=10.0, sigma_disparity_px=8.0)
     sensor = LandmarkSensor(replace(PERFECT, camera=camera), WALL, on_wall([[0.0, 0.0], [1.0, 0.0]]))
     rng = np.random.default_rng(9)
-    frames = [sensor.measure(np.zeros((1, 3)), rng)[0] for _ in range(200)]
+    frames = [sensor.measure(np.zeros((1, 3)), rng).of_each()[0] for _ in range(200)]
     assert all(np.all(frame.measurements.points[:, 2] > 0) for frame in frames)
     assert 200 < sum(len(frame.true_ids) for frame in frames) < 400
     for points, extent in [(frame.measurements.points, frame.measurements.extent) for frame in frames]:

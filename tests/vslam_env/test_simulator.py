@@ -134,13 +134,22 @@ def test_state_continues_bit_by_bit() -> None:
 
 
 def test_poses_share_no_memory() -> None:
-    """What is handed out or in can be changed without touching the simulator."""
+    """What was handed in or is a state can be changed without touching the simulator; poses seen stay as they were."""
     starts = np.array([[1.0, 1.0, 0.0]])
     simulator = Simulator(MAZE, starts)
     starts[:] = 3.0
-    simulator.poses[:] = 9.0
-    simulator.get_state()["poses"][:] = 9.0
+    state = simulator.get_state()
+    state["poses"][:] = 9.0
+    state["bumped"][:] = True
     np.testing.assert_array_equal(simulator.poses, [[1.0, 1.0, 0.0]])
+    seen, bumped = [], []
+    for _ in range(200):  # into a wall, where it stays
+        seen.append((simulator.poses, simulator.poses.copy()))
+        bumped.append((simulator.bumped, simulator.bumped.copy()))
+        simulator.step([[1.0, 0.0]])
+    assert simulator.bumped.all()
+    for now, then in seen + bumped:
+        np.testing.assert_array_equal(now, then)
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,7 @@ def test_measured_points_lie_at_their_true_landmarks(sensor: StereoSensor) -> No
     rng, away, claimed, total = np.random.default_rng(1), [], 0, 0
     for heading in np.arange(-3.0, 3.0, 0.4):
         poses = POSES + np.array([0.0, 0.0, heading])
-        for pose, frame in zip(poses, sensor.measure(poses, rng), strict=True):
+        for pose, frame in zip(poses, sensor.measure(poses, rng).of_each(), strict=True):
             points = sensor.config.camera.robot_from_camera(frame.measurements.points)
             world = np.column_stack([transform_points(pose, points[:, :2]), points[:, 2]])
             known = frame.true_ids >= 0
@@ -43,7 +43,7 @@ def test_measured_points_lie_at_their_true_landmarks(sensor: StereoSensor) -> No
 
 def test_frames_hold_what_was_seen(sensor: StereoSensor) -> None:
     """Frames carry both images and what the front end found; measurements are at most as many as asked for."""
-    frames = sensor.measure(POSES, np.random.default_rng(2))
+    frames = sensor.measure(POSES, np.random.default_rng(2)).of_each()
     assert all(isinstance(frame, EyeFrame) for frame in frames)
     for frame in frames:
         assert isinstance(frame, EyeFrame)
@@ -55,7 +55,7 @@ def test_frames_hold_what_was_seen(sensor: StereoSensor) -> None:
 
 def test_visible_landmarks_are_those_that_are_measured(sensor: StereoSensor) -> None:
     """Of the measured landmarks nearly all are visible ones, and nothing behind a robot is."""
-    visible, frames = sensor.visible(POSES), sensor.measure(POSES, np.random.default_rng(8))
+    visible, frames = sensor.visible(POSES), sensor.measure(POSES, np.random.default_rng(8)).of_each()
     assert visible.shape == (2, len(sensor.landmarks))
     measured = np.concatenate([visible[robot, f.true_ids[f.true_ids >= 0]] for robot, f in enumerate(frames)])
     assert measured.mean() > 0.8
@@ -67,9 +67,9 @@ def test_visible_landmarks_are_those_that_are_measured(sensor: StereoSensor) -> 
 
 def test_the_same_draws_give_the_same_images(sensor: StereoSensor) -> None:
     """Images depend on the poses and the generator alone, not on what was taken before."""
-    one = sensor.measure(POSES, np.random.default_rng(3))
+    one = sensor.measure(POSES, np.random.default_rng(3)).of_each()
     sensor.measure(POSES[::-1], np.random.default_rng(4))
-    two = sensor.measure(POSES, np.random.default_rng(3))
+    two = sensor.measure(POSES, np.random.default_rng(3)).of_each()
     for first, second in zip(one, two, strict=True):
         assert isinstance(first, EyeFrame)
         assert isinstance(second, EyeFrame)
@@ -129,6 +129,6 @@ def test_other_descriptors_and_sizes_can_be_had() -> None:
     camera = StereoCamera(focal_px=400.0, width=400, height=300)
     config = StereoSensorConfig(camera=camera, front_end=FrontEndOptions(descriptor="sift"))
     other = StereoSensor(config, ROOM, FreeSpace(ROOM, 0.2), np.random.default_rng(7))
-    frame = other.measure(POSES[:1], np.random.default_rng(1))[0]
+    frame = other.measure(POSES[:1], np.random.default_rng(1)).of_each()[0]
     assert frame.measurements.descriptors.shape[1] == 128
     assert len(frame.measurements) > 20

@@ -1,12 +1,14 @@
 """What the robots' sensors report of the world: measured landmarks and scans, with the true noise."""
 
-from vslam_env.sensors.landmark_sensor import Frame, LandmarkSensor, LandmarkSensorConfig
+from vslam_env.sensors.landmark_sensor import Frame, Frames, LandmarkSensor, LandmarkSensorConfig
 from vslam_env.sensors.scan import Scan, ScanConfig
-from vslam_env.sensors.stereo_sensor import EyeFrame, StereoSensor, StereoSensorConfig
+from vslam_env.sensors.stereo_sensor import EyeFrame, EyeFrames, StereoSensor, StereoSensorConfig
 
 __all__ = [
     "EyeFrame",
+    "EyeFrames",
     "Frame",
+    "Frames",
     "LandmarkSensor",
     "LandmarkSensorConfig",
     "Scan",

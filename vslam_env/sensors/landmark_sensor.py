@@ -1,5 +1,6 @@
 """The landmark sensor: true poses become noisy measurements of the landmarks that each camera sees."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import accumulate
 from typing import NamedTuple
@@ -8,7 +9,7 @@ import numpy as np
 
 from slam_backend.camera import StereoCamera
 from slam_backend.errors import BoolArray, FloatArray, IntArray, bad_argument, check_array, check_float, check_int
-from slam_backend.measurements import Measurements
+from slam_backend.measurements import Measurements, TeamMeasurements
 from vslam_env.sensors._landmark_kernels import measure
 from vslam_env.world.sight_kernels import detect
 from vslam_env.world.spec import Landmarks
@@ -61,6 +62,22 @@ class Frame(NamedTuple):
     true_ids: IntArray
 
 
+class Frames(NamedTuple):
+    """The frames of all robots in one tick.
+
+    Attributes:
+        measurements: In one piece.
+        true_ids: Per robot as of its `Frame`.
+    """
+
+    measurements: TeamMeasurements
+    true_ids: Sequence[IntArray]
+
+    def of_each(self) -> list[Frame]:
+        """Return the frame of each robot."""
+        return list(map(Frame, self.measurements.of_each(), self.true_ids))
+
+
 class LandmarkSensor:
     """Measures the landmarks of one world with the cameras of all robots.
 
@@ -93,7 +110,7 @@ class LandmarkSensor:
         """Tell which landmarks (K, N) the robots at `poses` (K, 3) [m, m, rad], world frame, can see."""
         return visible_landmarks(poses, self._landmarks, self._walls, self._robot_radius, self._view)
 
-    def measure(self, poses: FloatArray, rng: np.random.Generator) -> list[Frame]:
+    def measure(self, poses: FloatArray, rng: np.random.Generator) -> Frames:
         """Take a frame with each robot's camera.
 
         Each visible landmark is detected independently. False points take their places among the at most B points;
@@ -104,7 +121,7 @@ class LandmarkSensor:
             rng: Source of the draws.
 
         Returns:
-            One frame for each robot. Nothing in the order of its points tells anything about them.
+            One frame of each robot. Nothing in the order of its points tells anything about them.
         """
         config, marks = self.config, self._landmarks
         robots, most, size = len(poses), config.max_measurements, self._points.shape[1]
@@ -126,11 +143,9 @@ class LandmarkSensor:
         points, looks = np.empty((total, 3)), np.empty((total, size - 3), np.float32)
         truth = ids, counts, poses, self._points, false_points
         measure(*truth, noise, self._optics, config.descriptor_noise, points, looks)
-        each = counts.tolist()
-        ends = list(accumulate(each))
-        own_ids = map(ids.__getitem__, map(slice, [0, *ends], ends))
-        measured = points[: ends[-1]], looks[: ends[-1]]
-        return list(map(Frame, Measurements._trusted_frames(*measured, each), own_ids))
+        ends = list(accumulate(counts.tolist()))
+        measured = TeamMeasurements.trusted(points[: ends[-1]], looks[: ends[-1]], ends)
+        return Frames(measured, list(map(ids.__getitem__, map(slice, [0, *ends], ends))))
 
     def _false_points(self, count: int, rng: np.random.Generator) -> FloatArray:
         """Draw points (count, 3) [m], camera frame, in the view: uniform in the image and in depth."""

@@ -1,5 +1,6 @@
 """`StereoSensor`: rendered eyes and the image front end stand in for the landmark sensor."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -79,6 +80,20 @@ class EyeFrame(NamedTuple):
     seen: StereoFrame
 
 
+class EyeFrames(NamedTuple):
+    """The frames of all robots in one tick: per robot what its `EyeFrame` has by the same name."""
+
+    measurements: Sequence[Measurements]
+    true_ids: Sequence[IntArray]
+    left: Sequence[Image]
+    right: Sequence[Image]
+    seen: Sequence[StereoFrame]
+
+    def of_each(self) -> list[EyeFrame]:
+        """Return the frame of each robot."""
+        return list(map(EyeFrame, *self))
+
+
 class StereoSensor:
     """Measures the textured walls of one world with the eyes of all robots.
 
@@ -122,7 +137,7 @@ class StereoSensor:
         """Tell which true landmarks (K, N) the robots at `poses` (K, 3) [m, m, rad], world frame, can see."""
         return visible_landmarks(poses, self.landmarks, self._walls, self._robot_radius, self._view)
 
-    def measure(self, poses: FloatArray, rng: np.random.Generator) -> list[EyeFrame]:
+    def measure(self, poses: FloatArray, rng: np.random.Generator) -> EyeFrames:
         """Take and measure a pair of images with each robot's eyes.
 
         Args:
@@ -130,7 +145,7 @@ class StereoSensor:
             rng: Source of exposure and noise.
 
         Returns:
-            One frame for each robot, with the true landmark behind each point, -1 where there is none: on edges that
+            One frame of each robot, with the true landmark behind each point, -1 where there is none: on edges that
             are none of a texture, on robots, where nothing stands, and where the depth is wrong.
         """
         frames = []
@@ -138,7 +153,7 @@ class StereoSensor:
             left, right = self._eye.take(poses, robot, rng)
             seen = self._front_end.measure(left, right)
             frames.append(EyeFrame(seen.measurements, self._claims(poses, robot, seen), left, right, seen))
-        return frames
+        return EyeFrames(*zip(*frames, strict=True))
 
     def _claims(self, poses: FloatArray, robot: int, frame: StereoFrame) -> IntArray:
         """Return the true landmark (n,) int64 behind each measured point, -1 where there is none.

@@ -6,7 +6,7 @@ import numpy as np
 import pymunk
 
 from slam_backend._jit import jit
-from slam_backend.errors import BoolArray, FloatArray, check_array, check_float
+from slam_backend.errors import FloatArray, check_array, check_float
 from vslam_env.world.spec import World
 
 LONGEST_SUBSTEP = 12.5e-3  # [m] no robot moves farther between two looks for contacts
@@ -67,6 +67,9 @@ class Simulator:
     Attributes:
         radius: Of the robots [m].
         tick: Duration of a step [s].
+        poses: True poses (K, 3) float64 [m, m, rad], world frame, theta in [-pi, pi). Each tick makes both
+            arrays anew: what was looked at stays as it was, and nobody is to write to it.
+        bumped: Which robots (K,) bool something kept from going where they were commanded in the last tick.
 
     Raises:
         ValueError: If a number is out of range or poses are not (K, 3) finite numbers.
@@ -82,26 +85,16 @@ class Simulator:
         ground = self._space.static_body
         self._space.add(*(pymunk.Segment(ground, (a, b), (c, d), 0.0) for a, b, c, d in world.walls.tolist()))
         self._bodies = []
-        self._poses = check_array("start_poses", start_poses, (None, 3), "Give one row x y theta for each robot.")
+        self.poses = check_array("start_poses", start_poses, (None, 3), "Give one row x y theta for each robot.")
         _, _, x_max, y_max = world.bounds
         apart = 4.0 * (radius + SKIN)
-        self._parking = [(x_max + apart * (2 + robot), y_max + apart) for robot in range(len(self._poses))]
+        self._parking = [(x_max + apart * (2 + robot), y_max + apart) for robot in range(len(self.poses))]
         for place in self._parking:
             body = pymunk.Body(1.0, float("inf"))
             body.position = place
             self._space.add(body, pymunk.Circle(body, radius + SKIN))
             self._bodies.append(body)
-        self._bumped = self._nobody = np.zeros(len(self._bodies), dtype=np.bool_)  # replaced, never written to
-
-    @property
-    def poses(self) -> FloatArray:
-        """True poses (K, 3) [m, m, rad], world frame, theta in [-pi, pi). A fresh copy."""
-        return self._poses.copy()
-
-    @property
-    def bumped(self) -> BoolArray:
-        """Which robots (K,) something kept from going where they were commanded in the last tick. A fresh copy."""
-        return self._bumped.copy()
+        self.bumped = self._nobody = np.zeros(len(self._bodies), dtype=np.bool_)
 
     def step(self, commands: Any) -> bool:
         """Drive all robots for one tick.
@@ -120,16 +113,16 @@ class Simulator:
         if not as_it_stands or commands.shape != shape:
             commands = check_array("commands", commands, shape, cure)
         goals = np.empty((len(self._bodies), 3))
-        clear = _drive_freely(self._poses, commands, self.tick, self._walls, self.radius + SKIN, goals)
+        clear = _drive_freely(self.poses, commands, self.tick, self._walls, self.radius + SKIN, goals)
         if clear:
-            self._bumped = self._nobody
+            self.bumped = self._nobody
         else:
             check_array("commands", commands, shape, cure)  # for only finite ones are surely free
-            way = goals[:, :2] - self._poses[:, :2]
+            way = goals[:, :2] - self.poses[:, :2]
             goals[:, :2] = self._move_in_contact(way)
-            achieved = np.sum((goals[:, :2] - self._poses[:, :2]) * way, axis=1)
-            self._bumped = achieved < (1.0 - SHORTFALL) * np.sum(way * way, axis=1)
-        self._poses = goals
+            achieved = np.sum((goals[:, :2] - self.poses[:, :2]) * way, axis=1)
+            self.bumped = achieved < (1.0 - SHORTFALL) * np.sum(way * way, axis=1)
+        self.poses = goals
         return not clear
 
     def _move_in_contact(self, way: FloatArray) -> FloatArray:
@@ -141,7 +134,7 @@ class Simulator:
         longest = float(np.hypot(way[:, 0], way[:, 1]).max())
         substeps = max(2, int(np.ceil(longest / LONGEST_SUBSTEP)))
         duration = self.tick / substeps
-        for body, (x, y), (dx, dy) in zip(self._bodies, self._poses[:, :2].tolist(), way.tolist(), strict=True):
+        for body, (x, y), (dx, dy) in zip(self._bodies, self.poses[:, :2].tolist(), way.tolist(), strict=True):
             body.position = x, y
             body.velocity = 0.0, 0.0
             body.mass = STANDING_MASS if dx == dy == 0.0 else 1.0
@@ -157,11 +150,11 @@ class Simulator:
 
     def get_state(self) -> dict[str, Any]:
         """Return all that the next tick depends on; it shares no memory with the simulator."""
-        return {"poses": self._poses.copy(), "bumped": self._bumped.copy()}
+        return {"poses": self.poses.copy(), "bumped": self.bumped.copy()}
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Go on from a state of `get_state`, bit by bit as the simulator would have from which it was taken."""
         robots = len(self._bodies)
         cure = "Give what get_state returned, for the same number of robots."
-        self._poses = check_array("state['poses']", state["poses"], (robots, 3), cure)
-        self._bumped = check_array("state['bumped']", state["bumped"], (robots,), cure, dtype=np.bool_)
+        self.poses = check_array("state['poses']", state["poses"], (robots, 3), cure)
+        self.bumped = check_array("state['bumped']", state["bumped"], (robots,), cure, dtype=np.bool_)
