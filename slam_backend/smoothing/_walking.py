@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend._jit import inlined, jit
-from slam_backend.errors import BoolArray, FloatArray, IntArray
+from slam_backend.errors import FloatArray, IntArray
 from slam_backend.log_arrays import ODOMETRY, REJECTED
 
 
@@ -40,45 +40,47 @@ def walk(
     motions: FloatArray,
     variances: FloatArray,
     counts: IntArray,
-    guessed: BoolArray,
     guesses: FloatArray,
-    start: FloatArray,
+    robot: int,
     rigid_within: float,
     lever: float,
+    keys: int,
+    frames: int,
+    tips: IntArray,
+    robots: IntArray,
     poses: FloatArray,
+    previous: IntArray,
     key_motions: FloatArray,
     key_noises: FloatArray,
+    spreads: FloatArray,
     slack: FloatArray,
     frame_keys: IntArray,
     offsets: FloatArray,
 ) -> tuple[int, int]:
-    """Walk through the steps of a log, T of them.
+    """Walk through the steps of a robot's log, T of them.
 
     Args:
         kinds: (T,) int8. STOOD or ODOMETRY.
         motions: (T, 3) float64 [m, m, rad]. Odometry of each step, in the frame of the pose before.
         variances: (T, 3) float64. Of its parts.
         counts: (T,) int64. Measurements of each step.
-        guessed, guesses: (T,) and (T, 3) [m, m, rad]. Whether, and where, the robot is thought to be, map frame; else
-            odometry says.
-        start: (3,) float64 [m, m, rad]. The pose before, that of the robot's newest key.
+        guesses: (T, 3) float64 [m, m, rad]. Where the robot is thought to be, map frame; NaN where odometry says.
+        robot: Whose log it is.
         rigid_within: [m]. A step that measured something becomes a key unless odometry since the last key scatters
             less; see `SmoothingOptions`.
         lever: [m]. Where an error of the heading is felt.
-        poses, key_motions, key_noises: (T, 3), (T, 3), (T, 3, 3); the first rows are written: the new keys, map frame,
-            and the odometry to each from the key before.
-        slack: (T + 1,) float64 [m^2]. Written: the largest scatter of a frame against its key, first that of the newest
-            old key, then those of the new ones.
-        frame_keys, offsets: (T,), (T, 3); the first rows are written: new key of each frame, -1 for the newest old
-            one, and where the frame stands seen from it.
+        keys, frames: How many there are before.
+        tips: (K,) int64. The newest key of each robot, changed.
+        robots, poses, previous, key_motions, key_noises, spreads, slack: (k, ...) columns of `PathGraph` with room for
+            the new keys. Written from row `keys` on; and the slack of the newest old key, where frames stand to it.
+        frame_keys, offsets: (f,), (f, 3) columns of `PathGraph`, likewise from row `frames` on.
 
     Returns:
-        The number of new keys and of frames.
+        The number of keys and of frames.
     """
-    keys, frames = 0, 0
+    tip = tips[robot]
     moved = False
-    pose, chain, noise = start.copy(), np.zeros(3), np.zeros((3, 3))
-    slack[0] = 0.0
+    pose, chain, noise = poses[tip].copy(), np.zeros(3), np.zeros((3, 3))
     last = len(kinds) - 1
     for t in range(len(kinds)):
         if kinds[t] == ODOMETRY:
@@ -88,49 +90,63 @@ def walk(
             pose[1] += s * motions[t, 0] + c * motions[t, 1]
             pose[2] = _wrapped(pose[2] + motions[t, 2])
             moved = True
-        if guessed[t]:
+        if not math.isnan(guesses[t, 0]):
             pose[:] = guesses[t]
         scatter = noise[0, 0] + noise[1, 1] + lever * lever * noise[2, 2]
         far = counts[t] > 0 and scatter >= rigid_within * rigid_within
         if moved and (far or t == last):
-            poses[keys], key_motions[keys], key_noises[keys] = pose, chain, noise
+            robots[keys], previous[keys], poses[keys] = robot, tip, pose
+            key_motions[keys], key_noises[keys], spreads[keys] = chain, noise, scatter
             chain[:] = 0.0
             noise[:] = 0.0
             scatter, moved = 0.0, False
+            tip, slack[keys] = keys, 0.0
             keys += 1
-            slack[keys] = 0.0
         if counts[t] > 0:
-            slack[keys] = max(slack[keys], scatter)
-            frame_keys[frames] = keys - 1
-            offsets[frames] = chain
+            slack[tip] = max(slack[tip], scatter)
+            frame_keys[frames], offsets[frames] = tip, chain
             frames += 1
+    tips[robot] = tip
     return keys, frames
 
 
 @jit
-def choose(ids: IntArray, starts: IntArray, counts: IntArray, rows: IntArray, frames: IntArray) -> int:
-    """Say which measurements of a log of T steps are taken: those that bear a name.
+def choose(
+    ids: IntArray, points: FloatArray, starts: IntArray, num: int, frame: int, names: IntArray,
+    taken: FloatArray, rows: IntArray, frames: IntArray, counts: IntArray,
+) -> int:  # fmt: skip
+    """Take the measurements of a log of T steps that bear a name.
 
     Args:
-        ids: (n,) int64. Names of the measurements, `REJECTED` for none.
+        ids, points: (n,) int64, (n, 3) [m]. Names of the measurements, `REJECTED` for none; and where they lie.
         starts: (T + 1,) int64. Those of step t are starts[t] to starts[t + 1].
+        num, frame: How many measurements and frames there are before.
+        names, taken, rows, frames: (m, ...), written from row `num` on: name and point of each that is taken, its row
+            in the log, and its frame; a step of which any is taken makes one.
         counts: (T,) int64, result: how many of each step are taken.
-        rows, frames: (n,) int64, results, of which the first rows are written: those measurements, and their frames; a
-            step of which any is taken makes one.
 
     Returns:
-        How many there are.
+        How many measurements there are then.
     """
-    num, frame = 0, 0
     for t in range(len(counts)):
         first = num
         for row in range(starts[t], starts[t + 1]):
             if ids[row] != REJECTED:
-                rows[num], frames[num] = row, frame
+                names[num], taken[num], rows[num], frames[num] = ids[row], points[row], row, frame
                 num += 1
         counts[t] = num - first
         frame += num > first
     return num
+
+
+@jit
+def rename(names: IntArray, aliases: IntArray) -> None:
+    """Give landmarks the names by which they go, in place: (n,) int64, and rows (name, name it goes by) in order."""
+    for row in range(len(aliases)):
+        old, new = aliases[row, 0], aliases[row, 1]
+        for n in range(len(names)):
+            if names[n] == old:
+                names[n] = new
 
 
 @jit
@@ -158,22 +174,29 @@ def place(
 
 
 @jit
-def mostly_new(
-    frozen_landmarks: IntArray, counts: IntArray, point_landmarks: IntArray, new_landmarks: IntArray, num: int
-) -> BoolArray:
-    """Return (num,) which landmarks have more new measurements than old ones.
+def start_anew(
+    frozen_landmarks: IntArray, counts: IntArray, point_landmarks: IntArray, new_landmarks: IntArray, names: IntArray,
+    held: IntArray, means: FloatArray, landmarks: FloatArray,
+) -> None:  # fmt: skip
+    """Put those landmarks where a filter holds them to be that have more new measurements than old ones.
 
     Args:
         frozen_landmarks, counts: (s,) landmark of each frozen sighting, and the measurements in it.
         point_landmarks: (n,) of each old raw measurement.
         new_landmarks: (m,) of each new one.
-        num: Of landmarks.
+        names: (l,) int64. Of the landmarks.
+        held, means: (h,) int64, ascending, (h, 3) [m]. Names of those that the filter holds, and where.
+        landmarks: (l, 3) float64 [m], map frame; changed.
     """
-    more = np.zeros(num, dtype=np.int64)
+    more = np.zeros(len(names), dtype=np.int64)
     for n in range(len(frozen_landmarks)):
         more[frozen_landmarks[n]] -= counts[n]
     for landmark in point_landmarks:
         more[landmark] -= 1
     for landmark in new_landmarks:
         more[landmark] += 1
-    return more > 0
+    for landmark in range(len(names)):
+        if more[landmark] > 0:
+            at = np.searchsorted(held, names[landmark])
+            if at < len(held) and held[at] == names[landmark]:
+                landmarks[landmark] = means[at]

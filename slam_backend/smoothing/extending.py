@@ -1,18 +1,23 @@
 """`extended`: a graph takes in what the robots did since; steps without measurements are chained away."""
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from itertools import pairwise
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from slam_backend.errors import BoolArray, FloatArray, IntArray, bad_argument
 from slam_backend.geometry import compose, rotation
 from slam_backend.log_arrays import EXACT, LogArrays
 from slam_backend.motion import OdometryModel
-from slam_backend.smoothing._walking import choose, mostly_new, place, walk
+from slam_backend.smoothing._walking import choose, place, start_anew, walk
 from slam_backend.smoothing.graph import LEVER, PathGraph
 
 LEAST_NOISE = 1e-5  # [m, rad] of odometry in one step: where a part has none, as with no floors, nothing is singular
+OF_KEYS = ("robots", "poses", "previous", "motions", "noises", "spreads", "slack")
+OF_FRAMES = ("frame_keys", "frame_offsets")
+UNKNOWN = np.full(3, np.nan)  # a pose of which nothing is supposed
 
 
 class Places(NamedTuple):
@@ -27,17 +32,13 @@ class Places(NamedTuple):
     means: FloatArray
 
 
-class _Part(NamedTuple):
-    """One robot's new keys, frames and measurements; keys and frames are counted from 0, `NONE` is the old tip."""
+class _Measured(NamedTuple):
+    """New measurements: names of their landmarks (n,), points (n, 3), frames (n,); rows (m,) in each robot's log."""
 
-    poses: FloatArray
-    motions: FloatArray
-    noises: FloatArray
-    slack: FloatArray  # first of the old tip, then of the new keys
-    frame_keys: IntArray
-    offsets: FloatArray
-    rows: IntArray  # of the log's measurements that are taken
-    frames: IntArray  # of these
+    names: IntArray
+    points: FloatArray
+    frames: IntArray
+    rows: list[IntArray]
 
 
 def extended(
@@ -69,141 +70,109 @@ def extended(
     Raises:
         ValueError: If a log holds a pose that was given as exact: there is nothing to smooth.
     """
-    parts = [
-        _part(graph, i, log, motion, rigid_within, {} if guesses is None else guesses[i]) for i, log in enumerate(logs)
-    ]
-    keys = np.cumsum([graph.num_keys, *(len(part.poses) for part in parts)])
-    frames = np.cumsum([len(graph.frame_keys), *(len(part.frame_keys) for part in parts)])
-    previous, frame_keys, tips = [graph.previous], [graph.frame_keys], graph.tips.copy()
-    for i, part in enumerate(parts):
-        n = len(part.poses)
-        previous.append(np.where(np.arange(n) > 0, keys[i] + np.arange(n) - 1, graph.tips[i]))
-        frame_keys.append(np.where(part.frame_keys < 0, graph.tips[i], part.frame_keys + keys[i]))
-        tips[i] = keys[i] + n - 1 if n else graph.tips[i]
-    poses = np.concatenate([graph.poses, *(part.poses for part in parts)])
-    new_frames = np.concatenate([part.frames + frames[i] for i, part in enumerate(parts)])
-    frame_keys_now = np.concatenate(frame_keys)
-    points = np.concatenate([log.points[part.rows] for log, part in zip(logs, parts, strict=True)])
-    ids = graph.known_as(np.concatenate([log.ids[part.rows] for log, part in zip(logs, parts, strict=True)]))
-    offsets = np.concatenate([graph.frame_offsets, *(part.offsets for part in parts)])
-    first_seen = np.empty((len(points), 3))
-    place(poses, frame_keys_now, offsets, new_frames, points, mount, first_seen)
-    slack = np.concatenate([graph.slack, *(part.slack[1:] for part in parts)])
-    slack[graph.tips] = np.maximum(slack[graph.tips], [part.slack[0] for part in parts])
-    landmark_ids, landmarks, rows = _with_new(graph, ids, first_seen)
+    columns, new = _walked(graph, logs, motion, _supposed(logs, guesses), rigid_within)
+    landmark_ids, rows, first = _numbered(graph.landmark_ids, graph.known_as(new.names))
+    first_seen = np.empty((len(first), 3))
+    place(
+        columns["poses"], columns["frame_keys"], columns["frame_offsets"], new.frames[first], new.points[first], mount,
+        first_seen,
+    )  # fmt: skip
+    landmarks = np.concatenate([graph.landmarks, first_seen])
     if places is not None and len(places.ids) and guesses is not None and all(map(_guided, logs, guesses)):
-        landmarks = _started(graph, landmark_ids, landmarks, rows, places)
+        start_anew(
+            graph.frozen_landmarks, graph.counts, graph.point_landmarks, rows, landmark_ids, places.ids, places.means,
+            landmarks,
+        )  # fmt: skip
+    latest = [log.steps[-1] if len(log) else before for log, before in zip(logs, graph.latest, strict=True)]
     return graph.with_columns(
-        robots=np.concatenate([graph.robots, *(np.full(len(part.poses), i) for i, part in enumerate(parts))]),
-        poses=poses,
-        previous=np.concatenate(previous),
-        motions=np.concatenate([graph.motions, *(part.motions for part in parts)]),
-        noises=np.concatenate([graph.noises, *(part.noises for part in parts)]),
-        spreads=np.concatenate([graph.spreads, *(scatter(part.noises) for part in parts)]),
-        slack=slack,
-        frame_keys=frame_keys_now,
-        frame_offsets=offsets,
-        points=np.concatenate([graph.points, points]),
-        point_noises=np.concatenate([graph.point_noises, *map(_noises, logs, parts)]),
-        given=np.concatenate([graph.given, *map(_given, logs, parts)]),
-        point_frames=np.concatenate([graph.point_frames, new_frames]),
+        **columns,
+        points=np.concatenate([graph.points, new.points]),
+        point_noises=np.concatenate([graph.point_noises, *map(_noises, logs, new.rows)]),
+        given=np.concatenate([graph.given, *map(_given, logs, new.rows)]),
+        point_frames=np.concatenate([graph.point_frames, new.frames]),
         point_landmarks=np.concatenate([graph.point_landmarks, rows]),
         landmark_ids=landmark_ids,
         landmarks=landmarks,
-        tips=tips,
-        latest=np.array([log.steps[-1] if len(log) else graph.latest[i] for i, log in enumerate(logs)], dtype=np.int64),
-    )  # fmt: skip
+        latest=np.array(latest, dtype=np.int64),
+    )
+
+
+def _walked(
+    graph: PathGraph, logs: Sequence[LogArrays], motion: OdometryModel, guesses: FloatArray, rigid_within: float
+) -> tuple[dict[str, NDArray[Any]], _Measured]:
+    """Walk through the robots' new steps: the graph's columns of keys and frames with the new ones, what was measured.
+
+    Args:
+        graph, logs, motion, rigid_within: As of `extended`.
+        guesses: (T, 3) of `_supposed`.
+    """
+    steps, most = len(guesses), sum(len(log.ids) for log in logs)
+    columns = {name: _with_room(getattr(graph, name), steps) for name in (*OF_KEYS, *OF_FRAMES)}
+    tips, counts, points = graph.tips.copy(), np.empty(steps, dtype=np.int64), np.empty((most, 3))
+    names, rows, frames = (np.empty(most, dtype=np.int64) for _ in range(3))
+    variances = motion.variances(np.concatenate([log.motions for log in logs]))
+    if not motion.is_exact:
+        variances = np.maximum(variances, LEAST_NOISE**2)
+    num_keys, num_frames, ends, first = graph.num_keys, len(graph.frame_keys), [0], 0
+    for robot, log in enumerate(logs):
+        if (log.kinds == EXACT).any():
+            raise bad_argument("logs", "odometry", "a pose that was given as exact", "There is nothing to smooth.")
+        own = slice(first, first := first + len(log))
+        end = choose(log.ids, log.points, log.starts, ends[-1], num_frames, names, points, rows, frames, counts[own])
+        num_keys, num_frames = walk(
+            log.kinds, log.motions, variances[own], counts[own], guesses[own], robot, rigid_within, LEVER, num_keys,
+            num_frames, tips, *columns.values(),
+        )  # fmt: skip
+        ends.append(end)
+    used = {name: columns[name][:num_keys] for name in OF_KEYS}
+    used |= {name: columns[name][:num_frames] for name in OF_FRAMES}
+    of_robots = [rows[start:end] for start, end in pairwise(ends)]
+    return used | {"tips": tips}, _Measured(names[: ends[-1]], points[: ends[-1]], frames[: ends[-1]], of_robots)
+
+
+def _supposed(logs: Sequence[LogArrays], guesses: Sequence[Mapping[int, FloatArray]] | None) -> FloatArray:
+    """Return (T, 3) [m, m, rad] where robots are thought to be after the steps of all logs; NaN: nobody says."""
+    if guesses is None:
+        return np.full((sum(map(len, logs)), 3), np.nan)
+    poses = [by_step.get(t, UNKNOWN) for log, by_step in zip(logs, guesses, strict=True) for t in log.steps.tolist()]
+    return np.concatenate([np.empty(0), *poses]).reshape(-1, 3)
+
+
+def _with_room(column: NDArray[Any], extra: int) -> NDArray[Any]:
+    """Return a copy of a column (n, ...) with so many more rows, yet to be written."""
+    longer = np.empty((len(column) + extra, *column.shape[1:]), dtype=column.dtype)
+    longer[: len(column)] = column
+    return longer
 
 
 def _guided(log: LogArrays, guesses: Mapping[int, FloatArray]) -> bool:
     """Return whether there is a guess for the first step that measured something, and so for all."""
-    measured = np.flatnonzero(np.diff(log.starts))
-    return not len(measured) or int(log.steps[measured[0]]) in guesses
+    t = int(log.starts.searchsorted(0, side="right")) - 1
+    return t == len(log) or int(log.steps[t]) in guesses
 
 
-def _started(graph: PathGraph, ids: IntArray, landmarks: FloatArray, rows: IntArray, places: Places) -> FloatArray:
-    """Return the landmarks (l, 3), of which those start where the filter has them that are mostly seen anew.
-
-    Args:
-        graph: As it stood.
-        ids: (l,) int64. Names of all landmarks, the graph's first.
-        landmarks: (l, 3) float64 [m], map frame.
-        rows: (n,) int64. Of the new measurements among `ids`.
-        places: Of the filter; at least one.
-    """
-    at = np.minimum(places.ids.searchsorted(ids), len(places.ids) - 1)
-    anew = mostly_new(graph.frozen_landmarks, graph.counts, graph.point_landmarks, rows, len(ids))
-    return np.where((anew & (places.ids[at] == ids))[:, None], places.means[at], landmarks)
-
-
-def scatter(noises: FloatArray) -> FloatArray:
-    """Return the mean squares (n,) [m^2] by which motions of covariances (n, 3, 3) scatter, headings at `LEVER`."""
-    return np.asarray(noises[:, 0, 0] + noises[:, 1, 1] + LEVER**2 * noises[:, 2, 2])
-
-
-def _given(log: LogArrays, part: _Part) -> BoolArray:
-    """Return (n,) whether the sensor gave the covariances of the measurements taken."""
+def _given(log: LogArrays, rows: IntArray) -> BoolArray:
+    """Return (n,) whether the sensor gave the covariances of these measurements."""
     if not log.given.any():
-        return np.zeros(len(part.rows), dtype=np.bool_)
-    return np.repeat(log.given, np.diff(log.starts))[part.rows]
+        return np.zeros(len(rows), dtype=np.bool_)
+    return np.repeat(log.given, np.diff(log.starts))[rows]
 
 
-def _noises(log: LogArrays, part: _Part) -> FloatArray:
+def _noises(log: LogArrays, rows: IntArray) -> FloatArray:
     """Return these covariances (n, 6) [m^2], robot axes; zeros where none were given."""
-    return np.zeros((len(part.rows), 6)) if log.covariances is None else log.covariances[part.rows]
+    return np.zeros((len(rows), 6)) if log.covariances is None else log.covariances[rows]
 
 
-def _with_new(graph: PathGraph, ids: IntArray, seen: FloatArray) -> tuple[IntArray, FloatArray, IntArray]:
-    """Return landmark ids and means with the new ones appended, each where it was first seen, and rows of `ids`."""
-    old = len(graph.landmark_ids)
-    values, first, inverse = np.unique(
-        np.concatenate([graph.landmark_ids, ids]), return_index=True, return_inverse=True
-    )
-    order = np.argsort(first)  # old landmarks keep their rows
-    row = np.empty(len(order), dtype=np.int64)
-    row[order] = np.arange(len(order))
-    new = np.sort(first)[old:] - old
-    return values[order], np.concatenate([graph.landmarks, seen[new]]), row[inverse[old:]]
-
-
-def _part(
-    graph: PathGraph,
-    robot: int,
-    log: LogArrays,
-    motion: OdometryModel,
-    rigid_within: float,
-    guesses: Mapping[int, FloatArray],
-) -> _Part:
-    """Walk through a robot's new steps."""
-    if (log.kinds == EXACT).any():
-        raise bad_argument("logs", "odometry", "a pose that was given as exact", "There is nothing to smooth.")
-    n = len(log)
-    where = [guesses.get(step) for step in log.steps.tolist()] if guesses else [None] * n
-    guessed = np.array([pose is not None for pose in where], dtype=np.bool_)
-    variances = motion.variances(log.motions)
-    if not motion.is_exact:
-        variances = np.maximum(variances, LEAST_NOISE**2)
-    supposed = np.zeros((n, 3))
-    if guessed.any():
-        supposed[guessed] = [pose for pose in where if pose is not None]
-    counts, rows, of_rows = np.empty(n, dtype=np.int64), np.empty_like(log.ids), np.empty_like(log.ids)
-    taken = choose(log.ids, log.starts, counts, rows, of_rows)
-    poses, motions, offsets = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3))
-    noises, slack, frame_keys = np.empty((n, 3, 3)), np.empty(n + 1), np.empty(n, dtype=np.int64)
-    keys, frames = walk(
-        log.kinds, log.motions, variances, counts, guessed, supposed,
-        graph.poses[graph.tips[robot]], rigid_within, LEVER, poses, motions, noises, slack, frame_keys, offsets,
-    )  # fmt: skip
-    return _Part(
-        poses=poses[:keys],
-        motions=motions[:keys],
-        noises=noises[:keys],
-        slack=slack[: keys + 1],
-        frame_keys=frame_keys[:frames],
-        offsets=offsets[:frames],
-        rows=rows[:taken],
-        frames=of_rows[:taken],
-    )
+def _numbered(known: IntArray, names: IntArray) -> tuple[IntArray, IntArray, list[int]]:
+    """Return all names, known ones (l,) first, the row of each of `names` (n,), and which of these were new."""
+    row_of = {name: row for row, name in enumerate(known.tolist())}
+    new, rows = [], []
+    for n, name in enumerate(names.tolist()):
+        if name not in row_of:
+            row_of[name] = len(row_of)
+            new.append(n)
+        rows.append(row_of[name])
+    return np.concatenate([known, names[new]]), np.array(rows, dtype=np.int64), new
 
 
 def chained(

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from slam_backend.errors import BoolArray, FloatArray, IntArray
 from slam_backend.geometry import between, wrap_angle
+from slam_backend.smoothing._walking import rename
 
 NONE = -1
 VAGUE = (1e4, 1e4, 10.0)  # variances [m^2, m^2, rad^2] of a start of which nothing is known
@@ -153,8 +154,7 @@ class PathGraph:
     def known_as(self, ids: IntArray) -> IntArray:
         """Return the names by which landmarks `ids` (n,) int64 go, `aliases` applied."""
         result = ids.copy()
-        for old, new in self.aliases:  # in the order in which they were found
-            result[result == old] = new
+        rename(result, self.aliases)
         return result
 
     def to_mapping(self) -> dict[str, Any]:

@@ -9,27 +9,44 @@ from small_problems import camera_of, graph_of, logs_of, small_run
 from slam_backend.geometry import between, compose, transform_points, wrap_angle
 from slam_backend.log_arrays import ODOMETRY, REJECTED, STOOD
 from slam_backend.motion import OdometryModel
-from slam_backend.smoothing._walking import choose, mostly_new, place, walk
-from slam_backend.smoothing.extending import chained, extended, scatter
+from slam_backend.smoothing._walking import choose, place, rename, start_anew, walk
+from slam_backend.smoothing.extending import chained, extended
 from slam_backend.smoothing.graph import LEVER, PathGraph
 from slam_backend.smoothing.options import SmoothingOptions
 from slam_backend.smoothing.rejuvenation import rejuvenate
 from training.stereo_runs import RunSpec, simulate_run
 
+OLD = 4  # keys and frames of others before
+TIP = 2
 
-def walked(kinds, motions, variances, counts, guessed, guesses, start, rigid_within):
-    """Return what the compiled walk found: keys, odometry between them, its noise, slack, frames."""
-    n = len(kinds)
-    poses, between_keys, offsets = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3))
-    noises, slack, frame_keys = np.empty((n, 3, 3)), np.empty(n + 1), np.empty(n, dtype=np.int64)
+
+def walked(kinds, motions, variances, counts, guesses, start, rigid_within):
+    """Return what the compiled walk of robot 1 found: keys, odometry between them, its noise, slack, frames."""
+    n = OLD + len(kinds)
+    robots, previous, frame_keys = (np.full(n, -7) for _ in range(3))
+    poses, between_keys, offsets, noises = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3, 3))
+    spreads, slack, tips = np.empty(n), np.zeros(n), np.array([0, TIP, 3])
+    poses[TIP] = start
     keys, frames = walk(
-        kinds, motions, variances, counts, guessed, guesses, start, rigid_within, LEVER, poses, between_keys, noises,
-        slack, frame_keys, offsets,
+        kinds, motions, variances, counts, guesses, 1, rigid_within, LEVER, OLD, OLD, tips, robots, poses, previous,
+        between_keys, noises, spreads, slack, frame_keys, offsets,
     )  # fmt: skip
-    return poses[:keys], between_keys[:keys], noises[:keys], slack[: keys + 1], frame_keys[:frames], offsets[:frames]
+    new = np.arange(OLD, keys)
+    chain = np.array([TIP, *new])
+    np.testing.assert_array_equal(robots[new], 1)
+    np.testing.assert_array_equal(previous[new], chain[:-1])
+    np.testing.assert_allclose(spreads[new], scatter(noises[new]))
+    np.testing.assert_array_equal(tips, [0, chain[-1], 3])
+    own = np.searchsorted(new, frame_keys[OLD:frames]) - (frame_keys[OLD:frames] == TIP)
+    return poses[new], between_keys[new], noises[new], slack[chain], own, offsets[OLD:frames]
 
 
-def plainly_walked(kinds, motions, variances, counts, guessed, guesses, start, rigid_within):
+def scatter(noises):
+    """Return the mean squares (n,) [m^2] by which motions of covariances (n, 3, 3) scatter, headings at `LEVER`."""
+    return noises[:, 0, 0] + noises[:, 1, 1] + LEVER**2 * noises[:, 2, 2]
+
+
+def plainly_walked(kinds, motions, variances, counts, guesses, start, rigid_within):
     """Return the same, step by step with whole matrices."""
     pose, keys, slack, frames = start, [], [0.0], []
     chain, noise, moved = np.zeros(3), np.zeros((3, 3)), False
@@ -37,7 +54,7 @@ def plainly_walked(kinds, motions, variances, counts, guessed, guesses, start, r
         if kinds[t] == ODOMETRY:
             chain, noise = chained(chain, noise, motions[t], np.diag(variances[t]))
             pose, moved = compose(pose, motions[t]), True
-        if guessed[t]:
+        if np.isfinite(guesses[t]).all():
             pose = guesses[t]
         far = counts[t] > 0 and scatter(noise[None])[0] >= rigid_within**2
         if moved and (far or t == len(kinds) - 1):
@@ -62,22 +79,36 @@ def test_the_compiled_walk_is_the_plain_one(steps, rigid_within, seed):
     rng = np.random.default_rng(seed)
     kinds = rng.choice([STOOD, ODOMETRY], steps, p=[0.2, 0.8]).astype(np.int8)
     motions = np.where(kinds[:, None] == ODOMETRY, rng.normal(size=(steps, 3)) * [0.2, 0.05, 0.5], 0.0)
+    guesses = np.where(rng.random((steps, 1)) < 0.3, rng.normal(size=(steps, 3)), np.nan)
     arguments = (
-        kinds, motions, OdometryModel().variances(motions), rng.integers(0, 3, steps), rng.random(steps) < 0.3,
-        rng.normal(size=(steps, 3)), rng.normal(size=3), rigid_within,
+        kinds, motions, OdometryModel().variances(motions), rng.integers(0, 3, steps), guesses, rng.normal(size=3),
+        rigid_within,
     )  # fmt: skip
     for found, expected in zip(walked(*arguments), plainly_walked(*arguments), strict=True):
         np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
 
 
 def test_measurements_with_names_are_taken():
-    """Which rows bear a name, and of which frame they are if each step with such a row makes one."""
+    """Which rows bear a name, and of which frame they are if each step with such a row makes one; others stay."""
     ids, starts = np.array([4, REJECTED, 9, REJECTED, 4, 2]), np.array([0, 0, 3, 4, 5, 6])
-    counts, rows, frames = np.empty(5, dtype=np.int64), np.empty(6, dtype=np.int64), np.empty(6, dtype=np.int64)
-    taken = choose(ids, starts, counts, rows, frames)
+    points, taken = np.random.default_rng(3).normal(size=(6, 3)), np.zeros((8, 3))
+    names, rows, frames, counts = np.full(8, -7), np.full(8, -7), np.full(8, -7), np.empty(5, dtype=np.int64)
+    assert choose(ids, points, starts, 2, 5, names, taken, rows, frames, counts) == 6
     assert counts.tolist() == [0, 2, 0, 1, 1]
-    assert rows[:taken].tolist() == [0, 2, 4, 5]
-    assert frames[:taken].tolist() == [0, 0, 1, 2]
+    assert rows.tolist() == [-7, -7, 0, 2, 4, 5, -7, -7]
+    assert names.tolist() == [-7, -7, 4, 9, 4, 2, -7, -7]
+    assert frames.tolist() == [-7, -7, 5, 5, 6, 7, -7, -7]
+    np.testing.assert_array_equal(taken[2:6], points[[0, 2, 4, 5]])
+
+
+@given(st.lists(st.integers(0, 5), max_size=8), st.lists(st.tuples(st.integers(0, 5), st.integers(0, 5)), max_size=4))
+def test_names_are_changed_in_the_order_in_which_landmarks_were_found_to_be_one(names, aliases):
+    """Each pair is applied to all names before the next one is."""
+    found, expected = np.array(names, dtype=np.int64), list(names)
+    rename(found, np.array(aliases, dtype=np.int64).reshape(-1, 2))
+    for old, new in aliases:
+        expected = [new if name == old else name for name in expected]
+    assert found.tolist() == expected
 
 
 def test_points_are_placed_by_their_frames():
@@ -92,10 +123,14 @@ def test_points_are_placed_by_their_frames():
         np.testing.assert_allclose(found[n], transform_points(at, points[n] + mount), atol=1e-12)
 
 
-def test_landmarks_are_mostly_new_that_have_more_new_measurements_than_old():
-    """Old ones are those in frozen sightings and raw ones; as many is not more."""
-    frozen, counts, raw, new = np.array([0, 1, 1]), np.array([2, 1, 1]), np.array([0, 2]), np.array([0, 1, 1, 1, 2, 3])
-    assert mostly_new(frozen, counts, raw, new, 5).tolist() == [False, True, False, True, False]
+def test_landmarks_start_anew_that_have_more_new_measurements_than_old():
+    """Old ones are those in frozen sightings and raw ones; as many is not more. Only what the filter holds moves."""
+    frozen, counts, raw = np.array([0, 1, 1]), np.array([2, 1, 1]), np.array([0, 2])
+    new = np.array([0, 1, 1, 1, 2, 3, 5])
+    names, held = np.array([9, 3, 8, 7, 1, 6]), np.array([1, 3, 7, 8, 9])
+    means, landmarks = np.arange(15.0).reshape(5, 3), np.full((6, 3), -1.0)
+    start_anew(frozen, counts, raw, new, names, held, means, landmarks)
+    assert landmarks[:, 0].tolist() == [-1.0, 3.0, -1.0, 6.0, -1.0, -1.0]  # 3 and 7 are held, and 6 is not
 
 
 def test_variances_are_squared_sigmas():
