@@ -59,11 +59,11 @@ def pair_up(
         *common, from_a, from_b, alignment.transform, extra, ITERATIONS
     )  # fmt: skip
     scale = _contradiction(chi2, shared) if extra == MOST_EXTRA else 1.0
-    evidence, factors = _weigh(motions, informations, chi2, log_dets, shared, scale, alignment, known)
+    evidence, covariances = _weigh(motions, informations, chi2, log_dets, shared, scale, alignment, known)
     weights = np.exp(evidence - evidence.max())
     chosen = systematic(weights / weights.sum(), rng, count)
     draws = rng.standard_normal((count, 3))
-    motion = motions[chosen] + np.einsum("mij,mj->mi", factors[chosen], draws)
+    motion = motions[chosen] + np.einsum("mij,mj->mi", _factors(covariances[chosen]), draws)
     return Pairing(from_a[chosen], from_b[chosen], motion, evidence[chosen], extra, scale)
 
 
@@ -91,7 +91,7 @@ def _weigh(
     alignment: Alignment,
     known: bool,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return log-evidences (c,) and factors (c, 3, 3) with C C^T the covariance of each pair's motion.
+    """Return log-evidences (c,) and the covariance of each pair's motion (c, 3, 3).
 
     Pairs of particles that share too little take the consensus motion, and the smallest evidence of the others. Where
     the motion is `known`, all do.
@@ -101,10 +101,14 @@ def _weigh(
     covariances = scale * np.linalg.inv(informations)
     motions[poor] = alignment.transform
     covariances[poor] = alignment.covariance
-    values, vectors = np.linalg.eigh(0.5 * (covariances + covariances.transpose(0, 2, 1)))
-    factors = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
     log_evidence = -0.5 * (chi2 / scale + log_dets + 3.0 * shared * math.log(scale))
     log_evidence += 0.5 * np.linalg.slogdet(np.where(poor[:, None, None], np.eye(3), covariances))[1]
     if poor.any():
         log_evidence[poor] = log_evidence[~poor].min() if (~poor).any() else 0.0
-    return log_evidence, factors
+    return log_evidence, np.asarray(covariances)
+
+
+def _factors(covariances: FloatArray) -> FloatArray:
+    """Return C (c, 3, 3) with C C^T the covariances."""
+    values, vectors = np.linalg.eigh(0.5 * (covariances + covariances.transpose(0, 2, 1)))
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :])

@@ -1,12 +1,13 @@
 """Two groups become one, a merge is doubted, and taken back."""
 
 import math
-from copy import deepcopy
 from functools import partial
+from typing import NamedTuple, Self
 
 import numpy as np
 
 from slam_backend import _kernels
+from slam_backend._pairing import Pairing
 from slam_backend.alignment import RIVAL_ANGLE, RIVAL_DISTANCE, Alignment, AlignmentOptions
 from slam_backend.branches import Branch, fork
 from slam_backend.errors import FloatArray, IntArray
@@ -16,7 +17,7 @@ from slam_backend.geometry import rotate_covariances
 from slam_backend.groups import Group
 from slam_backend.landmark_map import LandmarkMap
 from slam_backend.merge_options import MergeOptions
-from slam_backend.merging import merge_filters, motion_covariance
+from slam_backend.merging import merge_filters, motion_covariance, paired
 from slam_backend.mixture_merging import merge_mixtures
 from slam_backend.records import Records
 from slam_backend.reports import MergeUndone, Renaming
@@ -37,38 +38,69 @@ def straightened(group_a: Group, group_b: Group) -> tuple[LandmarkMap, LandmarkM
     return None if all(report.reason for report in reports) else (filters[0].map("mixture"), filters[1].map("mixture"))
 
 
-def doubt_about(group_a: Group, group_b: Group, alignment: Alignment, rng: np.random.Generator) -> float:
-    """Return how uncertain the motion between two maps is, as the particles of a merge would have it.
+class MergePlan(NamedTuple):
+    """Two groups whose maps align, and what is known of their merge before it is made.
+
+    Attributes:
+        groups: Whose map frame and landmark ids stay, and the other.
+        maps: Of their joint filters as they are, with mixture covariances.
+        alignment: Motion from b's map frame to a's; `inliers` are rows of the maps.
+        pairing: Of the joint filters' particles, if that is drawn already.
+    """
+
+    groups: tuple[Group, Group]
+    maps: tuple[LandmarkMap, LandmarkMap]
+    alignment: Alignment
+    pairing: Pairing | None = None
+
+    @classmethod
+    def of(cls, group_a: Group, group_b: Group, alignment: Alignment) -> Self:
+        """Return a plan by an alignment from outside.
+
+        Raises:
+            ValueError: If the inliers name rows that do not exist or the same one twice.
+        """
+        maps = group_a.trunk.filter.map("mixture"), group_b.trunk.filter.map("mixture")
+        check_inliers(alignment.inliers, len(maps[0]), len(maps[1]))
+        return cls((group_a, group_b), maps, alignment)
+
+    @property
+    def filters(self) -> tuple[FastSlam, FastSlam]:
+        """The joint filters."""
+        return self.groups[0].trunk.filter, self.groups[1].trunk.filter
+
+    @property
+    def pairs(self) -> IntArray:
+        """(k, 2) int64 rows (landmark id in a, landmark id in b) in common."""
+        rows = self.alignment.inliers
+        return np.column_stack([self.maps[0].ids[rows[:, 0]], self.maps[1].ids[rows[:, 1]]])
+
+    def paired(self, merging: MergeOptions, rng: np.random.Generator) -> Self:
+        """Return the plan with the particles paired, as a merge of particles would draw it from `rng`."""
+        pairing = paired(*self.filters, self.alignment, self.pairs, rng, merging.merged_particles)
+        return self._replace(pairing=pairing)
+
+
+def doubt_about(plan: MergePlan) -> float:
+    """Return how uncertain the motion between two maps is, as the particles of a merge have it, which are paired.
 
     Landmarks of one map err together where its paths are uncertain. Their covariances, and the alignment's, do not say
     so; that particles differ in the motion does, with what these do not show where the frames of the maps are held.
-
-    Args:
-        group_a, group_b, alignment: As of `merge_groups`.
-        rng: As the merge would get it, here only looked at: the particles are the very ones.
 
     Returns:
         The standard deviation of the motion in its least certain direction over 0.5 m, or in heading over 5 degrees,
         whichever is more [-].
     """
-    a, b = group_a.trunk.filter, group_b.trunk.filter
-    covariance = motion_covariance(a, b, alignment, _named(alignment, a, b), deepcopy(rng))
-    covariance += _of_frames(a._frame, b._frame, alignment)
+    assert plan.pairing is not None
+    a, b = plan.filters
+    covariance = motion_covariance(plan.pairing.motion, plan.alignment)
+    covariance += _of_frames(a._frame, b._frame, plan.alignment)
     position, heading = math.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1]), math.sqrt(covariance[2, 2])
     return max(position / RIVAL_DISTANCE, heading / RIVAL_ANGLE)
 
 
-def _named(alignment: Alignment, a: FastSlam, b: FastSlam) -> IntArray:
-    """Return the inliers (k, 2), which are rows of the filters' maps, as landmark ids."""
-    ids_a, ids_b = a.map().ids, b.map().ids
-    check_inliers(alignment.inliers, len(ids_a), len(ids_b))
-    return np.column_stack([ids_a[alignment.inliers[:, 0]], ids_b[alignment.inliers[:, 1]]])
-
-
 def merge_groups(
-    group_a: Group,
-    group_b: Group,
-    alignment: Alignment,
+    plan: MergePlan,
     merging: MergeOptions,
     records: Records,
     rng: np.random.Generator,
@@ -78,21 +110,18 @@ def merge_groups(
     """Merge the joint filters of two groups; robots out of contact keep their forks. The merge is then watched.
 
     Args:
-        group_a: Whose map frame and landmark ids stay. Not to be used any more.
-        group_b: Likewise not.
-        alignment: Motion from b's map frame to a's; `inliers` are rows of the trunks' maps.
+        plan: Of the groups, which are not to be used any more.
         merging: How.
         records: Of the team.
         rng: For pairing and draws.
         epoch: Of the joint filter.
         known: As of `merge_filters`; mixtures are always merged so.
-
-    Raises:
-        ValueError: If the inliers name rows that do not exist or the same one twice; nothing has changed then.
     """
+    (group_a, group_b), alignment, pairs = plan.groups, plan.alignment, plan.pairs
     a, b = group_a.trunk, group_b.trunk
-    pairs = _named(alignment, a.filter, b.filter)
-    combine = partial(merge_filters, known=known) if merging.method == "particles" else merge_mixtures
+    combine = merge_mixtures
+    if merging.method == "particles":
+        combine = partial(merge_filters, known=known, pairing=plan.pairing)
     joint, renamed = combine(a.filter, b.filter, alignment, pairs, rng, merging.merged_particles)
     robots, live = a.robots + b.robots, a.live + b.live
     joint.reorder(np.argsort(robots))
@@ -102,8 +131,7 @@ def merge_groups(
         new_ids = dict(renamed.tolist())
         older = [*(watch.copy() for watch in a.watches), *(watch.copy(new_ids) for watch in b.watches)]
         sides = Side.of(a.get_state()), Side.of(b.get_state())
-        before = a.filter.map("mixture"), b.filter.map("mixture")
-        fresh = begin_watch(number, alignment, sides, before, renamed, pairs)
+        fresh = begin_watch(number, alignment, sides, plan.maps, renamed, pairs)
         trunk.watches = [*sorted(older, key=lambda watch: watch.number), fresh]
     renaming = Renaming(a.robots, b.robots, renamed, (a.number, b.number, number))
     records.entries.append(renaming)

@@ -25,7 +25,7 @@ import numpy as np
 
 from slam_backend._joint_landmarks import Landmarks, fuse_odds, joined_tiles, stack_descriptors
 from slam_backend._joint_robots import finish, joined_robots
-from slam_backend._pairing import pair_up
+from slam_backend._pairing import Pairing, pair_up
 from slam_backend.alignment import Alignment
 from slam_backend.errors import FloatArray, IntArray
 from slam_backend.filter import FastSlam
@@ -52,6 +52,7 @@ def merge_filters(
     rng: np.random.Generator,
     num_particles: int | None = None,
     known: bool = False,
+    pairing: Pairing | None = None,
 ) -> tuple[FastSlam, IntArray]:
     """Merge two filters into a joint one in a's map frame (Secs. 3.2 and 4).
 
@@ -64,14 +65,14 @@ def merge_filters(
         rng: For the pairing and the draws of T.
         num_particles: Of the joint filter; None: as many as the larger of the two.
         known: The motion is drawn from the alignment, whatever the landmarks in common say of it.
+        pairing: What `paired` returned for these arguments; None: it is drawn.
 
     Returns:
         The joint filter, a's robots first; and (n, 2) int64 rows (id in b, id in the joint map) of all of b's
         landmarks.
     """
-    count = max(a.num_particles, b.num_particles) if num_particles is None else num_particles
-    common = Landmarks.of(a._maps, ids=pairs[:, 0]), Landmarks.of(b._maps, ids=pairs[:, 1])
-    pairing = pair_up(a.weights, common[0], b.weights, common[1], alignment, count, rng, known)
+    if pairing is None:
+        pairing = paired(a, b, alignment, pairs, rng, num_particles, known)
     from_a, from_b, motion, evidence, extra, scale = pairing
     joint = joined_robots(a, from_a, b, from_b, motion, rng)
     joint._path_log_weights[:] = a._path_log_weights[from_a] + b._path_log_weights[from_b] + evidence
@@ -114,22 +115,31 @@ def merge_filters(
     return joint, renamed
 
 
-def motion_covariance(
-    a: FastSlam, b: FastSlam, alignment: Alignment, pairs: IntArray, rng: np.random.Generator
-) -> FloatArray:
-    """Return how the motions between the maps differ among the particles that `merge_filters` would make.
+def paired(
+    a: FastSlam, b: FastSlam, alignment: Alignment, pairs: IntArray, rng: np.random.Generator,
+    num_particles: int | None = None, known: bool = False,
+) -> Pairing:  # fmt: skip
+    """Draw which particles become joint ones and by which motions: all of a merge that is left to chance in its maps.
+
+    Args:
+        a, b, alignment, pairs, rng, num_particles, known: As of `merge_filters`, which draws it first of all.
+    """
+    count = max(a.num_particles, b.num_particles) if num_particles is None else num_particles
+    common_a, common_b = Landmarks.of(a._maps, ids=pairs[:, 0]), Landmarks.of(b._maps, ids=pairs[:, 1])
+    return pair_up(a.weights, common_a, b.weights, common_b, alignment, count, rng, known)
+
+
+def motion_covariance(motion: FloatArray, alignment: Alignment) -> FloatArray:
+    """Return how the motions between two maps differ among the particles that `merge_filters` makes.
 
     Where paths are uncertain this is more than the alignment of the two maps claims: landmarks of one map err together.
 
     Args:
-        a, b, alignment, pairs: As of `merge_filters`.
-        rng: For the pairing and the draws.
+        motion: (M, 3) of each particle [m, m, rad].
+        alignment: About which headings are told apart.
 
     Returns:
         (3, 3) covariance of (tx, ty, theta) [m, m, rad].
     """
-    common_a, common_b = Landmarks.of(a._maps, ids=pairs[:, 0]), Landmarks.of(b._maps, ids=pairs[:, 1])
-    count = max(a.num_particles, b.num_particles)
-    motion = pair_up(a.weights, common_a, b.weights, common_b, alignment, count, rng).motion
     turns = wrap_angle(motion[:, 2] - alignment.theta)
     return np.asarray(np.cov(np.column_stack([motion[:, :2], turns]).T, bias=True))

@@ -18,7 +18,7 @@ from slam_backend.alignment import Alignment
 from slam_backend.branches import Branch, take_in
 from slam_backend.contacts import check_contacts, reach
 from slam_backend.errors import FloatArray, IntArray, bad_argument
-from slam_backend.group_changes import contradicted, merge_groups, undone
+from slam_backend.group_changes import MergePlan, contradicted, merge_groups, undone
 from slam_backend.groups import Group
 from slam_backend.input_log import RobotInput
 from slam_backend.lineup import Lineup
@@ -26,7 +26,7 @@ from slam_backend.measurements import Measurements
 from slam_backend.merging import inverse_alignment
 from slam_backend.reports import MapDropped, MergeEvent, RejuvenationReport, Renaming, StepReport, TeamReport
 from slam_backend.team_knowledge import TeamKnowledge
-from slam_backend.trying import attempt, speakers
+from slam_backend.trying import attempt
 from slam_backend.undoing import Undoing
 
 NO_IDS: IntArray = np.empty(0, np.int64)
@@ -172,11 +172,15 @@ class TeamSlam(TeamKnowledge):
             raise bad_argument("alignment", "a successful Alignment", got, "Align the two maps first.")
         if groups[1].robots < groups[0].robots:
             groups, alignment = groups[::-1], inverse_alignment(alignment)
+        return self._merge(MergePlan.of(*groups, alignment), known)
+
+    def _merge(self, plan: MergePlan, known: bool = False) -> Renaming:
+        """Merge two groups as planned, and write it down."""
         epoch = self._epoch + 1
-        joint, renaming = merge_groups(*groups, alignment, self._merging, self._records, self._rng, epoch, known)
+        joint, renaming = merge_groups(plan, self._merging, self._records, self._rng, epoch, known)
         self._epoch = epoch
-        self._events.append(MergeEvent(self._step, "merge", groups[0].robots, groups[1].robots, alignment))
-        self._replace(groups, [joint])
+        self._events.append(MergeEvent(self._step, "merge", renaming.robots_a, renaming.robots_b, plan.alignment))
+        self._replace(plan.groups, [joint])
         return renaming
 
     def _replace(self, old: Sequence[Group], new: Sequence[Group]) -> None:
@@ -219,14 +223,11 @@ class TeamSlam(TeamKnowledge):
     def _attempt(self, networks: IntArray) -> tuple[Renaming, ...]:
         """Let a pair of groups try, and merge those whose attempt is a success."""
         options = self._schedule, self._alignment, self._merging
-        event = attempt(self._groups, networks, self._step, *options, self._records, self._rng)
-        if event is None:
+        tried = attempt(self._groups, networks, self._step, *options, self._records, self._rng)
+        if tried is None:
             return ()
-        self._events.append(event)
-        if not event.alignment.success:
-            return ()
-        groups = self._group_of(event.robots_a[0]), self._group_of(event.robots_b[0])
-        return (self.merge(*speakers(groups), event.alignment),)
+        self._events.append(tried.event)
+        return () if tried.plan is None else (self._merge(tried.plan),)
 
     def _note_dropped(self, lineup: Lineup) -> None:
         """Write down which maps are gone since the last lineup."""

@@ -7,7 +7,7 @@ in one step.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from slam_backend._candidates import may_suffice
 from slam_backend.alignment import Alignment, AlignmentOptions, align_maps
 from slam_backend.attempts import AttemptSchedule, PairKey, Straightening
 from slam_backend.errors import IntArray
-from slam_backend.group_changes import doubt_about, straightened
+from slam_backend.group_changes import MergePlan, doubt_about, straightened
 from slam_backend.groups import Group
 from slam_backend.landmark_map import LandmarkMap
 from slam_backend.merge_options import MergeOptions
@@ -29,10 +29,17 @@ Pair = tuple[Group, Group]
 Maps = tuple[LandmarkMap, LandmarkMap]
 
 
+class Tried(NamedTuple):
+    """An attempt that has come to its end, and the merge to be made if it is a success."""
+
+    event: MergeEvent
+    plan: MergePlan | None
+
+
 def attempt(
     groups: Sequence[Group], networks: IntArray, step: int, schedule: AttemptSchedule, alignment: AlignmentOptions,
     merging: MergeOptions, records: Records, rng: np.random.Generator,
-) -> MergeEvent | None:  # fmt: skip
+) -> Tried | None:  # fmt: skip
     """Let the most promising pair of groups try, or go on with an attempt whose maps are straightened; when it is due.
 
     Args:
@@ -43,7 +50,7 @@ def attempt(
         alignment: When two maps are believed to fit together.
         merging: Whether maps are straightened, and how sure a merge has to be.
         records: In which what is sent is written down.
-        rng: For the search.
+        rng: For the search, and the draws of the merge that follows.
 
     Returns:
         The attempt that came to its end in this step; its two groups are to be merged if its alignment is a success.
@@ -61,14 +68,15 @@ def attempt(
         schedule.straightening = replace(pending, ready=ready)  # to go on would be too much for one step
         return None
     schedule.straightening = None
-    outcome = _straight(pair, pending.bent, _mixtures(pair), alignment, records, rng)
-    return _concluded(pair, step, outcome, pending.bent, schedule, merging, rng)
+    maps = _mixtures(pair)
+    outcome = _straight(pair, pending.bent, maps, alignment, records, rng)
+    return _concluded(MergePlan(pair, maps, outcome), step, pending.bent, schedule, merging, rng)
 
 
 def _begun(
     groups: Sequence[Group], networks: IntArray, step: int, schedule: AttemptSchedule, options: AlignmentOptions,
     merging: MergeOptions, records: Records, rng: np.random.Generator,
-) -> MergeEvent | None:  # fmt: skip
+) -> Tried | None:  # fmt: skip
     """Choose a pair and align its maps as the filters have bent them."""
     if len(groups) < 2:
         return None
@@ -83,8 +91,9 @@ def _begun(
     pair, (map_a, map_b) = pairs[chosen], (maps[chosen[0]], maps[chosen[1]])
     bent = align_maps(map_a, map_b, rng=rng, options=options)
     records.exchange.record_maps(*speakers(pair), map_a, map_b)
+    plan = MergePlan(pair, (map_a, map_b), bent)
     if not bent.success or not merging.straighten:
-        return _concluded(pair, step, bent, None, schedule, merging, rng)
+        return _concluded(plan, step, None, schedule, merging, rng)
     if all(group.trunk.filter.smooths_in_slices for group in pair):
         for group in pair:
             group.trunk.filter.hasten()
@@ -93,9 +102,9 @@ def _begun(
     before = [group.trunk.filter.get_state() for group in pair]
     straight = straightened(*pair)
     if straight is None:
-        return _concluded(pair, step, bent, None, schedule, merging, rng)
+        return _concluded(plan, step, None, schedule, merging, rng)
     outcome = _straight(pair, bent, straight, options, records, rng, before)
-    return _concluded(pair, step, outcome, bent, schedule, merging, rng)
+    return _concluded(MergePlan(pair, straight, outcome), step, bent, schedule, merging, rng)
 
 
 def _straight(
@@ -117,16 +126,23 @@ def _straight(
 
 
 def _concluded(
-    pair: Pair, step: int, alignment: Alignment, bent: Alignment | None, schedule: AttemptSchedule,
-    merging: MergeOptions, rng: np.random.Generator,
-) -> MergeEvent:  # fmt: skip
+    plan: MergePlan, step: int, bent: Alignment | None, schedule: AttemptSchedule, merging: MergeOptions,
+    rng: np.random.Generator,
+) -> Tried:  # fmt: skip
     """Ask whether a merge would be sure enough, and remember what came of the attempt."""
+    pair, alignment = plan.groups, plan.alignment
     if alignment.success and merging.sure:
-        doubt = merging.sure * doubt_about(*pair, alignment, rng)
-        if schedule.should_wait(_key(pair), doubt):
+        before = rng.bit_generator.state
+        paired = plan.paired(merging, rng)
+        if schedule.should_wait(_key(pair), merging.sure * doubt_about(paired)):
             alignment = Alignment.refused("too uncertain", alignment.ratio)
+        if alignment.success and merging.method == "particles":
+            plan = paired
+        else:  # nothing was drawn for a merge
+            rng.bit_generator.state = before
     schedule.record(_key(pair), step, alignment.success, straightened=bent is not None)
-    return MergeEvent(step, "attempt", pair[0].robots, pair[1].robots, alignment, bent)
+    event = MergeEvent(step, "attempt", pair[0].robots, pair[1].robots, alignment, bent)
+    return Tried(event, plan if alignment.success else None)
 
 
 def speakers(pair: Pair) -> tuple[int, int]:

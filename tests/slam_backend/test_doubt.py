@@ -1,6 +1,5 @@
 """How uncertain a merge is, asked before it is made."""
 
-import copy
 import math
 
 import numpy as np
@@ -9,7 +8,8 @@ from simulated_team import SimulatedTeam
 
 from slam_backend.alignment import RIVAL_ANGLE, RIVAL_DISTANCE
 from slam_backend.geometry import compose
-from slam_backend.group_changes import doubt_about
+from slam_backend.group_changes import MergePlan, doubt_about
+from slam_backend.merge_options import MergeOptions
 from slam_backend.merging import motion_covariance
 
 
@@ -20,9 +20,10 @@ def test_what_held_frames_leave_open_is_doubted_as_well() -> None:
     simulation.run(team, 60)
     alignment = false_alignment(simulation, team, np.zeros(3))
     a, b = (group.trunk.filter for group in team._groups)
-    ids = np.column_stack([a.map().ids[alignment.inliers[:, 0]], b.map().ids[alignment.inliers[:, 1]]])
-    covariance = motion_covariance(a, b, alignment, ids, copy.deepcopy(team._rng))
-    before = doubt_about(*team._groups, alignment, team._rng)
+    plan = MergePlan.of(*team._groups, alignment).paired(MergeOptions(), team._rng)
+    assert plan.pairing is not None
+    covariance = motion_covariance(plan.pairing.motion, alignment)
+    before = doubt_about(plan)
 
     rng = np.random.default_rng(0)
     frames = [np.diag([3e-2, 1e-2, 9e-3]), np.diag([1e-2, 5e-2, 4e-3])]
@@ -32,6 +33,6 @@ def test_what_held_frames_leave_open_is_doubted_as_well() -> None:
 
     for slam, frame in zip((a, b), frames, strict=True):
         slam._frame[:] = frame
-    after = doubt_about(*team._groups, alignment, team._rng)
+    after = doubt_about(plan)
     np.testing.assert_allclose(after, max(position / RIVAL_DISTANCE, heading / RIVAL_ANGLE), rtol=0.03)
     assert after > 1.5 * before

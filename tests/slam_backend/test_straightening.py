@@ -1,5 +1,7 @@
 """Before a merge both maps are straightened by the smoother, and have to align once more."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from filter_contents import contents
@@ -17,7 +19,7 @@ from slam_backend.geometry import between
 from slam_backend.groups import Group
 from slam_backend.landmark_map import LandmarkMap
 from slam_backend.merge_options import MergeOptions
-from slam_backend.merging import merge_filters, motion_covariance
+from slam_backend.merging import merge_filters, motion_covariance, paired
 from slam_backend.team import TeamSlam
 
 STEPS = 80
@@ -171,7 +173,8 @@ def test_the_spread_of_motions_is_that_of_the_particles_that_a_merge_makes() -> 
     a, b = (team._find(robot)[0].filter for robot in range(2))
     alignment = align_maps(*both_maps(team), rng=np.random.default_rng(1))
     pairs = np.column_stack([a.map().ids[alignment.inliers[:, 0]], b.map().ids[alignment.inliers[:, 1]]])
-    foretold = motion_covariance(a, b, alignment, pairs, np.random.default_rng(2))
+    motion = paired(a, b, alignment, pairs, np.random.default_rng(2)).motion
+    foretold = motion_covariance(motion, alignment)
     joint, _ = merge_filters(a, b, alignment, pairs, np.random.default_rng(2))
     starts = joint._starts[1, :, : joint.num_particles].T
     np.testing.assert_allclose(foretold, np.cov(starts.T, bias=True), atol=1e-12)
@@ -193,9 +196,10 @@ def test_a_pair_too_uncertain_to_merge_waits_and_merges_later() -> None:
     assert len(team.groups) == 1
 
 
-def test_being_sure_leaves_no_trace() -> None:
+@pytest.mark.parametrize("how", [{}, {"merged_particles": 5}, {"method": "mixture"}])
+def test_being_sure_leaves_no_trace(how: dict[str, Any]) -> None:
     """Whether particles agree is only looked at: the merge is bit for bit that of a team which does not ask."""
-    states = [driven(112, AT_LAST, merging=MergeOptions(sure=sure))[1].get_state() for sure in (0.0, 1e-6)]
+    states = [driven(112, AT_LAST, merging=MergeOptions(sure=sure, **how))[1].get_state() for sure in (0.0, 1e-6)]
     assert_same(*({"filter": state["groups"], "rng": state["rng"]} for state in states))
 
 
