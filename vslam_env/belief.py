@@ -16,7 +16,7 @@ from slam_backend.measurements import TeamMeasurements
 from slam_backend.reports import MergeEvent, Renaming, TeamReport
 from slam_backend.standpoints import Standpoints
 from slam_backend.team import TeamSlam
-from vslam_env.navigation import TeamGrids, TeamSlots
+from vslam_env.navigation import TeamSlots
 from vslam_env.readings import Readings, TeamReadings
 from vslam_env.robot_belief import Belief, BeliefConfig, Body, Candidates, Teammate, View
 from vslam_env.shared_grids import SharedGrids
@@ -37,6 +37,10 @@ class TeamBelief:
         decision_ticks: Where policies choose among the candidates: these are renewed at every decision. None: every
             ten ticks, the robots taking turns.
         attempts: Whether the team tries to align its maps by itself; if not, merges from outside are final.
+
+    Attributes:
+        points: Where the robots stand; written to in the next step.
+        grids: The robots' seen grids; to be looked at.
     """
 
     def __init__(
@@ -57,6 +61,7 @@ class TeamBelief:
         self._team = TeamSlam(num_robots, config.alignment, seed, rhythm, merging, **options)
         self._body = body
         self._grids = SharedGrids(num_robots, body)
+        self.grids = self._grids.team
         self._candidates = TeamSlots(num_robots)
         self._slots = self._candidates.slots
         self._robots = np.arange(num_robots)
@@ -65,7 +70,7 @@ class TeamBelief:
         self._confirm_after = config.confirm_after
         self._beliefs: dict[int, Belief] = {}  # of this tick, made when asked for
         self._maps: dict[int, LandmarkMap] = {}  # of this tick, by the number of the map
-        self._points = Standpoints.unwritten(num_robots)  # of this tick, written to in the next
+        self.points = Standpoints.unwritten(num_robots)
         self._outlines = TeamOutlines.unwritten(num_robots, 0)  # likewise, when asked for
         self._has_outlines = False
         self._look_up_poses()
@@ -93,7 +98,7 @@ class TeamBelief:
     @property
     def poses(self) -> FloatArray:
         """(K, 3) float64 [m, m, rad]. Where each robot believes to be, in its own start frame. A copy."""
-        return self._points.own.copy()
+        return self.points.own.copy()
 
     def step(self, readings: TeamReadings | Sequence[Readings]) -> TeamReport:
         """Take in one tick's readings of all K robots; the first ones are those of the reset.
@@ -121,7 +126,7 @@ class TeamBelief:
         self._tick += 1
         self._look_up_poses()
         self._grids.follow(self._tick, report.entries, report.renamings)
-        points = self._points
+        points = self.points
         self._grids.meet(self._lineup.mates, points.starts)
         self._grids.paint(self._tick, points.poses, readings.scans, readings.bumps)
         for robot in self._turns[self._tick % len(self._turns)] if self._tick else range(len(self._robots)):
@@ -133,7 +138,7 @@ class TeamBelief:
         renaming = self._team.merge(robot_a, robot_b, alignment, known)
         self._look_up_poses()
         self._grids.keep(self._tick + 1, renaming)
-        self._grids.meet(self._lineup.mates, self._points.starts)
+        self._grids.meet(self._lineup.mates, self.points.starts)
         return renaming
 
     @property
@@ -164,16 +169,6 @@ class TeamBelief:
             self._has_outlines = True
         return self._outlines
 
-    @property
-    def points(self) -> Standpoints:
-        """Where the robots stand; to be looked at before the next step."""
-        return self._points
-
-    @property
-    def grids(self) -> TeamGrids:
-        """The robots' seen grids; to be looked at."""
-        return self._grids.team
-
     def cells(self, robot: int) -> NDArray[np.uint8]:
         """Return the cells (300, 300) uint8 of a robot's seen grid; a read-only view that follows its changes."""
         return self._grids[robot].cells
@@ -190,8 +185,8 @@ class TeamBelief:
 
     def view(self) -> View:
         """Return what observations show of all robots' beliefs; it shares memory with the grids."""
-        features = self._candidates.features(self._points.poses)
-        return View(self._robots, self._points, self.outlines, self._grids.team.cells, features)
+        features = self._candidates.features(self.points.poses)
+        return View(self._robots, self.points, self.outlines, self.grids.cells, features)
 
     def get_state(self) -> dict[str, Any]:
         """Return all that decides how the beliefs go on; it shares nothing with them."""
@@ -218,7 +213,7 @@ class TeamBelief:
     def _look_up_poses(self) -> None:
         """Take note of the groups and poses after a step or a merge, and forget what was derived from those before."""
         self._lineup = self._team.lineup
-        self._team.standpoints(self._points)
+        self._team.standpoints(self.points)
         self._beliefs.clear()
         self._maps.clear()
         self._has_outlines = False
@@ -229,11 +224,11 @@ class TeamBelief:
 
     def _mates_around(self, robot: int) -> FloatArray:
         """Return where a robot believes these to be (n, 2) [m], in its own start frame."""
-        return self._points.poses[robot, self._others(robot), :2]
+        return self.points.poses[robot, self._others(robot), :2]
 
     def _teammates(self, robot: int) -> tuple[Teammate, ...]:
         """Return the other robots that a robot knows of; one out of contact is where it was when contact was lost."""
-        points, team = self._points, self._team
+        points, team = self.points, self._team
         turn = float(points.starts[robot, 2])
         return tuple(
             Teammate(mate, points.poses[robot, mate], rotate_covariances(turn, team.pose(mate, robot).covariance))
@@ -242,7 +237,7 @@ class TeamBelief:
 
     def _make_belief(self, robot: int) -> Belief:
         """Put together what `belief` returns."""
-        points, slots, group = self._points, self._slots[robot], self._lineup.members[robot]
+        points, slots, group = self.points, self._slots[robot], self._lineup.members[robot]
         return Belief(
             robot=robot,
             tick=self._tick,

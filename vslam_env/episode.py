@@ -198,7 +198,7 @@ class Episode:
         if config.oracle_merge:
             self._merge_by_oracle(reach(heard, config.num_robots))
         self.true_path.append(poses.copy())  # whoever writes to that moves no robot
-        self.estimated_path.append(self.belief.poses)
+        self.estimated_path.append(self.belief.points.own.copy())
 
     def _contacts(self, poses: FloatArray) -> BoolArray:
         """Return who hears whom (K, K)."""

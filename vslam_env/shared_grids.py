@@ -65,20 +65,18 @@ class SharedGrids:
     Args:
         num_robots: K.
         body: The robots' hardware.
+
+    Attributes:
+        team: All grids, in the order of robots.
     """
 
     def __init__(self, num_robots: int, body: Body) -> None:
-        self._team = TeamGrids(num_robots)
-        self._grids = self._team.grids
+        self.team = TeamGrids(num_robots)
+        self._grids = self.team.grids
         self._body = body
         self._settle([(robot,) for robot in range(num_robots)])
         self._kept: list[Kept] = []
         self._strokes: deque[Strokes] = deque()
-
-    @property
-    def team(self) -> TeamGrids:
-        """All grids, in the order of robots."""
-        return self._team
 
     def __getitem__(self, robot: int) -> SeenGrid:
         return self._grids[robot]
@@ -182,7 +180,7 @@ class SharedGrids:
     def _draw(self, owners: IntArray, robots: IntArray, poses: FloatArray, scans: FloatArray, bumps: BoolArray) -> None:
         """Paint readings into the grids, as `Strokes` has them."""
         body = self._body
-        self._team.paint_readings(owners, robots, poses, scans, bumps, body.ray_angles, body.scan_range, body.radius)
+        self.team.paint_readings(owners, robots, poses, scans, bumps, body.ray_angles, body.scan_range, body.radius)
 
     def get_state(self) -> dict[str, Any]:
         """Return all that decides how the grids go on; what is never written to is shared."""
