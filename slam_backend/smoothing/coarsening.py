@@ -7,16 +7,15 @@ first, what was measured from it is moved there, and the odometry between them i
 
 import numpy as np
 
-from slam_backend.errors import BoolArray, FloatArray, IntArray
+from slam_backend.errors import BoolArray, FloatArray
 from slam_backend.smoothing import _kernels
-from slam_backend.smoothing.graph import PathGraph
+from slam_backend.smoothing.graph import OF_FRAMES, OF_KEYS, OF_LANDMARKS, OF_POINTS, PathGraph
 from slam_backend.smoothing.options import SmoothingOptions
 from slam_backend.smoothing.sightings import Sightings
 from slam_backend.smoothing.solving import Mode
 
 MOST_FRAMES = 100  # of a fresh key whose measurements stay raw: a robot that waits takes frames without end
 CONTRADICTION = 2.0  # times the kernel's squared distance: measurements farther off are dropped for good
-OF_POINTS = ("points", "point_noises", "given", "point_frames", "point_landmarks")
 
 
 def coarsened(graph: PathGraph, camera: FloatArray, options: SmoothingOptions) -> PathGraph:
@@ -31,37 +30,27 @@ def coarsened(graph: PathGraph, camera: FloatArray, options: SmoothingOptions) -
         camera: As in `find_mode`.
         options: How many keys, and how many of them fresh, of all robots together.
     """
-    fresh = _fresh(graph, options)
-    raw = fresh & (np.bincount(graph.frame_keys, minlength=graph.num_keys) <= MOST_FRAMES)
+    k, robots = graph.num_keys, len(graph.tips)
+    fresh, raw, sighted = (np.empty(k, dtype=np.bool_) for _ in range(3))
+    share = max(1, options.fresh_keys // robots)
+    _kernels.look_at_keys(graph.robots, graph.frame_keys, share, MOST_FRAMES, fresh, raw)
     graph, seen = _consistent(graph, raw, camera, options)
-    rows = np.flatnonzero(seen.frozen | ~raw[seen.keys])  # what is frozen from now on
-    k, sighted = graph.num_keys, np.zeros(graph.num_keys, dtype=np.bool_)
-    sighted[seen.keys[rows]] = True
-    previous, motions, noises = graph.previous.copy(), graph.motions.copy(), graph.noises.copy()
-    slack, roots, numbers = graph.slack.copy(), np.empty(k, dtype=np.int64), np.empty(k, dtype=np.int64)
-    offsets = np.empty((k, 3))
-    _kernels.join_keys(
-        graph.robots, graph.poses, graph.linked, previous, motions, noises, graph.spreads, slack, fresh, sighted,
-        options.most_keys(len(graph.tips)), roots, numbers, offsets,
-    )  # fmt: skip
-    kept, n = np.flatnonzero(numbers >= 0), len(rows)
+    rows = np.empty(len(seen.keys), dtype=np.int64)
+    rows = rows[: _kernels.to_freeze(seen.frozen, seen.keys, raw, rows, sighted)]
+    keys = {name: getattr(graph, name).copy() for name in OF_KEYS}
+    roots, numbers, offsets = np.empty(k, dtype=np.int64), np.empty(k, dtype=np.int64), np.empty((k, 3))
+    left = _kernels.join_keys(fresh, sighted, options.most_keys(robots), roots, numbers, offsets, *keys.values())
+    n = len(rows)
     frozen_keys, frozen_landmarks, counts = (np.empty(n, dtype=np.int64) for _ in range(3))
     centres, infos, slopes = np.empty((n, 3)), np.empty((n, 6)), np.empty((n, 3))
     num = _kernels.add_sightings(
-        rows, seen.keys, seen.landmarks, seen.centres, seen.infos, seen.slopes, seen.counts, roots, offsets,
+        rows, seen.keys, seen.landmarks, seen.centres, seen.infos, seen.slopes, seen.counts, roots, numbers, offsets,
         frozen_keys, frozen_landmarks, centres, infos, slopes, counts,
     )  # fmt: skip
     fewer = graph.with_columns(
-        robots=graph.robots[kept],
-        poses=graph.poses[kept],
-        previous=previous[kept],
-        motions=motions[kept],
-        noises=noises[kept],
-        spreads=graph.spreads[kept],
-        slack=slack[kept],
+        **{name: column[:left] for name, column in keys.items()},
         frame_keys=numbers[graph.frame_keys],
-        **_of_points(graph, raw[graph.frame_keys[graph.point_frames]]),
-        frozen_keys=numbers[frozen_keys[:num]],
+        frozen_keys=frozen_keys[:num],
         frozen_landmarks=frozen_landmarks[:num],
         centres=centres[:num],
         infos=infos[:num],
@@ -70,7 +59,7 @@ def coarsened(graph: PathGraph, camera: FloatArray, options: SmoothingOptions) -
         heads=numbers[graph.heads],
         tips=numbers[graph.tips],
     )
-    return compacted(fewer)
+    return _without_unused(fewer, raw[graph.frame_keys[graph.point_frames]])
 
 
 def at_mode(graph: PathGraph, mode: Mode, spreads: FloatArray | None = None) -> PathGraph:
@@ -81,26 +70,20 @@ def at_mode(graph: PathGraph, mode: Mode, spreads: FloatArray | None = None) -> 
 
 def compacted(graph: PathGraph) -> PathGraph:
     """Return the graph without the frames from which, and the landmarks of which, nothing was measured."""
-    frames, of_frames = _used(len(graph.frame_keys), graph.point_frames)
-    landmarks, of_landmarks = _used(len(graph.landmark_ids), graph.point_landmarks, graph.frozen_landmarks)
+    return _without_unused(graph, np.ones(len(graph.points), dtype=np.bool_))
+
+
+def _without_unused(graph: PathGraph, kept: BoolArray) -> PathGraph:
+    """Return the graph with some of its raw measurements (n,), and with what anything is left of; see `compacted`."""
+    frozen = graph.frozen_landmarks.copy()
+    columns = {name: getattr(graph, name).copy() for name in (*OF_POINTS, *OF_FRAMES, *OF_LANDMARKS)}
+    points, frames, landmarks = _kernels.drop_unused(kept, frozen, *columns.values())
     return graph.with_columns(
-        frame_keys=graph.frame_keys[frames],
-        frame_offsets=graph.frame_offsets[frames],
-        point_frames=of_frames[graph.point_frames],
-        point_landmarks=of_landmarks[graph.point_landmarks],
-        frozen_landmarks=of_landmarks[graph.frozen_landmarks],
-        landmark_ids=graph.landmark_ids[landmarks],
-        landmarks=graph.landmarks[landmarks],
+        frozen_landmarks=frozen,
+        **{name: columns[name][:points] for name in OF_POINTS},
+        **{name: columns[name][:frames] for name in OF_FRAMES},
+        **{name: columns[name][:landmarks] for name in OF_LANDMARKS},
     )
-
-
-def _fresh(graph: PathGraph, options: SmoothingOptions) -> BoolArray:
-    """Return (k,) which keys are each robot's newest."""
-    share = max(1, options.fresh_keys // len(graph.tips))
-    fresh = np.zeros(graph.num_keys, dtype=np.bool_)
-    for robot in range(len(graph.tips)):
-        fresh[np.flatnonzero(graph.robots == robot)[-share:]] = True
-    return fresh
 
 
 def _consistent(
@@ -127,11 +110,3 @@ def _of_points(graph: PathGraph, chosen: BoolArray) -> dict[str, np.ndarray]:
     """Return some of the raw measurements, by the names of their columns."""
     rows = np.flatnonzero(chosen)
     return {name: getattr(graph, name)[rows] for name in OF_POINTS}
-
-
-def _used(num: int, *rows: IntArray) -> tuple[IntArray, IntArray]:
-    """Return which of `num` rows any of these name, and what each of those is called among them."""
-    used = np.zeros(num, dtype=np.bool_)
-    for column in rows:
-        used[column] = True
-    return np.flatnonzero(used), np.cumsum(used) - 1

@@ -12,11 +12,9 @@ from slam_backend.geometry import compose, rotation
 from slam_backend.log_arrays import EXACT, LogArrays
 from slam_backend.motion import OdometryModel
 from slam_backend.smoothing._walking import choose, place, start_anew, walk
-from slam_backend.smoothing.graph import LEVER, PathGraph
+from slam_backend.smoothing.graph import LEVER, OF_FRAMES, OF_KEYS, PathGraph
 
 LEAST_NOISE = 1e-5  # [m, rad] of odometry in one step: where a part has none, as with no floors, nothing is singular
-OF_KEYS = ("robots", "poses", "previous", "motions", "noises", "spreads", "slack")
-OF_FRAMES = ("frame_keys", "frame_offsets")
 UNKNOWN = np.full(3, np.nan)  # a pose of which nothing is supposed
 
 

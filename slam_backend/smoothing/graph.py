@@ -16,6 +16,14 @@ LEVER = 3.0  # [m]; where an error of the heading between two keys is felt
 RIGID = 1e-4  # [m, rad]; starts that scatter less against each other do not move
 
 
+# The columns of a graph that go together, row by row.
+OF_KEYS = ("robots", "poses", "previous", "motions", "noises", "spreads", "slack")
+OF_FRAMES = ("frame_keys", "frame_offsets")
+OF_POINTS = ("points", "point_noises", "given", "point_frames", "point_landmarks")
+OF_FROZEN = ("frozen_keys", "frozen_landmarks", "centres", "infos", "slopes", "counts")
+OF_LANDMARKS = ("landmark_ids", "landmarks")
+
+
 def _empty(*shape: int) -> FloatArray:
     """Return an array of its own with no rows."""
     return np.zeros(shape)
@@ -160,11 +168,6 @@ class PathGraph:
     def to_mapping(self) -> dict[str, Any]:
         """Return all arrays by name; they cannot be written."""
         return dict(vars(self))
-
-    @property
-    def linked(self) -> BoolArray:
-        """(k,) whether a key comes after another of the same robot."""
-        return np.asarray((self.previous >= 0) & (self.robots[self.previous] == self.robots))
 
     @property
     def num_keys(self) -> int:

@@ -7,11 +7,7 @@ import numpy as np
 
 from slam_backend.errors import BoolArray, FloatArray, IntArray
 from slam_backend.geometry import between, compose, rotation
-from slam_backend.smoothing.graph import NONE, RIGID, VAGUE, PathGraph
-
-OF_POINTS = ("points", "point_noises", "given", "point_frames", "point_landmarks")
-OF_FROZEN = ("frozen_keys", "frozen_landmarks", "centres", "infos", "slopes", "counts")
-
+from slam_backend.smoothing.graph import NONE, OF_FROZEN, OF_POINTS, RIGID, VAGUE, PathGraph
 
 FIXES = 3  # landmarks in common from which measurements alone say how two groups lie
 

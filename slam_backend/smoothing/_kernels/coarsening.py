@@ -1,4 +1,4 @@
-"""Keys become one with the key before, and what was measured from them is added up, as `coarsened` asks for."""
+"""Keys become one with the key before, what was measured from them is added up, and what nobody names then goes."""
 
 import math
 
@@ -61,35 +61,83 @@ def chain(first: FloatArray, first_noise: FloatArray, motion: FloatArray, noise:
 
 
 @jit
+def look_at_keys(
+    robots: IntArray, frame_keys: IntArray, share: int, most_frames: int, fresh: BoolArray, raw: BoolArray
+) -> None:
+    """Say which keys are each robot's newest, and from which of these measurements stay raw.
+
+    Args:
+        robots: (k,) of the keys, in the order of time; negative: of none.
+        frame_keys: (f,) key of each frame.
+        share: So many keys of a robot are fresh.
+        most_frames: So many frames a key may have if its measurements are to stay raw.
+        fresh, raw: (k,), results.
+    """
+    frames = np.zeros(len(robots), dtype=np.int64)
+    for key in frame_keys:
+        frames[key] += 1
+    newer = np.zeros(robots.max() + 1, dtype=np.int64)
+    for b in range(len(robots) - 1, -1, -1):
+        fresh[b] = raw[b] = False
+        if robots[b] >= 0 and newer[robots[b]] < share:
+            newer[robots[b]] += 1
+            fresh[b], raw[b] = True, frames[b] <= most_frames
+
+
+@jit
+def to_freeze(frozen: BoolArray, keys: IntArray, raw: BoolArray, rows: IntArray, sighted: BoolArray) -> int:
+    """Say which sightings are frozen from now on: those that are, and those of keys that do not stay raw.
+
+    Args:
+        frozen, keys: (s,) whether each is by now, and its key.
+        raw: (k,) of `look_at_keys`.
+        rows: (s,), result, of which the first rows are written.
+        sighted: (k,), result: whether any of them is of a key.
+
+    Returns:
+        How many there are.
+    """
+    num = 0
+    sighted[:] = False
+    for row in range(len(keys)):
+        if frozen[row] or not raw[keys[row]]:
+            rows[num], sighted[keys[row]] = row, True
+            num += 1
+    return num
+
+
+@jit
 def join_keys(
-    robots: IntArray, poses: FloatArray, linked: BoolArray, previous: IntArray, motions: FloatArray,
-    noises: FloatArray, costs: FloatArray, slack: FloatArray, fresh: BoolArray, sighted: BoolArray, most_keys: int,
-    roots: IntArray, numbers: IntArray, offsets: FloatArray,
+    fresh: BoolArray, sighted: BoolArray, most_keys: int, roots: IntArray, numbers: IntArray, offsets: FloatArray,
+    robots: IntArray, poses: FloatArray, previous: IntArray, motions: FloatArray, noises: FloatArray,
+    costs: FloatArray, slack: FloatArray,
 ) -> int:  # fmt: skip
-    """Say which keys are left, and where the others stand to them; odometry is carried there.
+    """Leave few enough keys, and say where the others stand to them; odometry is carried there.
 
     Old keys from which nothing was measured are chained away if they have a successor. Then, as long as there are too
     many, the old key goes whose motion from the key before costs least with what either has cost already: it stands
     rigidly to the key before from then on.
 
     Args:
-        robots, poses: (k,), (k, 3) of the keys, in the order of time.
-        linked: (k,) whether a key comes after another of the same robot.
-        previous, motions, noises: (k,), (k, 3), (k, 3, 3) the odometry to each; changed: that of a key that is left
-            begins at another one that is left, by its new number.
-        costs, slack: (k,) [m^2] what joining a key to the one before costs; what each has cost, changed.
         fresh: (k,) whether a key stays in any case.
         sighted: (k,) whether anything was measured from it.
         most_keys: So many may be left.
         roots: (k,), result: the key to which each stands rigidly, itself if it is left, `NONE` if it was chained away.
         numbers: (k,), result: new number of each that is left, `NONE` of the others.
         offsets: (k, 3), result: pose of each seen from its root.
+        robots, poses, previous, motions, noises, costs, slack: (k, ...) columns of `PathGraph`, keys in the order of
+            time; `costs` [m^2], its `spreads`, is what joining a key to the one before costs, `slack` what each has
+            cost. Changed: the first rows are those of the keys that are left, whose odometry begins at another one that
+            is left, by its new number.
 
     Returns:
         How many are left.
     """
     k = len(robots)
     following = np.full(k, NONE)
+    linked = np.empty(k, dtype=np.bool_)  # whether a key comes after another of the same robot
+    for b in range(k):
+        linked[b] = previous[b] >= 0 and robots[previous[b]] == robots[b]
     for b in range(k):
         if linked[b]:
             a = previous[b]
@@ -136,30 +184,35 @@ def join_keys(
         offsets[b, 0], offsets[b, 1] = c * dx + s * dy, -s * dx + c * dy
         offsets[b, 2] = _wrapped_heading(poses[b, 2] - poses[a, 2])
     for b in range(k):
-        a = previous[b]
-        if roots[b] != b or a < 0:
+        if roots[b] != b:
             continue
-        previous[b] = numbers[roots[a]]
-        if roots[a] != a:
-            _compose(offsets[a], motions[b], motions[b])
-            _turned(math.cos(offsets[a, 2]), math.sin(offsets[a, 2]), noises[b], noises[b])
+        a = previous[b]
+        if a >= 0:
+            previous[b] = numbers[roots[a]]
+            if roots[a] != a:
+                _compose(offsets[a], motions[b], motions[b])
+                _turned(math.cos(offsets[a, 2]), math.sin(offsets[a, 2]), noises[b], noises[b])
+        n = numbers[b]
+        robots[n], poses[n], previous[n] = robots[b], poses[b], previous[b]
+        motions[n], noises[n], costs[n], slack[n] = motions[b], noises[b], costs[b], slack[b]
     return number
 
 
 @jit
 def add_sightings(
     rows: IntArray, keys: IntArray, landmarks: IntArray, centres: FloatArray, infos: FloatArray, slopes: FloatArray,
-    counts: IntArray, roots: IntArray, offsets: FloatArray, new_keys: IntArray, new_landmarks: IntArray,
-    new_centres: FloatArray, new_infos: FloatArray, new_slopes: FloatArray, new_counts: IntArray,
+    counts: IntArray, roots: IntArray, numbers: IntArray, offsets: FloatArray, new_keys: IntArray,
+    new_landmarks: IntArray, new_centres: FloatArray, new_infos: FloatArray, new_slopes: FloatArray,
+    new_counts: IntArray,
 ) -> int:  # fmt: skip
     """Move sightings to the keys to which theirs stand rigidly, and add up the forms of each pair.
 
     Args:
         rows: (n,) which sightings, those of a landmark one after the other; reordered: by key in each landmark.
         keys, landmarks, centres, infos, slopes, counts: Of all sightings.
-        roots, offsets: As `join_keys` wrote them.
+        roots, numbers, offsets: As `join_keys` wrote them.
         new_keys, new_landmarks, new_centres, new_infos, new_slopes, new_counts: (n, ...), results, of which the first
-            rows are written; keys by their old numbers. A sum lies about the centre of its first part.
+            rows are written; keys by their new numbers. A sum lies about the centre of its first part.
 
     Returns:
         How many there are.
@@ -173,7 +226,7 @@ def add_sightings(
     num = 0
     info = np.empty(6)
     for row in rows:
-        key, landmark, offset = roots[keys[row]], landmarks[row], offsets[keys[row]]
+        key, landmark, offset = numbers[roots[keys[row]]], landmarks[row], offsets[keys[row]]
         x, y, z = centres[row, 0], centres[row, 1], centres[row, 2]
         g0, g1, g2 = slopes[row, 0], slopes[row, 1], slopes[row, 2]
         info[:] = infos[row]
@@ -197,3 +250,48 @@ def add_sightings(
         new_infos[num] = info
         num += 1
     return num
+
+
+@jit
+def drop_unused(
+    kept: BoolArray, frozen_landmarks: IntArray, points: FloatArray, point_noises: FloatArray, given: BoolArray,
+    point_frames: IntArray, point_landmarks: IntArray, frame_keys: IntArray, frame_offsets: FloatArray,
+    landmark_ids: IntArray, landmarks: FloatArray,
+) -> tuple[int, int, int]:  # fmt: skip
+    """Leave some raw measurements, and those frames and landmarks of which anything is left that was measured.
+
+    Args:
+        kept: (n,) which raw measurements are left.
+        frozen_landmarks: (s,) of the frozen sightings; changed: where these are then.
+        points, point_noises, given, point_frames, point_landmarks, frame_keys, frame_offsets, landmark_ids, landmarks:
+            Columns of `PathGraph`. Changed: what is left are the first rows, which name each other by where they are.
+
+    Returns:
+        How many measurements, frames and landmarks are left.
+    """
+    num = 0
+    frame_numbers, landmark_numbers = np.full(len(frame_keys), NONE), np.full(len(landmark_ids), NONE)
+    for n in range(len(kept)):
+        if kept[n]:
+            frame_numbers[point_frames[n]], landmark_numbers[point_landmarks[n]] = 0, 0
+            points[num], point_noises[num], given[num] = points[n], point_noises[n], given[n]
+            point_frames[num], point_landmarks[num] = point_frames[n], point_landmarks[n]
+            num += 1
+    for landmark in frozen_landmarks:
+        landmark_numbers[landmark] = 0
+    frames = 0
+    for f in range(len(frame_keys)):
+        if frame_numbers[f] != NONE:
+            frame_keys[frames], frame_offsets[frames], frame_numbers[f] = frame_keys[f], frame_offsets[f], frames
+            frames += 1
+    left = 0
+    for row in range(len(landmark_ids)):
+        if landmark_numbers[row] != NONE:
+            landmark_ids[left], landmarks[left], landmark_numbers[row] = landmark_ids[row], landmarks[row], left
+            left += 1
+    for n in range(num):
+        point_frames[n] = frame_numbers[point_frames[n]]
+        point_landmarks[n] = landmark_numbers[point_landmarks[n]]
+    for s in range(len(frozen_landmarks)):
+        frozen_landmarks[s] = landmark_numbers[frozen_landmarks[s]]
+    return num, frames, left

@@ -8,9 +8,9 @@ import numpy as np
 from slam_backend._packed import UNPACK, UPPER
 from slam_backend.errors import BoolArray, FloatArray, IntArray
 from slam_backend.geometry import between, compose, rotation
-from slam_backend.smoothing.coarsening import CONTRADICTION, OF_POINTS, compacted
+from slam_backend.smoothing.coarsening import CONTRADICTION
 from slam_backend.smoothing.extending import chained
-from slam_backend.smoothing.graph import NONE, PathGraph
+from slam_backend.smoothing.graph import NONE, OF_POINTS, PathGraph
 from slam_backend.smoothing.options import SmoothingOptions
 from slam_backend.smoothing.sightings import Sightings
 
@@ -23,7 +23,36 @@ def plainly_coarsened(graph: PathGraph, camera: FloatArray, options: SmoothingOp
         fresh[np.flatnonzero(graph.robots == robot)[-share:]] = True
     condensed = _without_blind(_condensed(graph, fresh, camera, options), fresh)
     representatives, slack = _representatives(condensed, graph.spreads, fresh, options.most_keys(len(graph.tips)))
-    return compacted(_joined(replace(condensed, slack=slack), representatives))
+    return plainly_compacted(_joined(replace(condensed, slack=slack), representatives))
+
+
+def plainly_compacted(graph: PathGraph) -> PathGraph:
+    """Return what `compacted` does."""
+    frames, of_frames = _used(len(graph.frame_keys), graph.point_frames)
+    landmarks, of_landmarks = _used(len(graph.landmark_ids), graph.point_landmarks, graph.frozen_landmarks)
+    return replace(
+        graph,
+        frame_keys=graph.frame_keys[frames],
+        frame_offsets=graph.frame_offsets[frames],
+        point_frames=of_frames[graph.point_frames],
+        point_landmarks=of_landmarks[graph.point_landmarks],
+        frozen_landmarks=of_landmarks[graph.frozen_landmarks],
+        landmark_ids=graph.landmark_ids[landmarks],
+        landmarks=graph.landmarks[landmarks],
+    )
+
+
+def _used(num: int, *rows: IntArray) -> tuple[IntArray, IntArray]:
+    """Return which of `num` rows any of these name, and what each of those is called among them."""
+    used = np.zeros(num, dtype=np.bool_)
+    for column in rows:
+        used[column] = True
+    return np.flatnonzero(used), np.cumsum(used) - 1
+
+
+def _linked(graph: PathGraph) -> BoolArray:
+    """Return (k,) whether a key comes after another of the same robot."""
+    return np.asarray((graph.previous >= 0) & (graph.robots[graph.previous] == graph.robots))
 
 
 def _condensed(graph: PathGraph, fresh: BoolArray, camera: FloatArray, options: SmoothingOptions) -> PathGraph:
@@ -59,11 +88,11 @@ def _without_blind(graph: PathGraph, fresh: BoolArray) -> PathGraph:
     sighted = np.zeros(graph.num_keys, dtype=np.bool_)
     sighted[graph.frozen_keys] = True
     sighted[graph.frame_keys[graph.point_frames]] = True
-    blind = ~sighted & ~fresh & graph.linked
+    blind = ~sighted & ~fresh & _linked(graph)
     if not blind.any():
         return graph
     previous, motions, noises = graph.previous.copy(), graph.motions.copy(), graph.noises.copy()
-    for key in np.flatnonzero(graph.linked):  # in the order of time
+    for key in np.flatnonzero(_linked(graph)):  # in the order of time
         before = previous[key]
         while blind[before]:
             motions[key], noises[key] = chained(motions[before], noises[before], motions[key], noises[key])
@@ -79,7 +108,7 @@ def _representatives(
     k = graph.num_keys
     representative = np.arange(k)
     following = np.full(k, NONE)
-    linked = np.flatnonzero(graph.linked)
+    linked = np.flatnonzero(_linked(graph))
     following[graph.previous[linked]] = linked  # a blind key was replaced by its successor, if it has one
     needed = np.ones(k, dtype=np.bool_)
     needed[linked] = following[graph.previous[linked]] == linked
