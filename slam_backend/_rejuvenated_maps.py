@@ -2,10 +2,13 @@
 
 import numpy as np
 
+from slam_backend._best_map import slots_held
+from slam_backend._jit import jit
 from slam_backend._particle_maps import ParticleMaps
+from slam_backend.errors import FloatArray
 from slam_backend.smoothing.rejuvenation import Particles
 
-DIAGONAL = [3, 6, 8]  # of a landmark's covariance, in the rows of a tile
+XX, YY, ZZ = 3, 6, 8  # the diagonal of a landmark's covariance, in the rows of a tile
 
 
 def write_maps(maps: ParticleMaps, best: int, particles: Particles, walk: float) -> None:
@@ -21,10 +24,12 @@ def write_maps(maps: ParticleMaps, best: int, particles: Particles, walk: float)
         particles: The new ones.
         walk: Variance [m^2] along each axis, see `FilterOptions.landmark_walk`.
     """
-    slots = maps.used_slots()
-    slots = slots[(maps.of_particle(best, slots)[1] > 0) & np.isin(maps.ids[slots], particles.ids)]
-    rows = np.searchsorted(particles.ids[order := np.argsort(particles.ids)], maps.ids[slots])
-    rows = order[rows]
+    slots = slots_held(maps, best, 1)
+    order = np.argsort(particles.ids)
+    ids = particles.ids[order]
+    at = np.minimum(ids.searchsorted(maps.ids[slots]), len(ids) - 1)
+    supported = ids[at] == maps.ids[slots]
+    slots, rows = slots[supported], order[at[supported]]
     m = maps.num_particles
     odds = maps.dense_odds(slots)
     if odds is not None:
@@ -35,5 +40,13 @@ def write_maps(maps: ParticleMaps, best: int, particles: Particles, walk: float)
         particles.tiles, np.broadcast_to(particles.counts[rows, None], (len(rows), m)), maps.descriptors[slots],
         maps.ids[slots], maps.identities[slots], maps.next_id, odds, rows, maps.last_seen[slots],
     )  # fmt: skip
-    for row in DIAGONAL:
-        maps.blocks[: len(rows), :, row] += walk  # (7) of docs/smoothing.md
+    widen(maps.blocks[: len(rows)], walk)
+
+
+@jit
+def widen(tiles: FloatArray, walk: float) -> None:
+    """Add a variance [m^2] along each axis to landmarks (n, P / lanes, 9, lanes), in place."""
+    for tile in tiles.reshape(-1, 9, tiles.shape[3]):
+        for row in (XX, YY, ZZ):
+            for lane in range(tiles.shape[3]):
+                tile[row, lane] += walk  # (7) of docs/smoothing.md

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from slam_backend._best_map import best_map
 from slam_backend._particle_maps import ParticleMaps
 from slam_backend.log_arrays import LogArrays
 from slam_backend.run_log import RobotLog
@@ -15,11 +16,8 @@ from slam_backend.smoothing.rejuvenation import Looks
 
 def places_of(maps: ParticleMaps, best: int) -> Places:
     """Return where the most probable particle holds its landmarks to be."""
-    slots = maps.used_slots()
-    slots = slots[np.argsort(maps.ids[slots])]
-    values, counts = maps.of_particle(best, slots)
-    held = counts > 0
-    return Places(maps.ids[slots[held]], values[held, :3])
+    means, _, _, _, ids = best_map(maps, best, 1)
+    return Places(ids, means)
 
 
 def known_of(maps: ParticleMaps, best: int) -> Known:

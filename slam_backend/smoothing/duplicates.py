@@ -2,8 +2,8 @@
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
+from slam_backend._jit import inlined, jit
 from slam_backend._packed import UNPACK
 from slam_backend.errors import FloatArray, IntArray
 from slam_backend.smoothing.graph import PathGraph
@@ -28,18 +28,11 @@ def find_duplicates(
         descriptors: (l, d) by row of `graph.landmark_ids`; NaN for a landmark that is not to be touched.
         descriptor_gate: L2 distance beyond which two do not look alike.
     """
-    seen = mode.sightings
-    usable = np.flatnonzero((np.diff(seen.starts) > 0) & np.isfinite(descriptors).all(axis=1))
-    if len(usable) < 2:
-        return np.zeros((0, 2), dtype=np.int64)
+    order, seen = np.argsort(mode.landmarks[:, 0]), mode.sightings
     found: list[tuple[float, int, int]] = []
-    for i, j in cKDTree(mode.landmarks[usable]).query_pairs(REACH, output_type="ndarray"):
-        a, b = int(usable[i]), int(usable[j])
-        if np.linalg.norm(descriptors[a] - descriptors[b]) > descriptor_gate:
-            continue
-        keys_a, keys_b = seen.keys[seen.starts[a] : seen.starts[a + 1]], seen.keys[seen.starts[b] : seen.starts[b + 1]]
-        if np.intersect1d(keys_a, keys_b).size:
-            continue
+    for a, b in alike_pairs(
+        order, mode.landmarks, descriptors, seen.keys, seen.starts, REACH, descriptor_gate
+    ).tolist():
         distance = _distance(_values(draws, a), _values(draws, b))
         if distance <= GATE:
             found.append((distance, a, b))
@@ -50,6 +43,65 @@ def find_duplicates(
             taken |= {a, b}
             rows.append(sorted((int(graph.landmark_ids[a]), int(graph.landmark_ids[b])), reverse=True))
     return np.array(rows, dtype=np.int64).reshape(-1, 2)
+
+
+@inlined
+def _squared_distance(a: NDArray[np.float32], b: NDArray[np.float32]) -> float:
+    """Return the squared L2 distance of two descriptors (d,)."""
+    total = 0.0
+    for i in range(len(a)):
+        total += (a[i] - b[i]) * (a[i] - b[i])
+    return total
+
+
+@inlined
+def _apart(a: IntArray, b: IntArray) -> bool:
+    """Return whether two ascending rows, have elements, and none in common."""
+    i, j = 0, 0
+    while i < len(a) and j < len(b):
+        if a[i] == b[j]:
+            return False
+        if a[i] < b[j]:
+            i += 1
+        else:
+            j += 1
+    return len(a) > 0 and len(b) > 0
+
+
+@jit
+def alike_pairs(
+    order: IntArray, landmarks: FloatArray, descriptors: NDArray[np.float32], keys: IntArray, starts: IntArray,
+    reach: float, gate: float,
+) -> IntArray:  # fmt: skip
+    """Return pairs (n, 2) of landmarks that lie near each other, look alike and have no key in common.
+
+    Args:
+        order: (l,) int64. The landmarks by ascending x.
+        landmarks: (l, 3) float64 [m].
+        descriptors: (l, d) float32. Two do not look alike if any number is NaN.
+        keys, starts: (s,), (l + 1,) int64. Key of each sighting, ascending for each landmark; those of landmark i are
+            starts[i] to starts[i + 1]. One that has none is in no pair.
+        reach: [m]. How far apart they may lie.
+        gate: L2 distance beyond which two do not look alike.
+    """
+    pairs, num = np.empty((16, 2), dtype=np.int64), 0
+    for i in range(len(order)):
+        for j in range(i + 1, len(order)):
+            a, b = min(order[i], order[j]), max(order[i], order[j])
+            dx, dy = landmarks[a, 0] - landmarks[b, 0], landmarks[a, 1] - landmarks[b, 1]
+            dz = landmarks[a, 2] - landmarks[b, 2]
+            if abs(dx) > reach:
+                break
+            if dx * dx + dy * dy + dz * dz > reach * reach:
+                continue
+            if not _squared_distance(descriptors[a], descriptors[b]) <= gate * gate:
+                continue
+            if _apart(keys[starts[a] : starts[a + 1]], keys[starts[b] : starts[b + 1]]):
+                if num == len(pairs):
+                    pairs = np.concatenate((pairs, np.empty_like(pairs)))
+                pairs[num, 0], pairs[num, 1] = a, b
+                num += 1
+    return pairs[:num]
 
 
 def _values(draws: Draws, row: int) -> FloatArray:

@@ -1,10 +1,13 @@
 from dataclasses import replace
 
 import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial import cKDTree
 from small_problems import TIGHT, camera_of, graph_of, logs_of, small_run
 
 from slam_backend.run_log import RobotLog
-from slam_backend.smoothing.duplicates import find_duplicates, without_duplicates
+from slam_backend.smoothing.duplicates import alike_pairs, find_duplicates, without_duplicates
 from slam_backend.smoothing.extending import extended
 from slam_backend.smoothing.graph import PathGraph
 from slam_backend.smoothing.sampling import draw_paths
@@ -71,6 +74,27 @@ def test_landmarks_seen_from_one_key_stay_two():
         point_landmarks=np.concatenate([graph.point_landmarks, [_row(graph, NEW_NAME)]]),
     )
     assert len(found(run, twin, looks(twin, (often, NEW_NAME)))) == 0
+
+
+@given(st.integers(0, 40), st.integers(0, 2**32 - 1))
+def test_pairs_are_those_of_the_tree(num, seed):
+    """The compiled sweep finds what a tree, norms and sets say: nearness, looks, and keys that both were seen from."""
+    rng = np.random.default_rng(seed)
+    landmarks, descriptors = rng.uniform(0.0, 2.0, (num, 3)), rng.normal(size=(num, 2)).astype(np.float32)
+    descriptors[rng.random(num) < 0.1, 1] = np.nan
+    seen = [np.sort(rng.integers(0, 12, rng.integers(0, 4))) for _ in range(num)]
+    starts = np.cumsum([0, *map(len, seen)])
+    keys = np.concatenate([np.empty(0, dtype=np.int64), *seen])
+    order = np.argsort(landmarks[:, 0])
+    found = alike_pairs(order, landmarks, descriptors, keys, starts, 0.5, 1.2)
+    expected = {
+        (a, b)
+        for a, b in cKDTree(landmarks).query_pairs(0.5)
+        if np.linalg.norm(descriptors[a] - descriptors[b]) <= 1.2
+        and len(seen[a]) and len(seen[b]) and not set(seen[a]) & set(seen[b])
+    }  # fmt: skip
+    assert len(found) == len(expected)
+    assert {tuple(pair) for pair in found.tolist()} == expected
 
 
 def test_a_duplicate_given_up_leaves_one_landmark():
