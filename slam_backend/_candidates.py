@@ -4,7 +4,7 @@ import numpy as np
 
 from slam_backend import _alignment_kernels as kernels
 from slam_backend._matching import Float32Array, look_alikes, mutual_nearest, num_alike, unlike_other_places
-from slam_backend._packed import UPPER
+from slam_backend._packed import OF_NINE
 from slam_backend.alignment_types import AlignmentOptions
 from slam_backend.errors import BoolArray, FloatArray, IntArray, bad_argument
 from slam_backend.landmark_map import LandmarkMap
@@ -70,6 +70,15 @@ def match_table(map_a: LandmarkMap, map_b: LandmarkMap, matches: IntArray) -> Fl
     """
     table = np.empty((len(matches), kernels.MATCH_COLUMNS))
     for offset, source, rows in ((0, map_a, matches[:, 0]), (1, map_b, matches[:, 1])):
-        table[:, 3 * offset : 3 * offset + 3] = source.means[rows]
-        table[:, 6 + 6 * offset : 12 + 6 * offset] = source.covariances[rows][:, *UPPER]
+        packed = rows_of(source)[rows]
+        table[:, 3 * offset : 3 * offset + 3] = packed[:, :3]
+        table[:, 6 + 6 * offset : 12 + 6 * offset] = packed[:, 3:]
     return table
+
+
+def rows_of(landmarks: LandmarkMap) -> FloatArray:
+    """Return means [m] and upper triangles of covariances [m^2] in rows (N, 9); fresh, as kernels are compiled for."""
+    rows = np.empty((len(landmarks), 9))
+    rows[:, :3] = landmarks.means
+    rows[:, 3:] = landmarks.covariances.reshape(-1, 9).take(OF_NINE, axis=1)
+    return rows

@@ -7,6 +7,7 @@ from scipy.spatial import KDTree
 from scipy.special import bdtrc
 
 from slam_backend import _alignment_kernels as kernels
+from slam_backend._packed import UNPACK, UPPER
 from slam_backend.alignment_types import RIVAL_ANGLE, RIVAL_DISTANCE, AlignmentOptions
 from slam_backend.errors import BoolArray, FloatArray, IntArray
 from slam_backend.geometry import transform_points, wrap_angle
@@ -21,7 +22,7 @@ MIRRORED, OF_INLIERS, OF_REST = 3, 0.1, 0.3
 
 def one_to_one(matches: IntArray) -> bool:
     """Tell whether no landmark appears twice in matches (k, 2)."""
-    return len(np.unique(matches[:, 0])) == len(np.unique(matches[:, 1])) == len(matches)
+    return all(len(set(rows)) == len(rows) for rows in matches.T.tolist())
 
 
 def fitting(table: FloatArray, matches: IntArray, pose: FloatArray, floor: float, gate: float) -> BoolArray:
@@ -116,10 +117,7 @@ def is_mirrored(
     mirror[:2, :2] = 2.0 * np.outer(axis, axis) - np.eye(2)
     image = table.copy()
     image[:, 3:5] = centre + (table[:, 3:5] - centre) @ mirror[:2, :2]
-    upper = np.triu_indices(3)
-    full = np.empty((len(table), 3, 3))
-    full[:, upper[0], upper[1]] = full[:, upper[1], upper[0]] = table[:, 12:]
-    image[:, 12:] = (mirror @ full @ mirror)[:, upper[0], upper[1]]
+    image[:, 12:] = (mirror @ table[:, 12:][:, UNPACK] @ mirror)[:, *UPPER]
     fits = fitting(image, matches, pose, options.position_floor**2, options.position_gate)
     more = np.count_nonzero(fits & ~inside) - np.count_nonzero(inside & ~fits)
     share = min(OF_INLIERS * np.count_nonzero(inside), OF_REST * np.count_nonzero(~inside))

@@ -6,8 +6,9 @@ import numpy as np
 
 from slam_backend import _kernels
 from slam_backend._best_map import slots_held
-from slam_backend._jit import any_order, jit
+from slam_backend._jit import any_order, jit, lanes_inlined
 from slam_backend._kernels import LANES
+from slam_backend._kernels.layout import IDS, MAP_OF, ROW_OF
 from slam_backend._particle_maps import ParticleMaps
 from slam_backend.errors import FloatArray, IntArray
 from slam_backend.reports import PoseEstimates
@@ -39,22 +40,37 @@ def _sum(weights: FloatArray, one: FloatArray, two: FloatArray, count: int) -> f
     return total
 
 
+@lanes_inlined
+def widen(scatter: FloatArray, x: float, y: float, covariance: FloatArray) -> None:
+    """Add to the covariance (3, 3) of a point what a scattered motion of the whole map gives it, to first order.
+
+    J C J^T with J = [[1, 0, -y], [0, 1, x]]: heights stay.
+    """
+    ahead_turn, left_turn = scatter[0, 2] - y * scatter[2, 2], scatter[1, 2] + x * scatter[2, 2]
+    both = scatter[0, 1] - y * scatter[2, 1] + x * ahead_turn
+    covariance[0, 0] += scatter[0, 0] - y * scatter[2, 0] - y * ahead_turn
+    covariance[1, 1] += scatter[1, 1] + x * scatter[2, 1] + x * left_turn
+    covariance[0, 1] += both
+    covariance[1, 0] += both
+
+
 @jit
 def _mix(
-    slots: Any, row_of: Any, map_of: Any, maps: Any, values: Any, counts: Any, best: int, weights: FloatArray,
+    slots: Any, table: Any, maps: Any, values: Any, counts: Any, best: int, weights: FloatArray, scatter: FloatArray,
     lanes: int,
-) -> tuple[FloatArray, FloatArray, IntArray]:  # fmt: skip
-    """Return means (n, 3), covariances (n, 3, 3) and counts (n,) of landmarks, see `map_mixture`.
+) -> tuple[FloatArray, FloatArray, IntArray, IntArray]:  # fmt: skip
+    """Return means (n, 3), covariances (n, 3, 3), counts (n,) and ids (n,) of landmarks, see `map_mixture`.
 
     The number of lanes is an argument, for a compiled kernel would not notice that it changed in another file.
     """
+    row_of, map_of, ids = table[ROW_OF], table[MAP_OF], table[IDS]
     padded, size = counts.shape[1], len(weights)
     means, covariances = np.empty((len(slots), 3)), np.empty((len(slots), 3, 3))
-    times = np.empty(len(slots), np.int64)
+    times, names = np.empty(len(slots), np.int64), np.empty(len(slots), np.int64)
     shares, own, ones = np.empty(size), np.empty((9, size)), np.ones(size)
     for i in range(len(slots)):
         row, ancestors = row_of[slots[i]], map_of[slots[i]]
-        times[i] = counts[row, maps[ancestors, best] if ancestors > 0 else best]
+        times[i], names[i] = counts[row, maps[ancestors, best] if ancestors > 0 else best], ids[slots[i]]
         holders = 0
         for m in range(size):
             place = maps[ancestors, m] if ancestors > 0 else m
@@ -77,29 +93,32 @@ def _mix(
                 mixed = _sum(shares, own[entry], ones, holders) + _sum(shares, own[j], own[k], holders)
                 covariances[i, j, k] = covariances[i, k, j] = mixed
                 entry += 1
-    return means, covariances, times
+        widen(scatter, means[i, 0], means[i, 1], covariances[i])
+    return means, covariances, times, names
 
 
 def map_mixture(
-    maps: ParticleMaps, best: int, log_weights: FloatArray, min_count: int
+    maps: ParticleMaps, best: int, log_weights: FloatArray, scatter: FloatArray, min_count: int
 ) -> tuple[FloatArray, FloatArray, Any, IntArray, IntArray]:
     """Return the landmarks of one particle with mean and covariance over all that hold them, by ascending id.
 
     The covariance is sum w_m (Sigma_m + (mu_m - mu)(mu_m - mu)^T), with the weights of those particles scaled to sum
-    to 1 (Sec. 3.2, see `docs/errata.md`): Sigma_m alone is conditioned on the path of particle m.
+    to 1 (Sec. 3.2, see `docs/errata.md`): Sigma_m alone is conditioned on the path of particle m. To it comes what the
+    particles do not show of the map's frame.
 
     Args:
         maps: Of all particles; only looked at.
         best: The particle that says which landmarks there are.
         log_weights: (M,) normalised.
+        scatter: (3, 3) covariance of the map's frame about its origin [m, m, rad]; 0 where particles show all.
         min_count: Landmarks that it measured fewer times, 1 at least, are left out.
 
     Returns:
         Means (n, 3) [m] and covariances (n, 3, 3) [m^2], map frame, descriptors (n, d) float32, counts (n,) of
         particle `best`, and ids (n,): all fresh.
     """
-    slots = slots_held(maps, best, min_count)
-    means, covariances, times = _mix(
-        slots, maps.row_of, maps.map_of, maps.maps, maps.values, maps.counts, best, np.exp(log_weights), LANES
+    slots, weights = slots_held(maps, best, min_count), np.exp(log_weights)
+    means, covariances, times, names = _mix(
+        slots, maps.table, maps.maps, maps.values, maps.counts, best, weights, scatter, LANES
     )
-    return means, covariances, maps.descriptors[slots], times, maps.ids[slots]
+    return means, covariances, maps.descriptors[slots], times, names

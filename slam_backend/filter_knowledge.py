@@ -14,7 +14,6 @@ from slam_backend.geometry import between
 from slam_backend.landmark_map import LandmarkMap, MapOutline
 from slam_backend.reports import PoseEstimate
 from slam_backend.run_log import RobotLog
-from slam_backend.smoothing.holding import of_points
 from slam_backend.standpoints import Standpoints, filter_rows
 
 NO_WEIGHTS = np.empty(0)  # nobody asks for them where all particles start at the same place
@@ -117,10 +116,7 @@ class FilterKnowledge(FilterState):
         best, least = self.best_particle, max(min_count, 1)
         if estimate == "best":
             return LandmarkMap._trusted(*best_map(self._maps, best, least))
-        means, covariances, *rest = map_mixture(self._maps, best, self._log_weights, least)
-        if self._frame.any():
-            covariances += of_points(self._frame, means)
-        return LandmarkMap._trusted(means, covariances, *rest)
+        return LandmarkMap._trusted(*map_mixture(self._maps, best, self._log_weights, self._frame, least))
 
     def looks(self) -> NDArray[np.float32]:
         """Return the descriptors (n, d) of the landmarks of `map()`. A copy."""

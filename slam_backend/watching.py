@@ -18,8 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend._alignment_kernels import moved_away
-from slam_backend._candidates import match_table, may_suffice
+from slam_backend import _alignment_kernels as kernels
+from slam_backend._candidates import may_suffice, rows_of
 from slam_backend.alignment import RIVAL_ANGLE, RIVAL_DISTANCE, Alignment, AlignmentOptions, align_maps
 from slam_backend.errors import FloatArray, IntArray
 from slam_backend.geometry import transform_points
@@ -105,10 +105,11 @@ class Watch:
         if any(moved_share(old, joint, options) > merging.max_moved for old in self.before):
             return True
         ids = joint.ids.tolist()
-        parts = [joint.subset(np.flatnonzero([name in own for name in ids])) for own in self.own]
-        looks = (parts[0].descriptors, parts[1].descriptors)
-        if min(map(len, looks)) < options.min_inliers or not may_suffice(*looks, options):
+        masks = [np.array([name in own for name in ids], np.bool_) for own in self.own]
+        looks = [joint.descriptors[mask] for mask in masks]
+        if min(map(len, looks)) < options.min_inliers or not may_suffice(looks[0], looks[1], options):
             return False
+        parts = [joint.subset(mask) for mask in masks]
         rival = align_maps(parts[0], parts[1], options=options)
         return rival.success and differs(rival.transform, parts[1].means[rival.inliers[:, 1]])
 
@@ -125,11 +126,8 @@ def moved_share(old: LandmarkMap, joint: LandmarkMap, options: AlignmentOptions)
     Returns:
         In [0, 1]: of the landmarks that both maps hold, those beyond the gate at the rigid motion on which most agree.
     """
-    _, rows, places = np.intersect1d(old.ids, joint.ids, assume_unique=True, return_indices=True)
-    if len(rows) < options.min_inliers:
-        return 0.0
-    table = match_table(joint, old, np.column_stack([places, rows]))
-    return moved_away(table, options.position_floor**2, options.position_gate) / len(table)
+    now, then = (rows_of(joint), joint.ids.copy()), (rows_of(old), old.ids.copy())  # kernels take what can be written
+    return kernels.moved_share(*now, *then, options.min_inliers, options.position_floor**2, options.position_gate)
 
 
 def differs(motion: FloatArray, points: FloatArray) -> bool:
@@ -140,9 +138,9 @@ def differs(motion: FloatArray, points: FloatArray) -> bool:
 
 def renamed_map(landmarks: LandmarkMap, new_ids: Mapping[int, int]) -> LandmarkMap:
     """Return the landmarks that have new names, under these."""
-    kept = landmarks.subset(np.flatnonzero([name in new_ids for name in landmarks.ids.tolist()]))
-    names = np.array([new_ids[name] for name in kept.ids.tolist()], dtype=np.int64)
-    return LandmarkMap(kept.means, kept.covariances, kept.descriptors, kept.counts, names)
+    names = np.array([new_ids.get(name, -1) for name in landmarks.ids.tolist()], dtype=np.int64)
+    kept = landmarks.subset(names >= 0)
+    return LandmarkMap._trusted(kept.means, kept.covariances, kept.descriptors, kept.counts, names[names >= 0])
 
 
 def begin_watch(

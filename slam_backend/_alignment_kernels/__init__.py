@@ -8,11 +8,11 @@ from slam_backend._alignment_kernels.fitting import (
     refine,
     unexplained,
 )
-from slam_backend._alignment_kernels.overlay import moved_away
+from slam_backend._alignment_kernels.overlay import moved_share
 from slam_backend._alignment_kernels.residuals import MATCH_COLUMNS, own_support, squared_distances
 from slam_backend._alignment_kernels.search import search
 
 __all__ = [
-    "MATCH_COLUMNS", "drop_unverified", "gauss_newton_step", "information", "largest_influence", "moved_away",
+    "MATCH_COLUMNS", "drop_unverified", "gauss_newton_step", "information", "largest_influence", "moved_share",
     "own_support", "refine", "search", "squared_distances", "unexplained",
 ]  # fmt: skip

@@ -6,21 +6,48 @@ import numpy as np
 
 from slam_backend._alignment_kernels.residuals import squared_distances
 from slam_backend._jit import jit
-from slam_backend.errors import BoolArray, FloatArray
+from slam_backend.errors import BoolArray, FloatArray, IntArray
 
 FITS = 10  # rounds of fitting a rigid motion to the landmarks within the gate
 OUTSIDE = 1e-3  # weight of those beyond it; never nothing: the fit stays defined
 
 
 @jit
-def moved_away(table: FloatArray, floor: float, gate: float) -> int:
-    """Return how many landmarks (k,) lie beyond the gate at the rigid motion that those within it agree on.
+def moved_share(
+    now: FloatArray, ids_now: IntArray, old: FloatArray, ids_old: IntArray, least: int, floor: float, gate: float
+) -> float:
+    """Return the share of the landmarks in both maps that lie beyond the gate at the motion that the others agree on.
 
     Args:
-        table: (k, 18), k > 0: a the map as it is now, b as it was.
+        now: (n, 9) the map as it is now: means and upper triangles of covariances; `ids_now` (n,) its names.
+        old: (m, 9) the map as it was, `ids_old` (m,) likewise.
+        least: With fewer landmarks in both, 1 at least, the share is 0.
         floor: Added to each variance [m^2].
         gate: Largest squared Mahalanobis residual [-].
     """
+    table = _matched(now, ids_now, old, ids_old)
+    return 0.0 if len(table) < least else _moved_away(table, floor, gate) / len(table)
+
+
+@jit
+def _matched(now: FloatArray, ids_now: IntArray, old: FloatArray, ids_old: IntArray) -> FloatArray:
+    """Return the table (k, 18) of the landmarks that both maps hold, by ascending name; a is the map as it is now."""
+    table = np.empty((min(len(now), len(old)), 18))
+    order_now, order_old = np.argsort(ids_now), np.argsort(ids_old)
+    k, i = 0, 0
+    for place in order_old:
+        while i < len(order_now) and ids_now[order_now[i]] < ids_old[place]:
+            i += 1
+        if i < len(order_now) and ids_now[order_now[i]] == ids_old[place]:
+            table[k, :3], table[k, 6:12] = now[order_now[i], :3], now[order_now[i], 3:]
+            table[k, 3:6], table[k, 12:] = old[place, :3], old[place, 3:]
+            k += 1
+    return table[:k]
+
+
+@jit
+def _moved_away(table: FloatArray, floor: float, gate: float) -> int:
+    """Return how many landmarks lie beyond the gate at the rigid motion that those within it agree on."""
     inside = np.ones(len(table), np.bool_)
     outside = 0
     for _ in range(FITS):

@@ -129,13 +129,3 @@ def moved_tiles(tiles: FloatArray, num_landmarks: int, num_blocks: int, motions:
                 tile[6 * LANES + i] = s * s * xx + 2.0 * c * s * xy + c * c * yy
                 tile[5 * LANES + i] = c * xz - s * yz
                 tile[7 * LANES + i] = s * xz + c * yz
-
-
-def of_points(scatter: FloatArray, points: FloatArray) -> FloatArray:
-    """Return the covariances (n, 3, 3) [m^2] that a scattered motion of the whole map gives points (n, 2 or 3)."""
-    result = np.zeros((len(points), 3, 3))
-    turns = np.zeros((len(points), 2, 3))
-    turns[:, 0, 0] = turns[:, 1, 1] = 1.0
-    turns[:, 0, 2], turns[:, 1, 2] = -points[:, 1], points[:, 0]
-    result[:, :2, :2] = turns @ scatter @ turns.transpose(0, 2, 1)
-    return result

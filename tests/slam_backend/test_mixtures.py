@@ -8,6 +8,7 @@ from slam_backend._mixtures import map_mixture
 from slam_backend.landmark_map import LandmarkMap
 
 UNPACK = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
+SCATTER = np.array([[3e-2, 1e-3, 2e-3], [1e-3, 2e-2, -1e-3], [2e-3, -1e-3, 5e-3]])  # of the frame [m, m, rad]
 
 
 def plain_mixture(slam: FastSlam, min_count: int) -> LandmarkMap:
@@ -22,15 +23,24 @@ def plain_mixture(slam: FastSlam, min_count: int) -> LandmarkMap:
     mixed = np.einsum("ncm,nm->nc", dense, weights)
     offsets = dense[:, :3] - mixed[:, :3, None]
     covariances = mixed[:, 3:][:, UNPACK] + np.einsum("nim,njm,nm->nij", offsets, offsets, weights)
+    slopes = np.zeros((len(mixed), 3, 3))
+    slopes[:, 0, 0] = slopes[:, 1, 1] = 1.0
+    slopes[:, 0, 2], slopes[:, 1, 2] = -mixed[:, 1], mixed[:, 0]
+    covariances += slopes @ SCATTER @ slopes.transpose(0, 2, 1)
     return LandmarkMap(mixed[:, :3], covariances, maps.descriptors[slots], counts, maps.ids[slots])
 
 
 def test_the_kernel_agrees_with_plain_sums() -> None:
-    """Whatever the number of particles, and however often a landmark has to be seen: the same map, to rounding."""
+    """Whatever the number of particles, and however often a landmark has to be seen: the same map, to rounding.
+
+    Covariances hold what a scattered frame adds, and are symmetric to the last bit.
+    """
     for num_particles, seed in ((1, 5), (8, 6), (70, 7)):
         slam = filter_with_gaps(num_particles, seed)
         for least in (1, 2):
-            found = LandmarkMap(*map_mixture(slam._maps, slam.best_particle, slam._log_weights, least))
+            raw = map_mixture(slam._maps, slam.best_particle, slam._log_weights, SCATTER, least)
+            np.testing.assert_array_equal(raw[1], raw[1].transpose(0, 2, 1))
+            found = LandmarkMap(*raw)
             plain = plain_mixture(slam, least)
             np.testing.assert_array_equal(found.ids, plain.ids)
             np.testing.assert_array_equal(found.counts, plain.counts)

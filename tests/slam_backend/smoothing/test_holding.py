@@ -5,6 +5,7 @@ import pytest
 from small_problems import small_run
 
 from slam_backend._kernels import add_share
+from slam_backend._mixtures import widen
 from slam_backend._rejuvenation_step import RejuvenationStep
 from slam_backend.errors import FloatArray
 from slam_backend.filter import FastSlam
@@ -13,7 +14,7 @@ from slam_backend.geometry import between, compose, inverse, rotation, transform
 from slam_backend.smoothing import rejuvenation
 from slam_backend.smoothing._kernels import LANES
 from slam_backend.smoothing.graph import RIGID, PathGraph
-from slam_backend.smoothing.holding import holding, move_tiles, of_points
+from slam_backend.smoothing.holding import holding, move_tiles
 from training.stereo_runs import RunSpec, simulate_run
 
 SCATTER = np.array([[0.04, 0.01, -0.02], [0.01, 0.09, 0.03], [-0.02, 0.03, 0.05]])
@@ -89,7 +90,8 @@ def test_a_scattered_frame_scatters_poses_and_points():
         np.testing.assert_allclose(covariance, slopes @ SCATTER @ slopes.T, atol=1e-8)
         point = np.array([*pose[:2], 0.7])
         slopes = np.array([(transform_points(by, point[:2]) - transform_points(-by, point[:2])) / 2e-6 for by in small])
-        of_point = of_points(SCATTER, point[None])[0]
+        of_point = np.zeros((3, 3))
+        widen(SCATTER, point[0], point[1], of_point)
         np.testing.assert_allclose(of_point[:2, :2], slopes.T @ SCATTER @ slopes, atol=1e-8)
         assert not of_point[2].any()
 
@@ -175,7 +177,10 @@ def test_maps_of_all_particles_claim_their_share():
     """Of the same particles a mixture claims more of each landmark by what the frame adds; its means are the same."""
     slam, _, _ = open_run()
     widened = slam.map("mixture")
-    share = of_points(slam._frame, widened.means)
+    slopes = np.zeros((len(widened), 3, 3))
+    slopes[:, 0, 0] = slopes[:, 1, 1] = 1.0
+    slopes[:, 0, 2], slopes[:, 1, 2] = -widened.means[:, 1], widened.means[:, 0]
+    share = slopes @ slam._frame @ slopes.transpose(0, 2, 1)
     slam._frame[:] = 0.0
     narrow = slam.map("mixture")
     np.testing.assert_array_equal(widened.means, narrow.means)
