@@ -21,11 +21,10 @@ def joined_robots(
         motion: (M, 3) by which each joint particle moves what stems from b into a's map frame.
         rng: From which the joint filter's own stream is seeded.
     """
-    joint = FastSlam.from_options(
-        a.num_robots + b.num_robots,
-        replace(a.options, num_particles=len(motion)),
-        np.random.default_rng(rng.integers(2**63, size=4)),
-    )
+    same = a.options.num_particles == len(motion)
+    options = a.options if same else replace(a.options, num_particles=len(motion))
+    stream = np.random.default_rng(rng.integers(2**63, size=4))
+    joint = FastSlam.from_options(a.num_robots + b.num_robots, options, stream)
     _join_poses(joint, a, from_a, b, from_b, motion)
     joint._blind[:] = np.concatenate([a._blind, b._blind])
     joint._frame[:] = a._frame

@@ -20,6 +20,7 @@ class Lineup(NamedTuple):
         numbers: Of all maps that are in use or may be taken up again.
         oldest: The first step that some filter may have to take in yet; None: there is none.
         is_split: Whether some robots are out of contact with their group's joint filter.
+        is_watched: Whether some merge can still be undone, or is being taken back.
     """
 
     groups: tuple[tuple[int, ...], ...]
@@ -31,6 +32,7 @@ class Lineup(NamedTuple):
     numbers: frozenset[int]
     oldest: int | None
     is_split: bool
+    is_watched: bool
 
     @classmethod
     def of(cls, groups: Sequence[Group]) -> Self:
@@ -49,4 +51,5 @@ class Lineup(NamedTuple):
             numbers=frozenset[int]().union(*(group.numbers() for group in groups)),
             oldest=min(oldest, default=None),
             is_split=len(owned) > len(groups),
+            is_watched=any(branch.watches or group.undoing is not None for group, branch in owned),
         )

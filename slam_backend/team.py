@@ -96,7 +96,8 @@ class TeamSlam(TeamKnowledge):
             for robot, found, made in zip(branch.robots, done.associations, done.created, strict=True):
                 if robot in branch.live:
                     associations[robot], created[robot] = found, made
-        self._doubt()
+        if lineup.is_watched:
+            self._doubt()
         renamings = self._attempt(networks) if self._schedule.is_due(self._step) else ()
         lineup = self.lineup
         oldest = self._step + 1 if lineup.oldest is None else lineup.oldest
@@ -208,7 +209,7 @@ class TeamSlam(TeamKnowledge):
         """Go on with taking back a merge; it is done when all sides have caught up and are in contact."""
         merges = undoing.merges(group.trunk)
         if not merges:  # the joint filter is another one now, whose window is over
-            group.undoing = None
+            group.undoing, self._lineup = None, None
             return
         caught_up = undoing.catch_up(group.trunk, self._records.log)
         if not caught_up or not all(watch.together(group.trunk.live) for watch in merges):
