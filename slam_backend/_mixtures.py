@@ -68,6 +68,10 @@ def _mix(
     means, covariances = np.empty((len(slots), 3)), np.empty((len(slots), 3, 3))
     times, names = np.empty(len(slots), np.int64), np.empty(len(slots), np.int64)
     shares, own, ones = np.empty(size), np.empty((9, size)), np.ones(size)
+    at = np.empty(size, np.int64)
+    offsets = np.empty(padded, np.int64)  # of each particle's values in a row: a table, as divisions are dear
+    for place in range(padded):
+        offsets[place] = place // lanes * 9 * lanes + place % lanes
     for i in range(len(slots)):
         row, ancestors = row_of[slots[i]], map_of[slots[i]]
         times[i], names[i] = counts[row, maps[ancestors, best] if ancestors > 0 else best], ids[slots[i]]
@@ -75,11 +79,11 @@ def _mix(
         for m in range(size):
             place = maps[ancestors, m] if ancestors > 0 else m
             if counts[row, place] > 0:
-                at = row * 9 * padded + place // lanes * 9 * lanes + place % lanes
-                for c in range(9):
-                    own[c, holders] = values[at + c * lanes]
-                shares[holders] = weights[m]
+                at[holders], shares[holders] = row * 9 * padded + offsets[place], weights[m]
                 holders += 1
+        for c in range(9):
+            for h in range(holders):
+                own[c, h] = values[at[h] + c * lanes]
         whole = max(_sum(shares, ones, ones, holders), 1e-300)
         for h in range(holders):
             shares[h] /= whole

@@ -59,7 +59,8 @@ def holding(
     rows = tiles[seen[:, None], :, PLANE].reshape(len(seen), len(PLANE), -1)[:, :, :m]
     targets = landmarks[seen, :2]
     off = rows[:, :2] - targets[:, :, None]
-    spread = ((off * off).sum(axis=1) + rows[:, 2] + rows[:, 3]) @ weights
+    squares = off * off
+    spread = (squares[:, 0] + squares[:, 1] + rows[:, 2] + rows[:, 3]) @ weights
     motions = _fitted(rows[:, :2], targets, 1.0 / np.maximum(spread, 1e-300))
     moved = compose(motions, poses.transpose(0, 2, 1)).transpose(0, 2, 1)
     if not _scatter(moved, means, weights) < _scatter(poses, means, weights):

@@ -235,7 +235,9 @@ def _particles(graph: PathGraph, mode: Mode, draws: Draws, weights: FloatArray) 
         covariances[robot] = joint[3 * place : 3 * place + 3, 3 * place : 3 * place + 3]
     densities = -0.5 * np.einsum("im,im->m", off, np.linalg.solve(joint, off)) if len(off) else np.zeros(len(weights))
     frame = np.zeros((3, 3))
-    rows = np.flatnonzero(np.isin(np.flatnonzero(seen), graph.point_landmarks))
+    in_view = np.zeros(len(seen), dtype=np.bool_)
+    in_view[graph.point_landmarks] = True
+    rows = np.flatnonzero(in_view[seen])
     if (held := holding(tiles, rows, mode.landmarks[seen], poses, means, weights)) is not None:
         move_tiles(tiles, held.motions)
         move_poses(poses, held.motions, np.arange(len(poses)))

@@ -105,8 +105,7 @@ def lane_rows(poses: FloatArray) -> FloatArray:
     """
     k, _, m = poses.shape
     rows = np.empty((-(-m // LANES), k, POSE_ROWS, LANES))
-    headings = np.ascontiguousarray(poses[:, 2])
-    _kernels.to_lanes(poses, np.cos(headings), np.sin(headings), rows)
+    _kernels.to_lanes(poses, rows)
     return rows
 
 

@@ -9,7 +9,7 @@ from slam_backend.smoothing._kernels.forms import _inverse
 
 @lanes
 def draw(
-    normals: FloatArray, poses: FloatArray, columns: IntArray, keys: IntArray, starts: IntArray, blocks: FloatArray,
+    draws: FloatArray, poses: FloatArray, columns: IntArray, keys: IntArray, starts: IntArray, blocks: FloatArray,
     cross: FloatArray, pivots: FloatArray, values: FloatArray, order: IntArray, ranks: IntArray, tops: IntArray,
     rows: IntArray, row_tops: IntArray, paths: FloatArray, log_densities: FloatArray,
 ) -> None:  # fmt: skip
@@ -21,7 +21,8 @@ def draw(
     deviates from its conditional mean, times S.
 
     Args:
-        normals: (D, 3, M) standard normal draws: of the nodes that are drawn, in the order of elimination.
+        draws: (D, 3, M) standard normal draws: of the nodes that are drawn, in the order of elimination. Changed: by
+            how much these deviate from the mode.
         poses: (k, 3) of the mode.
         columns, keys, starts, blocks, cross: As of `form`.
         pivots, values: As `factorise` wrote them.
@@ -29,22 +30,22 @@ def draw(
         paths: (k, 3, M), result.
         log_densities: (M,), result: log of the density of each path, up to a constant.
     """
-    num, m, num_landmarks = len(order), normals.shape[2], len(starts) - 1
+    num, m, num_landmarks = len(order), draws.shape[2], len(starts) - 1
     num_poses = num - num_landmarks
-    x = np.empty((num, 3, m))
+    places = np.empty(num, dtype=np.int64)  # of nodes among those that are drawn, by rank
     log_densities[:] = 0.0
-    drawn = len(normals)
+    drawn = len(draws)
     for j in range(num - 1, -1, -1):
         if order[j] >= num_poses and row_tops[j] == row_tops[j + 1]:
             continue
         drawn -= 1
-        z, own = normals[drawn], x[j]
+        places[j] = drawn
+        own = draws[drawn]
         for axis in range(3):
             for i in range(m):
-                own[axis, i] = z[axis, i]
-                log_densities[i] -= 0.5 * z[axis, i] * z[axis, i]
+                log_densities[i] -= 0.5 * own[axis, i] * own[axis, i]
         for p in range(tops[j], tops[j + 1]):
-            v, y = values[p], x[rows[p]]
+            v, y = values[p], draws[places[rows[p]]]
             v0, v1, v2, v3, v4, v5, v6, v7, v8 = v[0], v[1], v[2], v[3], v[4], v[5], v[6], v[7], v[8]
             for i in range(m):
                 own[0, i] -= v0 * y[0, i] + v3 * y[1, i] + v6 * y[2, i]
@@ -61,7 +62,7 @@ def draw(
             for i in range(m):
                 paths[b, axis, i] = poses[b, axis]
             if columns[b] >= 0:
-                deviations = x[ranks[columns[b] // 3]]
+                deviations = draws[places[ranks[columns[b] // 3]]]
                 for i in range(m):
                     paths[b, axis, i] += deviations[axis, i]
     off, inverse = np.empty((3, m)), np.empty(6)
@@ -70,7 +71,7 @@ def draw(
         j = ranks[node]
         if row_tops[j] == row_tops[j + 1]:
             continue
-        s, own = blocks[node], x[j]
+        s, own = blocks[node], draws[places[j]]
         s0, s1, s2, s3, s4, s5 = s[0], s[1], s[2], s[3], s[4], s[5]
         for i in range(m):
             off[0, i] = s0 * own[0, i] + s1 * own[1, i] + s2 * own[2, i]
@@ -79,7 +80,7 @@ def draw(
         for q in range(starts[landmark], starts[landmark + 1]):
             if columns[keys[q]] < 0:
                 continue
-            v, y = cross[q], x[ranks[columns[keys[q]] // 3]]
+            v, y = cross[q], draws[places[ranks[columns[keys[q]] // 3]]]
             for axis in range(3):
                 v0, v1, v2 = v[0, axis], v[1, axis], v[2, axis]
                 for i in range(m):

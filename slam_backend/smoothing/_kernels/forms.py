@@ -66,7 +66,7 @@ def invert(matrices: FloatArray, out: FloatArray) -> bool:
     return True
 
 
-@jit
+@inlined
 def linearise(
     point: FloatArray, noise: FloatArray, given: bool, camera: FloatArray, e: FloatArray, y: FloatArray,
     info: FloatArray,

@@ -16,12 +16,11 @@ WORK_ROWS = 10
 
 
 @jit
-def to_lanes(poses: FloatArray, cosines: FloatArray, sines: FloatArray, rows: FloatArray) -> None:
+def to_lanes(poses: FloatArray, rows: FloatArray) -> None:
     """Write paths in blocks of lanes; surplus lanes are copies of the first path.
 
     Args:
         poses: (k, 3, M) float64 [m, m, rad].
-        cosines, sines: (k, M) of the headings.
         rows: (P / LANES, k, 5, LANES), result: x, y, cos, sin, heading.
     """
     num_paths = poses.shape[2]
@@ -30,14 +29,11 @@ def to_lanes(poses: FloatArray, cosines: FloatArray, sines: FloatArray, rows: Fl
         count = min(LANES, num_paths - first)
         for key in range(len(poses)):
             row = rows[block, key]
-            for i in range(count):
-                row[0, i], row[1, i], row[4, i] = (
-                    poses[key, 0, first + i], poses[key, 1, first + i], poses[key, 2, first + i],
-                )  # fmt: skip
-                row[2, i], row[3, i] = cosines[key, first + i], sines[key, first + i]
-            for i in range(count, LANES):
-                row[0, i], row[1, i], row[4, i] = poses[key, 0, 0], poses[key, 1, 0], poses[key, 2, 0]
-                row[2, i], row[3, i] = cosines[key, 0], sines[key, 0]
+            for i in range(LANES):
+                path = first + i if i < count else 0
+                heading = poses[key, 2, path]
+                row[0, i], row[1, i], row[4, i] = poses[key, 0, path], poses[key, 1, path], heading
+                row[2, i], row[3, i] = math.cos(heading), math.sin(heading)
 
 
 @lanes
