@@ -44,26 +44,27 @@ def minimum_degree(near: Bits, order: IntArray) -> int:
         How many blocks off the diagonal the factor has.
     """
     num, words = near.shape
-    degrees = np.empty(num, dtype=np.int64)
+    degrees, times = np.empty(num, dtype=np.int64), np.zeros(num + 1, dtype=np.int64)  # how often each degree occurs
     for v in range(num):
         degree = 0
         for w in range(words):
             degree += _num_bits(near[v, w])
         degrees[v] = degree
+        times[degree] += 1
     left = np.arange(num)
     filled, least = 0, 0
     for turn in range(num):
+        least = max(least - 1, 0)  # no degree falls by more than one when a node goes
+        while times[least] == 0:
+            least += 1
         at = turn
-        for n in range(turn, num):  # no degree falls by more than one when a node goes
-            if degrees[left[n]] < degrees[left[at]]:
-                at = n
-                if degrees[left[n]] < least:
-                    break
+        while degrees[left[at]] != least:
+            at += 1
         v = left[at]
         left[at] = left[turn]
         left[turn] = v
         order[turn] = v
-        least = degrees[v]
+        times[least] -= 1
         filled += least
         mine, own = v >> 6, ~(ONE << np.uint64(v & 63))
         for w in range(words):
@@ -79,6 +80,8 @@ def minimum_degree(near: Bits, order: IntArray) -> int:
                 near[u, mine] &= own
                 for i in range(words):
                     degree += _num_bits(near[u, i])
+                times[degrees[u]] -= 1
+                times[degree] += 1
                 degrees[u] = degree
     return filled
 
