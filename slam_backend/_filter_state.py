@@ -1,30 +1,34 @@
 """All that a filter holds, from the particles to the random stream: begun, changed as a whole, written down, kept."""
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from slam_backend._existence_step import ExistenceStep
 from slam_backend._filter_arrays import FilterArrays
-from slam_backend._frame_buffers import FrameBuffers, Frames
-from slam_backend._kernels import add_share
+from slam_backend._frame_buffers import FrameBuffers
+from slam_backend._kernels import IDLE, MOVED, PLACED, add_share
 from slam_backend._kernels.layout import CAMERA, RECOVERY
 from slam_backend._mixtures import pose_mixtures
 from slam_backend._particle_maps import MAPS_KEPT, ParticleMaps
 from slam_backend._rejuvenated_maps import write_maps
 from slam_backend._rejuvenation_step import RejuvenationStep
 from slam_backend._turns import assumed
-from slam_backend.errors import IntArray, bad_argument, check_int, check_seed
+from slam_backend.errors import FloatArray, IntArray, bad_argument, check_int, check_seed
 from slam_backend.filter_options import FilterOptions
-from slam_backend.input_log import RobotInput
-from slam_backend.reports import PoseEstimates, StepReport
-from slam_backend.run_log import RobotLog
+from slam_backend.input_log import UNHEARD, StepInput
+from slam_backend.reports import PoseEstimates
+from slam_backend.run_log import LogRow, RobotLog
 from slam_backend.smoothing.rejuvenation import Particles
 
 POSES = ("_poses", "_starts", "_means", "_covariances")  # (K, 3 or 6, P), of each robot
 KEPT = (*POSES, "_frame", "_blind", "_log_weights", "_path_log_weights", "_weights")
+# A step's number, what was read, which rows of it the filter's robots are, the landmarks (n,) that it was taken for,
+# and where the robots (K, 3) were thought to be.
+Entry = tuple[int, StepInput, tuple[int, ...], IntArray, FloatArray]
+LONGEST_JOURNAL = 32
 OTHERS_KEPT = ("steps", "estimates", "maps", "logs", "options", "rng")
 
 
@@ -38,7 +42,7 @@ class FilterState(FilterArrays):
         _best: Index of the largest weight along paths.
         _maps: The landmarks of all particles.
         _estimates: The poses of all robots over all particles, as of the last step; never written to afterwards.
-        _logs: Per robot what it did and measured, and which landmarks that was taken for.
+        _journal: What the last steps came to that the logs do not hold yet.
         _steps: Number of the next step.
         _rng: The filter's own random stream.
     """
@@ -60,7 +64,8 @@ class FilterState(FilterArrays):
         self._from_origin = True
         self._best = 0
         self._steps = 0
-        self._logs = [RobotLog() for _ in range(k)]
+        self._robot_logs = [RobotLog() for _ in range(k)]
+        self._journal: list[Entry] = []
         self._buffers = FrameBuffers(k, self._maps.padded)
         self._estimates = self._mixtures()
 
@@ -119,38 +124,49 @@ class FilterState(FilterArrays):
         for name in (*POSES, "_blind"):
             array = getattr(self, name)
             array[:] = array[order]
-        self._logs = [self._logs[robot] for robot in order]
+        self._robot_logs = [self._logs[robot] for robot in order]
         self._estimates = PoseEstimates(*(of_all[order] for of_all in self._estimates))
         if self._rejuvenation is not None:
             self._rejuvenation.reorder(order)
 
     # ------------------------------------------------------------------ what a step leaves behind
 
-    def _write_down(self, frames: Frames, inputs: Sequence[RobotInput], report: StepReport) -> None:
-        """Log what the robots did and measured in the step before `_steps`, and what that was taken for."""
-        step, sightings, smoother, first = self._steps - 1, self._buffers.sightings, self._rejuvenation, 0
-        means = self._estimates.means
-        rows = zip(inputs, report.associations, frames.ends, self._logs, strict=True)
-        for robot, ((move, frame, names, exact), ids, last, log) in enumerate(rows):
-            if len(ids) or move is not None or exact is not None:
-                used = ids[frames.masks[robot]] if robot in frames.masks else ids
-                covered = frame is not None and frame.covariances is not None and len(ids) > 0
-                log.append(
-                    step, move, exact, sightings[first:last, :3], used, sightings[first:last, 3:] if covered else None
-                )
+    @property
+    def _logs(self) -> list[RobotLog]:
+        """Per robot what it did and measured so far, and which landmarks that was taken for."""
+        if self._journal:
+            self._write_down()
+        return self._robot_logs
+
+    def _write_down(self) -> None:
+        """Enter into the logs, and tell the smoother, what the steps in the journal came to."""
+        smoother = self._rejuvenation
+        for robot, log in enumerate(self._robot_logs):
+            written: list[LogRow] = []
+            for step, inputs, rows, found, means in self._journal:
+                row = rows[robot]
+                act, begin, end, covered, named, count = inputs.turns[row] if row >= 0 else UNHEARD
+                if count <= 0 and act == IDLE:
+                    continue
+                move, exact = inputs.moves[row] if act == MOVED else None, inputs.exact[row] if act == PLACED else None
+                points, ids = inputs.sightings[begin:end, :3], found[begin:end]
+                spreads = inputs.sightings[begin:end, 3:] if covered and count else None
+                written.append((step, move, exact, points, ids, spreads))
                 if smoother is not None:
                     smoother.note(robot, step, means[robot], exact is not None)
-                    if names is None and frame is not None and report.num_rejected:
-                        smoother.note_refused(robot, step, ids, frame.descriptors)
-            first = last
+                    if not named:
+                        smoother.note_refused(robot, step, ids, inputs.descriptors[begin:end])
+            log.extend(written)
+        self._journal.clear()
 
     # ------------------------------------------------------------------ snapshots
 
     def get_state(self) -> dict[str, Any]:
         """Return all that decides how the filter goes on, its random stream included. Shares nothing with it."""
+        logs = tuple(log.get_state() for log in self._logs)  # first, for it tells the smoother as well
         state: dict[str, Any] = {name: getattr(self, name).copy() for name in KEPT}
         state |= {"steps": self._steps, "estimates": self._estimates.copy(), "maps": self._maps.get_state()}
-        state["logs"] = tuple(log.get_state() for log in self._logs)
+        state["logs"] = logs
         if self._rejuvenation is not None:
             state["rejuvenation"] = self._rejuvenation.get_state()
         return state | {"options": self.options, "rng": copy.deepcopy(self._rng.bit_generator.state)}
@@ -174,7 +190,8 @@ class FilterState(FilterArrays):
         self._look_at_starts()
         self._look_at_weights()
         self._maps.set_state(state["maps"])
-        for log, logged in zip(self._logs, state["logs"], strict=True):
+        self._journal.clear()
+        for log, logged in zip(self._robot_logs, state["logs"], strict=True):
             log.set_state(logged)
         if self._rejuvenation is not None:
             self._rejuvenation.set_state(state["rejuvenation"])

@@ -55,7 +55,7 @@ def finish(joint: FastSlam, a: FastSlam, b: FastSlam, renamed: IntArray) -> None
     joint._steps = max(a._steps, b._steps)
     joint._estimates = joint._mixtures()
     joint._widen()
-    joint._logs = [log.copy() for log in a._logs] + [log.renamed(renamed[:, 0], renamed[:, 1]) for log in b._logs]
+    joint._robot_logs = [log.copy() for log in a._logs] + [log.renamed(renamed[:, 0], renamed[:, 1]) for log in b._logs]
     if joint._rejuvenation is not None and a._rejuvenation is not None and b._rejuvenation is not None:
         starts = [slam._starts[:, :, : slam.num_particles] for slam in (a, b, joint)]
         joint._rejuvenation.join(a._rejuvenation, b._rejuvenation, starts, (a._frame, b._frame), renamed, joint._camera)

@@ -27,7 +27,7 @@ CLOSURE = 3  # landmarks not seen for long that are matched in one step: a loop 
 SOONEST = 5  # after a fifth of the usual time at the earliest
 LEAST_ROWS = 8  # of each log in a slice, so that no more of them come while it is worked through
 PATIENCE = 2  # descents that fail in a row, where all is done at once, before something is given up
-SCHEDULE = ("_asked", "_waited", "_read", "_closed", "_failures", "_exact", "_last_closing", "_count")
+SCHEDULE = ("_asked", "_waited", "_read", "_closed", "_failures", "_exact", "_last_closing", "steps")
 
 
 class RejuvenationStep:
@@ -36,10 +36,14 @@ class RejuvenationStep:
     Args:
         options: Of the filter, with `rejuvenate_every` set.
         num_robots: K.
+
+    Attributes:
+        steps: How many were counted.
     """
 
     def __init__(self, options: FilterOptions, num_robots: int) -> None:
         assert options.rejuvenate_every is not None
+        self.steps = 0
         self._options = options
         self._every = options.rejuvenate_every
         self._share = max(LEAST_ROWS, (options.smoothing.slice_steps or 0) // num_robots)  # steps a slice takes in
@@ -53,7 +57,6 @@ class RejuvenationStep:
         self._failures = 0  # descents in a row
         self._exact = False  # a pose was given as exact: there never will be
         self._last_closing = 0  # step in which landmarks not seen for long were matched
-        self._count = 0  # of all steps
         self._guesses: list[dict[int, FloatArray]] = [{} for _ in range(num_robots)]
         self._refused: list[dict[int, Refused]] = [{} for _ in range(num_robots)]
 
@@ -76,19 +79,15 @@ class RejuvenationStep:
             rows = np.array(refused)
             self._refused[robot][step] = Refused(rows, descriptors[rows])
 
-    def begin_step(self) -> int:
-        """Count a step, and return its number, 1 for the first."""
-        self._count += 1
-        self._waited += 1
-        return self._count
-
     def count(self, matched: int, long_unseen: int) -> None:
-        """Count what was matched or started in this step, and how much of it to landmarks not seen for long."""
+        """Count a step, what was matched or started in it, and how much of it to landmarks not seen for long."""
+        self.steps += 1
+        self._waited += 1
         self._read += matched
         after = self._options.smoothing.closure_after
         if after > 0 and long_unseen >= CLOSURE:
-            self._closed |= 2 * (self._count - self._last_closing) > after  # else it is the same one that goes on
-            self._last_closing = self._count
+            self._closed |= 2 * (self.steps - self._last_closing) > after  # else it is the same one that goes on
+            self._last_closing = self.steps
 
     def hasten(self) -> None:
         """Be due now, as before a merge."""
@@ -117,6 +116,12 @@ class RejuvenationStep:
         smoothing = self._options.smoothing
         sightings = 0 if self._graph is None else self._graph.num_sightings - smoothing.free_sightings
         return haste * smoothing.effort * self._read >= sightings
+
+    def waits(self, step: int) -> bool:
+        """Return whether there is nothing to do after a step, whatever the logs hold up to it; else see `rests`."""
+        if self._graph is None or self._draft is not None or self.due:
+            return False
+        return step - int(min(self._graph.latest.tolist())) < self._share
 
     def rests(self, logs: Sequence[RobotLog]) -> bool:
         """Return whether there is nothing to do now: the rule. Else it is due, or a slice of the work can be done."""

@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 
 from slam_backend import _kernels
+from slam_backend._step_table import in_one_table, seen_by_each, seen_by_team
 from slam_backend.camera import StereoCamera
 from slam_backend.errors import FloatArray, IntArray, bad_argument, check_array
-from slam_backend.input_log import RobotInput
-from slam_backend.measurements import Measurements
+from slam_backend.input_log import StepInput
+from slam_backend.measurements import Measurements, TeamMeasurements
 
 FARTHEST_MOVE = 1e4  # [m, rad]; no robot moves so far between two steps
 FARTHEST_POINT = 1e4  # [m]; no camera measures so far; at a million times this, covariances overflow
@@ -20,8 +21,8 @@ FARTHEST_POSE = 1e6  # [m, rad]; no robot goes so far from its start
 
 def check_step(
     k: int, size: int, camera: StereoCamera, odometry: Any, measurements: Any, identities: Any, poses: Any
-) -> list[RobotInput]:
-    """Return the arguments of `FastSlam.step` for k robots, checked, robot by robot.
+) -> StepInput:
+    """Return the arguments of `FastSlam.step` for k robots, checked.
 
     Args:
         k: Number of robots.
@@ -32,22 +33,21 @@ def check_step(
     Raises:
         ValueError: If one is ill-formed; the text names it.
     """
-    none = [None] * k
-    moves, frames = _check_moves(odometry, k), _one_each("measurements", measurements, k)
-    names = none if identities is None else _one_each("identities", identities, k)
-    exact = none if poses is None else _one_each("poses", poses, k)
+    moves, moved = _check_moves(odometry, k)
+    exact = {} if poses is None else _check_poses(poses, k)
     limit = min(FARTHEST_POINT, FLATTEST * camera.baseline * camera.sigma_px / camera.sigma_disparity_px)
-    inputs = []
+    if isinstance(measurements, TeamMeasurements):
+        if identities is None and len(measurements.ends) == k and _are_usual(measurements, size, limit):
+            return in_one_table(moves, moved, exact, *seen_by_team(measurements))
+        measurements = measurements.of_each()
+    frames = _one_each("measurements", measurements, k)
+    names = [None] * k if identities is None else list(_one_each("identities", identities, k))
     for robot in range(k):
-        frame, own_names, pose = frames[robot], names[robot], exact[robot]
-        if frame is not None:
+        if (frame := frames[robot]) is not None:
             size = _check_frame(robot, frame, size, limit)
-        if own_names is not None:
-            own_names = _check_names(robot, own_names, 0 if frame is None else len(frame))
-        if pose is not None:
-            pose = _check_pose(robot, pose)
-        inputs.append(RobotInput(moves[robot], frame, own_names, pose))
-    return inputs
+        if names[robot] is not None:
+            names[robot] = _check_names(robot, names[robot], 0 if frame is None else len(frame))
+    return in_one_table(moves, moved, exact, *seen_by_each(frames, names))
 
 
 def _one_each(name: str, value: Any, k: int) -> Any:
@@ -61,22 +61,25 @@ def _one_each(name: str, value: Any, k: int) -> Any:
     return value
 
 
-def _check_moves(odometry: Any, k: int) -> FloatArray | Sequence[FloatArray | None]:
-    """Return the odometry of k robots, checked, as one array or as many, None where there is none."""
+def _check_moves(odometry: Any, k: int) -> tuple[FloatArray, Sequence[bool]]:
+    """Return the odometry (k, 3) of k robots, checked, and which of them have any; zeros for the others."""
     if type(odometry) is np.ndarray and odometry.dtype == np.float64 and odometry.shape == (k, 3):
         moves: FloatArray = odometry.copy()
         if math.hypot(*moves.ravel().tolist()) <= FARTHEST_MOVE:  # and so each of them; NaN is not
-            return moves
-    each = enumerate(_one_each("odometry", odometry, k))
-    return [None if move is None else _check_move(robot, move) for robot, move in each]
+            return moves, [True] * k
+    moves, moved = np.zeros((k, 3)), [False] * k
+    for robot, move in enumerate(_one_each("odometry", odometry, k)):
+        if move is not None:
+            moves[robot], moved[robot] = _check_move(robot, move), True
+    return moves, moved
 
 
 def _check_move(robot: int, move: Any) -> FloatArray:
-    """Return a robot's odometry as a checked array."""
+    """Return a robot's odometry as a checked array, perhaps the caller's."""
     if type(move) is np.ndarray and move.dtype == np.float64 and move.shape == (3,):
-        copied: FloatArray = move.copy()
-        if math.hypot(*copied.tolist()) <= FARTHEST_MOVE:
-            return copied
+        own: FloatArray = move
+        if math.hypot(*own.tolist()) <= FARTHEST_MOVE:
+            return own
     cure = "Give the motion (dx, dy, dtheta) in the previous robot frame, or None."
     checked = check_array(f"odometry[{robot}]", move, (3,), cure)
     if np.abs(checked).max() > FARTHEST_MOVE:
@@ -85,14 +88,17 @@ def _check_move(robot: int, move: Any) -> FloatArray:
     return checked
 
 
-def _check_pose(robot: int, pose: Any) -> FloatArray:
-    """Return a robot's exact pose as a checked array."""
-    cure = "Give (x, y, theta) in the robot's own start frame, or None."
-    checked = check_array(f"poses[{robot}]", pose, (3,), cure)
-    if np.abs(checked).max() > FARTHEST_POSE:
-        cure = "Check the units: metres and radians from the robot's start."
-        raise bad_argument(f"poses[{robot}]", f"numbers within +-{FARTHEST_POSE:g}", pose, cure)
-    return checked
+def _check_poses(poses: Any, k: int) -> dict[int, FloatArray]:
+    """Return the exact poses of k robots as checked arrays, by robot; none of those that have none."""
+    exact: dict[int, FloatArray] = {}
+    for robot, pose in enumerate(_one_each("poses", poses, k)):
+        if pose is not None:
+            cure = "Give (x, y, theta) in the robot's own start frame, or None."
+            exact[robot] = check_array(f"poses[{robot}]", pose, (3,), cure)
+            if np.abs(exact[robot]).max() > FARTHEST_POSE:
+                cure = "Check the units: metres and radians from the robot's start."
+                raise bad_argument(f"poses[{robot}]", f"numbers within +-{FARTHEST_POSE:g}", pose, cure)
+    return exact
 
 
 def _check_names(robot: int, names: Any, count: int) -> IntArray:
@@ -102,6 +108,13 @@ def _check_names(robot: int, names: Any, count: int) -> IntArray:
     cure = "Name each measurement."
     checked: IntArray = check_array(f"identities[{robot}]", names, (count,), cure, dtype=np.int64)
     return checked
+
+
+def _are_usual(frames: TeamMeasurements, size: int, limit: float) -> bool:
+    """Tell whether all frames pass `_check_frame`, which takes the same, at a glance; else it has to say which."""
+    nearest, farthest = frames.extent
+    fits = not size or frames.descriptors.shape[1] == size
+    return fits and nearest >= _kernels.MIN_DEPTH and farthest <= limit
 
 
 def _check_frame(robot: int, frame: Any, size: int, limit: float) -> int:

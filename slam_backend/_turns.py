@@ -1,19 +1,22 @@
 """The turns of a step: what each robot did and saw goes into all particles, and what became of it into a report."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import astuple
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
 
 from slam_backend import _kernels
 from slam_backend._filter_arrays import FilterArrays
-from slam_backend._frame_buffers import FrameBuffers, Frames
+from slam_backend._frame_buffers import FrameBuffers
 from slam_backend._kernels.layout import ASSOCIATED, CREATED, REJECTED
 from slam_backend._particle_maps import ParticleMaps
-from slam_backend.errors import FloatArray, IntArray
+from slam_backend.errors import BoolArray, FloatArray, IntArray
 from slam_backend.filter_options import FilterOptions
 from slam_backend.geometry import compose
+from slam_backend.input_log import UNHEARD, StepInput
 from slam_backend.reports import PoseEstimates, StepReport
 
 # What `_kernels.take_turns` returns; `report_of` takes it apart.
@@ -51,7 +54,7 @@ def place(arrays: FilterArrays, robot: int, exact: FloatArray) -> None:
 
 def take_turns(
     low: int, high: int, now: int, numbers: FloatArray, arrays: FilterArrays, maps: ParticleMaps, buffers: FrameBuffers,
-    frames: Frames, normals: FloatArray, told: IntArray, estimates: PoseEstimates,
+    inputs: StepInput, rows: tuple[int, ...], normals: FloatArray, told: IntArray, estimates: PoseEstimates,
 ) -> Summary:  # fmt: skip
     """Move robots `low` to `high` - 1 in all particles, match what they saw, weigh and update (Algorithm 1, l. 6-8).
 
@@ -61,51 +64,60 @@ def take_turns(
         numbers: What the filter assumes.
         arrays: Its poses and weights, changed; robots that were told their poses are `place`d already.
         maps: Of all particles, changed; there is room for all that may start.
-        buffers: Which took the frames.
-        frames: What the robots saw.
+        buffers: With room for the n measurements of the inputs.
+        inputs: What these robots, and perhaps others, read.
+        rows: Of each robot there; -1: none.
         normals: (k, M, 3) standard normal draws, for the k robots that are not idle.
         told: (3, n) int64, written: what becomes of the measurements.
         estimates: Of the robots' poses, written with the last turn.
     """
     return _kernels.take_turns(
-        low, high, now, numbers, buffers.turns, buffers.moves, normals,
+        low, high, now, numbers, _as_array(rows), inputs.table, inputs.moves, normals,
         arrays._of_robots, arrays._blind, arrays._of_particles, arrays._frame,
         maps.values, maps.counts, maps.odds, maps.table, maps.maps, maps.users,
         maps.free_rows, maps.tops, maps.descriptors, maps.heads,
-        frames.points, frames.covariances, frames.descriptors, frames.names,
-        buffers.sightings, buffers.space, buffers.found, buffers.distances, told, *estimates,
+        inputs.sightings, inputs.descriptors, inputs.names,
+        buffers.space, buffers.found, buffers.distances, told, *estimates,
     )  # fmt: skip
 
 
-def report_of(frames: Frames, told: IntArray, summary: Summary, threshold: float) -> StepReport:
+@lru_cache(maxsize=256)
+def _as_array(rows: tuple[int, ...]) -> IntArray:
+    """Return the rows of robots as kernels take them."""
+    array = np.array(rows, np.int64)
+    array.setflags(write=False)
+    return array
+
+
+def report_of(inputs: StepInput, rows: Sequence[int], told: IntArray, summary: Summary, threshold: float) -> StepReport:
     """Return the report of a step.
 
     Args:
-        frames: What the robots saw.
+        inputs: What the robots read.
+        rows: Of each robot there; -1: none.
         told: (3, n) int64. What became of it; the report shares it.
         summary: Of `take_turns`.
         threshold: Particles are to be resampled where the effective sample size is not above it.
     """
     ess, _, num_created, num_new, num_matched, _, squares, judged = summary
-    associated, created = told[ASSOCIATED], told[CREATED]
-    alone = len(frames.ends) == 1 and not frames.masks
+    associated, created, given, used = [], [], 0, 0
+    for row in rows:
+        _, begin, end, _, _, count = inputs.turns[row] if row >= 0 else UNHEARD
+        found, made = told[ASSOCIATED, begin:end], told[CREATED, begin:end]
+        if row in inputs.masks:
+            found, made = _unmasked(found, inputs.masks[row]), _unmasked(made, inputs.masks[row])
+        associated.append(found)
+        created.append(made)
+        given, used = given + max(count, 0), used + end - begin
     nis = squares / judged if judged else math.nan
-    num_rejected = frames.given - num_new - num_matched
-    resampled = frames.ends[-1] > 0 and ess <= threshold
     return StepReport(
-        (associated,) if alone else _by_robot(associated, frames),
-        (created,) if alone else _by_robot(created, frames),
-        num_created, num_new, num_matched, num_rejected, ess, nis, resampled,
+        tuple(associated), tuple(created), num_created, num_new, num_matched, given - num_new - num_matched,
+        ess, nis, used > 0 and ess <= threshold,
     )  # fmt: skip
 
 
-def _by_robot(values: IntArray, frames: Frames) -> tuple[IntArray, ...]:
-    """Return what became of each robot's measurements (n_i,), -1 for those that were not used."""
-    own, first = [], 0
-    for robot, end in enumerate(frames.ends):
-        used, mask, first = values[first:end], frames.masks.get(robot), end
-        if mask is not None:
-            used, rest = np.full(len(mask), REJECTED), used
-            used[mask] = rest
-        own.append(used)
-    return tuple(own)
+def _unmasked(used: IntArray, mask: BoolArray) -> IntArray:
+    """Return what became of all of a robot's measurements (n,), -1 for those that were not used."""
+    every: IntArray = np.full(len(mask), REJECTED)
+    every[mask] = used
+    return every

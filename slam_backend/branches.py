@@ -7,13 +7,14 @@ what they have read meanwhile, in order of time, and the fork is dropped.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from slam_backend.errors import IntArray
 from slam_backend.filter import FastSlam
-from slam_backend.input_log import NOTHING, InputLog, RobotInput, are_silent
+from slam_backend.input_log import InputLog, StepInput, rows_of
 from slam_backend.reports import StepReport
 from slam_backend.watching import Watch
 
@@ -101,13 +102,13 @@ class ReplayedStep(NamedTuple):
     Attributes:
         step: Number of the step.
         robots: Whose readings it took in.
-        inputs: Those readings.
+        inputs: Those readings, and the other robots'.
         report: Of the filter, one entry for each of its robots.
     """
 
     step: int
     robots: tuple[int, ...]
-    inputs: tuple[RobotInput, ...]
+    inputs: StepInput
     report: StepReport
 
 
@@ -124,7 +125,13 @@ def landmark_counts(slam: FastSlam) -> dict[int, int]:
     return dict(zip(held.ids.tolist(), held.counts.tolist(), strict=True))
 
 
-def take_in(branch: Branch, step: int, robots: Sequence[int], inputs: Sequence[RobotInput]) -> StepReport:
+@lru_cache(maxsize=256)
+def turns_of(robots: tuple[int, ...]) -> frozenset[int]:
+    """Return in which of `TURNS` steps the filter of some robots smooths."""
+    return frozenset(robot % TURNS for robot in robots)
+
+
+def take_in(branch: Branch, step: int, robots: tuple[int, ...], inputs: StepInput) -> StepReport:
     """Let a filter take in what some of its robots read in one step; the others stand still, unseeing.
 
     If there is nothing to take in the filter stays as it is, bit for bit, so that a later replay finds it unchanged.
@@ -133,23 +140,19 @@ def take_in(branch: Branch, step: int, robots: Sequence[int], inputs: Sequence[R
         branch: Whose filter steps; its `known`, `report` and watches move on.
         step: Number of the step; the filter's logs bear it, whenever it is taken in.
         robots: Whose readings.
-        inputs: One for each, checked by `check_step`.
+        inputs: Of all robots of the team, checked by `check_step`.
     """
     for robot in robots:
         branch.known[robot] = step
-    all_of_them = len(robots) == len(branch.robots)
     for watch in branch.watches:
-        watch.steps += all_of_them or watch.together(robots)
-    if are_silent(inputs):
+        watch.steps += len(robots) == len(branch.robots) or watch.together(robots)
+    if inputs.silent and inputs.silent.issuperset(robots):
         branch.report = _silent_report(branch)
         return branch.report
-    if not all_of_them:
-        given = dict(zip(robots, inputs, strict=True))
-        inputs = [given.get(robot, NOTHING) for robot in branch.robots]
     slam, smoothing = branch.filter, branch.robots if branch.split_from is None else branch.live
-    slam.may_smooth = step % TURNS in [robot % TURNS for robot in smoothing]
+    slam.may_smooth = step % TURNS in turns_of(smoothing)
     slam._steps = step
-    branch.report = report = slam._step_checked(inputs)
+    branch.report = report = slam._step_checked(inputs, rows_of(branch.robots, robots))
     if report.num_created:
         for watch in branch.watches:
             watch.note(branch.robots, report)
@@ -219,6 +222,6 @@ def replay(
             break
         step = min(due.values())
         robots = tuple(sorted(robot for robot, first in due.items() if first == step))
-        inputs = tuple(log.read(step, robot) for robot in robots)
+        inputs = log.read(step)
         done.append(ReplayedStep(step, robots, inputs, take_in(branch, step, robots, inputs)))
     return done

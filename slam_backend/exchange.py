@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from slam_backend._kernels import MOVED, PLACED
 from slam_backend.branches import ReplayedStep
 from slam_backend.errors import IntArray
 from slam_backend.landmark_map import LandmarkMap
@@ -61,14 +62,12 @@ class ExchangeLedger:
     def record_replay(self, replayed: Sequence[ReplayedStep]) -> None:
         """Count the buffered readings that returning robots send."""
         for done in replayed:
-            for robot, reading in zip(done.robots, done.inputs, strict=True):
-                if reading.odometry is not None or reading.pose is not None:
+            each = POINT_BYTES + 4 * done.inputs.descriptors.shape[1]
+            for robot in done.robots:
+                act, _, _, covered, _, count = done.inputs.turns[robot]
+                if act in (MOVED, PLACED):
                     self.bytes_sent[robot] += POSE_BYTES
-                frame = reading.frame
-                if frame is not None:
-                    each = POINT_BYTES + 4 * frame.descriptors.shape[1]
-                    each += 0 if frame.covariances is None else COVARIANCE_BYTES
-                    self.bytes_sent[robot] += len(frame) * each
+                self.bytes_sent[robot] += max(count, 0) * (each + covered * COVARIANCE_BYTES)
 
     def record_return(
         self, sender: int, known: Mapping[int, int], counts: Mapping[int, int], descriptor_size: int

@@ -12,8 +12,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from slam_backend._frame_buffers import Frames
-from slam_backend._kernels.layout import NEW_SLOTS
+from slam_backend._filter_state import LONGEST_JOURNAL
+from slam_backend._kernels import IDLE, PLACED
+from slam_backend._kernels.layout import ASSOCIATED, NEW_SLOTS
 from slam_backend._rejuvenation_step import RejuvenationStep
 from slam_backend._step_input import check_step
 from slam_backend._turns import BEST, LONG_UNSEEN, Summary, place, report_of, take_turns
@@ -24,7 +25,7 @@ from slam_backend.existence import ExistenceModel
 from slam_backend.filter_knowledge import FilterKnowledge
 from slam_backend.filter_options import FilterOptions
 from slam_backend.geometry import wrap_angle
-from slam_backend.input_log import RobotInput
+from slam_backend.input_log import UNHEARD, StepInput
 from slam_backend.measurements import Measurements
 from slam_backend.motion import OdometryModel
 from slam_backend.reports import PoseEstimates, RejuvenationReport, StepReport
@@ -157,23 +158,29 @@ class FastSlam(FilterKnowledge):
         Raises:
             ValueError: If an argument is ill-formed; the filter is then as before.
         """
-        return self._step_checked(
-            check_step(
-                self.num_robots, self.descriptor_size, self.options.camera, odometry, measurements, identities, poses
-            )
-        )
+        count, size = self.num_robots, self.descriptor_size
+        inputs = check_step(count, size, self.options.camera, odometry, measurements, identities, poses)
+        return self._step_checked(inputs, tuple(range(count)))
 
-    def _step_checked(self, inputs: Sequence[RobotInput]) -> StepReport:
-        """Do what `step` does with readings that `check_step` returned; none of them is written to."""
-        maps, num_robots = self._maps, len(inputs)
-        frames = self._buffers.take(inputs)
-        told = np.empty((3, frames.ends[-1]), np.int64)
+    def _step_checked(self, inputs: StepInput, rows: tuple[int, ...]) -> StepReport:
+        """Do what `step` does with readings that `check_step` returned.
+
+        Args:
+            inputs: What these robots, and perhaps others, read; it is not written to.
+            rows: Of each robot there; -1: it stands still, unseeing.
+        """
+        maps, num_robots = self._maps, len(rows)
+        told = np.empty((3, len(inputs.sightings)), np.int64)
         self._estimates = PoseEstimates(np.empty((num_robots, 3)), np.empty((num_robots, 3, 3)))
-        summary, deserted = self._take_turns(inputs, frames, told)
-        self._steps, self._best = self._steps + 1, summary[BEST]
+        summary, deserted = self._take_turns(inputs, rows, told)
+        self._best = summary[BEST]
         threshold = self.options.resample_threshold * maps.num_particles * (1.0 + 1e-9)
-        report = report_of(frames, told, summary, threshold)
-        self._write_down(frames, inputs, report)
+        report = report_of(inputs, rows, told, summary, threshold)
+        found = told[ASSOCIATED].copy()  # the report's is the caller's
+        self._journal.append((self._steps, inputs, rows, found, self._estimates.means))
+        if len(self._journal) == LONGEST_JOURNAL:
+            self._write_down()
+        self._steps += 1
         for slots in deserted:
             maps.release(slots)
         if report.resampled:
@@ -217,7 +224,7 @@ class FastSlam(FilterKnowledge):
 
     def _rejuvenate(self, smoother: RejuvenationStep) -> RejuvenationReport | None:
         """Draw the particles anew from the posterior of whole paths, if it is time and that can be found."""
-        if smoother.rests(self._logs):
+        if smoother.waits(self._steps - 1) or smoother.rests(self._logs):
             return None
         starts = self._starts[:, :, : self.num_particles]
         result = smoother.run(
@@ -230,7 +237,7 @@ class FastSlam(FilterKnowledge):
         return RejuvenationReport(result.reason, result.ess, result.iterations, result.graph.num_keys)
 
     def _take_turns(
-        self, inputs: Sequence[RobotInput], frames: Frames, told: IntArray
+        self, inputs: StepInput, rows: tuple[int, ...], told: IntArray
     ) -> tuple[Summary, list[IntArray]]:  # fmt: skip
         """Take all robots' turns; where one did and saw nothing no random number is drawn.
 
@@ -239,25 +246,28 @@ class FastSlam(FilterKnowledge):
             for their ids.
         """
         maps, buffers = self._maps, self._buffers
-        for robot, reading in enumerate(inputs):
-            if reading.pose is not None:
-                place(self, robot, reading.pose)
-        if used := frames.ends[-1]:
-            maps.make_room(used, frames.descriptors.shape[1])
-        normals = self._rng.standard_normal((frames.active, maps.num_particles, 3))
-        now = 0 if self._rejuvenation is None else self._rejuvenation.begin_step()
-        step = (now, self._assumed, self, maps, buffers, frames, normals, told, self._estimates)
+        active = used = 0
+        for robot, row in enumerate(rows):
+            act, begin, end, _, _, _ = inputs.turns[row] if row >= 0 else UNHEARD
+            active, used = active + (act != IDLE), used + end - begin
+            if act == PLACED:
+                place(self, robot, inputs.exact[row])
+        if used:
+            maps.make_room(used, inputs.descriptors.shape[1])
+        if (most := len(inputs.sightings)) > len(buffers.found):
+            buffers.make_room(2 * most)
+        normals = self._rng.standard_normal((active, maps.num_particles, 3))
+        now = 0 if self._rejuvenation is None else self._rejuvenation.steps + 1
+        step = (now, self._assumed, self, maps, buffers, inputs, rows, normals, told, self._estimates)
         if self._existence is None:
-            return take_turns(0, len(inputs), *step), []
-        deserted, best, first = [], self._best, 0
-        for robot, (reading, end) in enumerate(zip(inputs, frames.ends, strict=True)):
+            return take_turns(0, len(rows), *step), []
+        deserted, best = [], self._best
+        for robot, row in enumerate(rows):
             summary = take_turns(robot, robot + 1, *step)
-            if reading.frame is not None:
-                new_slots = told[NEW_SLOTS, first:end]
-                deserted.append(
-                    self._existence.weigh(maps, self._poses[robot], best, buffers.found[first:end], new_slots)
-                )
-            first = end
+            _, begin, end, _, _, count = inputs.turns[row] if row >= 0 else UNHEARD
+            if count >= 0:
+                found, new_slots = buffers.found[begin:end], told[NEW_SLOTS, begin:end]
+                deserted.append(self._existence.weigh(maps, self._poses[robot], best, found, new_slots))
         return summary, deserted
 
     def _resample(self) -> None:

@@ -1,52 +1,70 @@
 """What the robots read in the last steps, kept as long as some filter may have to take it in later."""
 
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from typing import Any, NamedTuple
 
-from slam_backend.errors import FloatArray, IntArray
-from slam_backend.measurements import Measurements
+from slam_backend._kernels import IDLE
+from slam_backend.errors import BoolArray, Float32Array, FloatArray, IntArray
+
+# Of one robot: what it did, where its used measurements begin and end among all n, whether these come with covariances,
+# and with names; and how many it was given, used or not, -1 where it has no frame. `_kernels.layout` names the numbers.
+Turn = tuple[int, int, int, bool, bool, int]
+UNHEARD: Turn = (IDLE, 0, 0, False, False, -1)
 
 
-class RobotInput(NamedTuple):
-    """What `FastSlam.step` takes of one robot in one step; it is not written to."""
+class StepInput(NamedTuple):
+    """What N robots read in one step, checked, as filters take it; it is not written to.
 
-    odometry: FloatArray | None
-    frame: Measurements | None
-    identities: IntArray | None
-    pose: FloatArray | None
-
-
-NOTHING = RobotInput(None, None, None, None)
-
-
-def are_silent(inputs: Sequence[RobotInput]) -> bool:
-    """Tell whether there is nothing to take in.
-
-    An empty frame is something: it says that nothing was there to see.
+    Attributes:
+        turns: Of each robot.
+        table: (N, 6) int64. The same.
+        moves: (N, 3) odometry [m, m, rad] of those that moved.
+        exact: By robot the pose (3,) [m, m, rad], own start frame, that it was told.
+        masks: By robot which of its measurements are used (n_i,) bool; only of robots that the caller gave some named
+            -1, which are not.
+        sightings: (n, 9) [m, m^2] all robots' measurements, one robot's after the other's, in robot axes: points (3)
+            relative to the camera centre, and their covariances (6), upper triangles by rows, where they have any.
+        descriptors: (n, d).
+        names: (n,) the caller's names, or (0,) where no robot has any.
+        silent: Robots of which there is nothing to take in. An empty frame is something: it says that nothing was there
+            to see.
     """
-    for odometry, frame, _, pose in inputs:
-        if odometry is not None or frame is not None or pose is not None:
-            return False
-    return True
+
+    turns: Sequence[Turn]
+    table: IntArray
+    moves: FloatArray
+    exact: Mapping[int, FloatArray]
+    masks: Mapping[int, BoolArray]
+    sightings: FloatArray
+    descriptors: Float32Array
+    names: IntArray
+    silent: frozenset[int]
+
+
+@lru_cache(maxsize=256)
+def rows_of(robots: tuple[int, ...], given: tuple[int, ...]) -> tuple[int, ...]:
+    """Return for each of a filter's robots its row in a `StepInput`: its name if it is given, else -1."""
+    return tuple(robot if robot in given else -1 for robot in robots)
 
 
 class InputLog:
     """The readings of all robots, step by step."""
 
     def __init__(self) -> None:
-        self._steps: dict[int, tuple[RobotInput, ...]] = {}
+        self._steps: dict[int, StepInput] = {}
 
     def __len__(self) -> int:
         """Return how many steps are kept."""
         return len(self._steps)
 
-    def record(self, step: int, inputs: Sequence[RobotInput]) -> None:
+    def record(self, step: int, inputs: StepInput) -> None:
         """Keep what all robots read in a step, later than all before."""
-        self._steps[step] = tuple(inputs)
+        self._steps[step] = inputs
 
-    def read(self, step: int, robot: int) -> RobotInput:
-        """Return what a robot read in a step that is kept."""
-        return self._steps[step][robot]
+    def read(self, step: int) -> StepInput:
+        """Return what all robots read in a step that is kept."""
+        return self._steps[step]
 
     def forget_before(self, step: int) -> None:
         """Forget the steps before this one."""

@@ -20,11 +20,11 @@ from slam_backend.contacts import check_contacts, reach
 from slam_backend.errors import FloatArray, IntArray, bad_argument
 from slam_backend.group_changes import MergePlan, contradicted, merge_groups, undone
 from slam_backend.groups import Group
-from slam_backend.input_log import RobotInput
+from slam_backend.input_log import StepInput
 from slam_backend.lineup import Lineup
-from slam_backend.measurements import Measurements
+from slam_backend.measurements import Measurements, TeamMeasurements
 from slam_backend.merging import inverse_alignment
-from slam_backend.reports import MapDropped, MergeEvent, RejuvenationReport, Renaming, StepReport, TeamReport
+from slam_backend.reports import MapDropped, MergeEvent, RejuvenationReport, Renaming, TeamReport
 from slam_backend.team_knowledge import TeamKnowledge
 from slam_backend.trying import attempt
 from slam_backend.undoing import Undoing
@@ -52,7 +52,7 @@ class TeamSlam(TeamKnowledge):
     def step(
         self,
         odometry: FloatArray | Sequence[ArrayLike | None],
-        measurements: Sequence[Measurements | None],
+        measurements: Sequence[Measurements | None] | TeamMeasurements,
         contacts: ArrayLike | None = None,
         identities: Sequence[ArrayLike | None] | None = None,
         poses: Sequence[ArrayLike | None] | None = None,
@@ -68,7 +68,7 @@ class TeamSlam(TeamKnowledge):
 
         Args:
             odometry: Per robot (3,) [m, m, rad], or None; see `FastSlam.step`. (K, 3) where all have moved.
-            measurements: Per robot its frame, or None.
+            measurements: Per robot its frame, or None; or the frames of all in one piece.
             contacts: (K, K) bool, symmetric: who hears whom now; the diagonal means nothing. None = all.
             identities: Per robot (n_i,) int, see `FastSlam.step`.
             poses: Per robot (3,), see `FastSlam.step`.
@@ -86,16 +86,7 @@ class TeamSlam(TeamKnowledge):
         records.log.record(self._step, inputs)
         if contacts is not None or lineup.is_split:
             lineup = self._regrouped(networks)
-        associations: list[IntArray] = [NO_IDS] * count
-        created = list(associations)
-        rejuvenations: list[tuple[tuple[int, ...], RejuvenationReport]] = []
-        for branch in lineup.branches:
-            done = self._advance(branch, inputs)
-            if done.rejuvenation is not None:
-                rejuvenations.append((branch.live, done.rejuvenation))
-            for robot, found, made in zip(branch.robots, done.associations, done.created, strict=True):
-                if robot in branch.live:
-                    associations[robot], created[robot] = found, made
+        associations, created, rejuvenations = self._advance(lineup.branches, inputs)
         if lineup.is_watched:
             self._doubt()
         renamings = self._attempt(networks) if self._schedule.is_due(self._step) else ()
@@ -129,15 +120,27 @@ class TeamSlam(TeamKnowledge):
             self._lineup = None
         return self.lineup
 
-    def _advance(self, branch: Branch, inputs: Sequence[RobotInput]) -> StepReport:
-        """Step a filter with what its robots have just read."""
-        live = branch.live
-        report = take_in(branch, self._step, live, [inputs[robot] for robot in live])
-        if report.num_created:
-            self._records.note_created(branch, live, self._step, report)
-        if len(live) > 1:  # a robot that nobody hears sends nothing
-            self._records.exchange.record_step(branch.robots, live, report, branch.filter.descriptor_size)
-        return report
+    def _advance(
+        self, branches: Sequence[Branch], inputs: StepInput
+    ) -> tuple[list[IntArray], list[IntArray], list[tuple[tuple[int, ...], RejuvenationReport]]]:
+        """Step all filters with what their robots have just read; return what `TeamReport` tells of it."""
+        step, records = self._step, self._records
+        associations: list[IntArray] = [NO_IDS] * self._num_robots
+        created = list(associations)
+        rejuvenations: list[tuple[tuple[int, ...], RejuvenationReport]] = []
+        for branch in branches:
+            live = branch.live
+            report = take_in(branch, step, live, inputs)
+            if report.num_created:
+                records.note_created(branch, live, step, report)
+            if len(live) > 1:  # a robot that nobody hears sends nothing
+                records.exchange.record_step(branch.robots, live, report, branch.filter.descriptor_size)
+            if report.rejuvenation is not None:
+                rejuvenations.append((live, report.rejuvenation))
+            for robot, found, made in zip(branch.robots, report.associations, report.created, strict=True):
+                if robot in live:
+                    associations[robot], created[robot] = found, made
+        return associations, created, rejuvenations
 
     def merge(self, robot_a: int, robot_b: int, alignment: Alignment, known: bool = False) -> Renaming:
         """Merge the joint filters of two robots' groups with a given alignment, unasked whether it is right.

@@ -12,7 +12,6 @@ from slam_backend.errors import FloatArray, IntArray, bad_argument
 from slam_backend.filter_options import FilterOptions
 from slam_backend.geometry import rotate_covariances
 from slam_backend.landmark_map import LandmarkMap, TeamOutlines
-from slam_backend.measurements import TeamMeasurements
 from slam_backend.reports import MergeEvent, Renaming, TeamReport
 from slam_backend.standpoints import Standpoints
 from slam_backend.team import TeamSlam
@@ -115,10 +114,9 @@ class TeamBelief:
         if readings.scans.shape != shape:
             got, cure = f"shape {readings.scans.shape}", "Give a range for each ray of each robot."
             raise bad_argument("readings.scans", f"an array of shape {shape}", got, cure)
-        frames = readings.measurements
         report = self._team.step(
             [None] * len(self._robots) if readings.odometry is None else readings.odometry,
-            frames.of_each() if isinstance(frames, TeamMeasurements) else frames,
+            readings.measurements,
             readings.heard,
             readings.identities,
             None if readings.poses is None else list(readings.poses),

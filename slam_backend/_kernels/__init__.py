@@ -20,7 +20,7 @@ special case. With A = (dr/dx) C and S = Sigma + R, a match adds J = A^T S^-1 A 
 g = A^T S^-1 r to the gradient. A gate takes S + A P A^T, with P the covariance of xi.
 """
 
-from slam_backend._kernels.candidates import extent
+from slam_backend._kernels.candidates import extent, to_robot_axes
 from slam_backend._kernels.landmark_updates import YOUNG
 from slam_backend._kernels.layout import CANDIDATE_ROWS, FAR, LANES, MIN_DEPTH, WORK_ROWS
 from slam_backend._kernels.places import carry_odds, refresh
@@ -31,5 +31,6 @@ from slam_backend._kernels.weights import add_share, mixture
 
 __all__ = [
     "CANDIDATE_ROWS", "FAR", "IDLE", "LANES", "MIN_DEPTH", "MOVED", "PLACED", "STOOD", "WORK_ROWS", "YOUNG",
-    "add_share", "carry_odds", "extent", "mixture", "refresh", "resample", "stand", "take_turns", "write_sigmas",
+    "add_share", "carry_odds", "extent", "mixture", "refresh", "resample", "stand", "take_turns",
+    "to_robot_axes", "write_sigmas",
 ]  # fmt: skip

@@ -21,16 +21,16 @@ def extent(points: FloatArray) -> tuple[float, float]:
 
 
 @jit
-def to_robot_axes(points: FloatArray, covariances: FloatArray, turned: FloatArray, noises: FloatArray) -> None:
+def to_robot_axes(points: FloatArray, covariances: FloatArray, sightings: FloatArray) -> None:
     """Turn points (n, 3) and covariances (n, 3, 3), or none (0, 3, 3), from camera axes to the robot's.
 
     Args:
         points, covariances: As measured.
-        turned: (n, 3), written: relative to the camera centre, x ahead, y left, z up.
-        noises: (n, 6), written: upper triangles by rows, zeros for none.
+        sightings: (n, 9), written: points (3) relative to the camera centre, x ahead, y left, z up, and covariances
+            (6), upper triangles by rows, zeros for none.
     """
-    n = len(points)
-    for i in range(n):
+    turned, noises = sightings[:, :3], sightings[:, 3:]
+    for i in range(len(points)):
         turned[i, 0], turned[i, 1], turned[i, 2] = points[i, 2], -points[i, 0], -points[i, 1]
         noises[i] = 0.0
     for i in range(len(covariances)):

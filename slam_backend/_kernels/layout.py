@@ -41,7 +41,7 @@ POSES, STARTS, MEANS, COVARIANCES = range(4)
 # The weights of all particles, (4, P): as of the last resampling, along paths, as they are, and what a step adds.
 LOG_WEIGHTS, PATH_LOG_WEIGHTS, WEIGHTS, LOG_LIKELIHOOD = range(4)
 ROW_OF, MAP_OF, IDS, IDENTITIES, LAST_SEEN, FREE_SLOTS = range(6)  # of the table of a map's slots, (6, slots)
-ACT, END, GIVEN, NAMED = range(4)  # of a robot's turn
+ACT, BEGIN, END, GIVEN, NAMED, COUNT = range(6)  # of a robot's turn
 ASSOCIATED, CREATED, NEW_SLOTS = range(3)  # what becomes of measurements, (3, n)
 # What a filter assumes: the first of six numbers, seven and three, and then one each.
 NOISE, CAMERA, RECOVERY = 0, 6, 13

@@ -5,12 +5,12 @@ import math
 import numpy as np
 
 from slam_backend._jit import jit
-from slam_backend._kernels.candidates import to_robot_axes
 from slam_backend._kernels.fastslam1 import update_fastslam1
 from slam_backend._kernels.fastslam2 import update_fastslam2
 from slam_backend._kernels.layout import (
     ACT,
     AMBIGUITY,
+    BEGIN,
     CAMERA,
     CANDIDATE_ROWS,
     COVARIANCES,
@@ -60,12 +60,12 @@ def write_sigmas(noise: FloatArray, move: FloatArray, sigmas: FloatArray) -> Non
 
 @jit
 def take_turns(
-    low: int, high: int, now: int, assumed: FloatArray, turns: IntArray, moves: FloatArray, normals: FloatArray,
-    robots: FloatArray, blind: BoolArray, weights: FloatArray, frame: FloatArray,
+    low: int, high: int, now: int, assumed: FloatArray, rows: IntArray, turns: IntArray, moves: FloatArray,
+    normals: FloatArray, robots: FloatArray, blind: BoolArray, weights: FloatArray, frame: FloatArray,
     values: FloatArray, counts: Int32Array, odds: FloatArray, table: IntArray, maps: Int32Array, users: IntArray,
     free_rows: IntArray, tops: IntArray, stored: Float32Array, heads: Float32Array,
-    measured: FloatArray, spreads: FloatArray, descriptors: Float32Array, names: IntArray,
-    sightings: FloatArray, space: FloatArray, found: Int32Array, distances: FloatArray, told: IntArray,
+    sightings: FloatArray, descriptors: Float32Array, names: IntArray,
+    space: FloatArray, found: Int32Array, distances: FloatArray, told: IntArray,
     mean: FloatArray, covariance: FloatArray,
 ) -> tuple[float, int, int, int, int, int, float, int]:  # fmt: skip
     """Move robots `low` to `high` - 1 in all particles, match, weigh and update landmarks (Algorithm 1, l. 6-8).
@@ -76,20 +76,19 @@ def take_turns(
         low, high: Whose turns are taken; the step begins with the first robot, and with the last one it is concluded.
         now: Number of the step, above 0 if anyone asks when landmarks were seen last.
         assumed: (27,) noise of the odometry, camera, and the rest, see `layout`.
-        turns: (K, 4) int64. What each robot did: `IDLE`, `STOOD`, `MOVED`, or `PLACED`, with the pose already written;
-            where its measurements end among all n; whether these come with covariances, and with names.
-        moves: (K, 3) odometry [m, m, rad] of those that moved.
+        rows: (K,) which of the N robots that `turns` tells of each is; -1: none, it did nothing at all.
+        turns: (N, 6) int64. What each did: `IDLE`, `STOOD`, `MOVED`, or `PLACED`, with the pose already written; where
+            its measurements begin and end among all n; whether these come with covariances, and with names.
+        moves: (N, 3) odometry [m, m, rad] of those that moved.
         normals: (k, M, 3) standard normal draws, for the k robots that are not idle.
         robots: (5, K, 3, P) samples, starts, and N(x^, P^) before sampling.
         blind: (K,) whether that was propagated since the last sighting.
         weights: (4, P), read and written up to M.
         frame: (3, 3) as in `conclude`.
         values, ..., heads: The store, see `ParticleMaps`. n + 1 rows and n slots are free.
-        measured: (n, 3) [m], camera frame.
-        spreads: (n, 3, 3) [m^2], camera frame, their covariances, of the robots that have them; or (0, 3, 3).
+        sightings: (n, 9) [m, m^2] points and, of the robots that have them, covariances, as in `to_robot_axes`.
         descriptors: (n, d).
         names: (n,) the caller's names, of the robots that have them; or (0,).
-        sightings: (n, 9), written: `measured` and `spreads` in robot axes, relative to the camera centre.
         space: Of the kernels: `WORK_ROWS` and the records of some candidates, in rows of lanes.
         found, distances: (n, P), written as in `update_fastslam2`.
         told: (3, n), written: as in `summarise`, and the slots of the landmarks that were started.
@@ -98,7 +97,7 @@ def take_turns(
     Returns:
         What `conclude` returns; zeros before that.
     """
-    num_robots, num_particles = len(turns), normals.shape[1]
+    num_robots, num_particles = len(rows), normals.shape[1]
     camera, recovery = assumed[CAMERA : CAMERA + 7], assumed[RECOVERY : RECOVERY + 3]
     is_one_to_one = assumed[IS_ONE_TO_ONE] > 0.0
     poses, means = robots[POSES], robots[MEANS]
@@ -108,21 +107,22 @@ def take_turns(
     free_slots = table[FREE_SLOTS]
     points, noises = sightings[:, :3], sightings[:, 3:]
     work, records = space[: WORK_ROWS * LANES], space[WORK_ROWS * LANES :].reshape((-1, CANDIDATE_ROWS * LANES))
-    still, sigmas, drawn, b = np.zeros(3), np.zeros(3), -1, 0
+    still, move, sigmas, drawn = np.zeros(3), np.zeros(3), np.zeros(3), -1
     if low == 0:
         log_likelihood[:] = 0.0
     for robot in range(high):
-        act, a, b = turns[robot, ACT], b, turns[robot, END]
+        row = rows[robot]
+        act = turns[row, ACT] if row >= 0 else IDLE
         drawn += act != IDLE
         if robot < low or act == IDLE:
             continue
-        given, named = turns[robot, GIVEN] > 0, turns[robot, NAMED] > 0
-        own_spreads = spreads[a:b] if given else spreads[:0]
-        to_robot_axes(measured[a:b], own_spreads, points[a:b], noises[a:b])
-        move, placed = still, act == PLACED
+        a, b = turns[row, BEGIN], turns[row, END]
+        given, named = turns[row, GIVEN] > 0, turns[row, NAMED] > 0
+        placed = act == PLACED
+        move[:] = 0.0
         sigmas[:] = 0.0
         if act == MOVED:
-            move = moves[robot]
+            move[:] = moves[row]
             write_sigmas(assumed[NOISE : NOISE + 6], move, sigmas)
         own_poses, own_means, own_covariances = poses[robot], means[robot], covariances[robot]
         was_blind = blind[robot] and not placed
@@ -156,6 +156,6 @@ def take_turns(
     if high < num_robots:
         return 0.0, 0, 0, 0, 0, 0, 0.0, 0
     return conclude(
-        weights, num_particles, means, covariances, frame, mean, covariance, found, distances, told, ids,
+        weights, num_particles, means, covariances, frame, mean, covariance, rows, turns, found, distances, told, ids,
         table[LAST_SEEN], now, assumed[LONG],
     )  # fmt: skip

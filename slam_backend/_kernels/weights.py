@@ -8,7 +8,9 @@ from slam_backend._jit import jit, lanes
 from slam_backend._kernels.lane_math import sine_cosine, wrapped
 from slam_backend._kernels.layout import (
     ASSOCIATED,
+    BEGIN,
     CREATED,
+    END,
     LANES,
     LOG_LIKELIHOOD,
     LOG_WEIGHTS,
@@ -127,12 +129,13 @@ def add_share(scatter: FloatArray, poses: FloatArray, covariances: FloatArray) -
 
 @jit
 def summarise(
-    found: Int32Array, distances: FloatArray, told: IntArray, best: int, ids: IntArray, last_seen: IntArray, now: int,
-    long: float,
+    rows: IntArray, turns: IntArray, found: Int32Array, distances: FloatArray, told: IntArray, best: int, ids: IntArray,
+    last_seen: IntArray, now: int, long: float,
 ) -> tuple[int, int, int, int, float, int]:  # fmt: skip
-    """Tell what became of measurements.
+    """Tell what became of the robots' measurements.
 
     Args:
+        rows, turns: Which of all n measurements they are, as in `take_turns`; those of others are passed over.
         found: (n, P) slots to which the particles gave the measurements, -1 = rejected.
         distances: (n, P) squared distances of matches.
         told: (3, n). Read: the slots of the landmarks that were started, -1 = none. Written: the id to which the most
@@ -152,32 +155,35 @@ def summarise(
     """
     associated, created, new_slots = told[ASSOCIATED], told[CREATED], told[NEW_SLOTS]
     num_created, num_new, num_matched, num_long_unseen, squares, judged = 0, 0, 0, 0, 0.0, 0
-    for b in range(len(new_slots)):
-        slot, new = found[b, best], new_slots[b]
-        associated[b] = ids[slot] if slot >= 0 else REJECTED
-        created[b] = ids[new] if new >= 0 else REJECTED
-        if new >= 0:
-            num_created += 1
-            last_seen[new] = 0
-        if slot < 0:
+    for row in rows:
+        if row < 0:
             continue
-        num_long_unseen += 0 < last_seen[slot] < now - long
-        last_seen[slot] = now
-        if slot == new:
-            num_new += 1
-        else:
-            num_matched += 1
-            if distances[b, best] < np.inf:
-                squares += distances[b, best]
-                judged += 1
+        for b in range(turns[row, BEGIN], turns[row, END]):
+            slot, new = found[b, best], new_slots[b]
+            associated[b] = ids[slot] if slot >= 0 else REJECTED
+            created[b] = ids[new] if new >= 0 else REJECTED
+            if new >= 0:
+                num_created += 1
+                last_seen[new] = 0
+            if slot < 0:
+                continue
+            num_long_unseen += 0 < last_seen[slot] < now - long
+            last_seen[slot] = now
+            if slot == new:
+                num_new += 1
+            else:
+                num_matched += 1
+                if distances[b, best] < np.inf:
+                    squares += distances[b, best]
+                    judged += 1
     return num_created, num_new, num_matched, num_long_unseen, squares, judged
 
 
 @jit
 def conclude(
     weights: FloatArray, count: int, means: FloatArray, covariances: FloatArray, frame: FloatArray,
-    mean: FloatArray, covariance: FloatArray, found: Int32Array, distances: FloatArray, told: IntArray, ids: IntArray,
-    last_seen: IntArray, now: int, long: float,
+    mean: FloatArray, covariance: FloatArray, rows: IntArray, turns: IntArray, found: Int32Array, distances: FloatArray,
+    told: IntArray, ids: IntArray, last_seen: IntArray, now: int, long: float,
 ) -> tuple[float, int, int, int, int, int, float, int]:  # fmt: skip
     """Do what `weigh`, `mixture` and `add_share` for each of K robots and, for their measurements, `summarise` do.
 
@@ -200,6 +206,6 @@ def conclude(
         add_share(frame, mean, covariance)
     best = int(path_log_weights.argmax())
     created, new, matched, long_unseen, squares, judged = summarise(
-        found, distances, told, best, ids, last_seen, now, long
+        rows, turns, found, distances, told, best, ids, last_seen, now, long
     )  # fmt: skip
     return ess, best, created, new, matched, long_unseen, squares, judged

@@ -5,10 +5,10 @@ the resampling.
 """
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from slam_backend._step_input import check_step
 from slam_backend.errors import FloatArray, IntArray, bad_argument, check_array, check_choice, check_int, check_seed
@@ -127,11 +127,12 @@ class PlainFastSlam:
             ValueError: If an argument is ill-formed; the filter is then as before.
         """
         k = len(self.is_blind)
-        inputs = check_step(k, self._descriptor_size, self.options.camera, odometry, measurements, identities, poses)
+        check_step(k, self._descriptor_size, self.options.camera, odometry, measurements, identities, poses)
+        moves, names, exact = _arrays(odometry, k), _arrays(identities, k, np.int64), _arrays(poses, k)
         records = []
-        for robot, reading in enumerate(inputs):
-            records.append(self._step_robot(robot, *reading))
-            if self.options.existence is not None and reading.frame is not None:
+        for robot, frame in enumerate(measurements):
+            records.append(self._step_robot(robot, moves[robot], frame, names[robot], exact[robot]))
+            if self.options.existence is not None and frame is not None:
                 best = self.particles[self.best_particle]  # weights change once all robots have had their turns
                 model, camera = self.options.existence, self.options.camera
                 weigh_existence(self.particles, best, robot, records[robot], model, camera)
@@ -258,3 +259,9 @@ class PlainFastSlam:
         """Draw the particles anew in proportion to their weights; all that a particle holds is copied with it."""
         ancestors = RESAMPLING[self.options.resampling](self.weights, self.rng)
         self.particles = descendants(self.particles, ancestors)
+
+
+def _arrays(values: Sequence[ArrayLike | None] | None, k: int, dtype: Any = np.float64) -> list[NDArray[Any] | None]:
+    """Return one kind of reading of k robots as arrays, None where there is none."""
+    given = [None] * k if values is None else values
+    return [None if value is None else np.asarray(value, dtype) for value in given]

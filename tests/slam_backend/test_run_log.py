@@ -199,6 +199,24 @@ def test_a_frame_larger_than_a_chunk(before: int) -> None:
     assert_same(log.copy().get_state(), log.get_state())
 
 
+@pytest.mark.parametrize(("most", "optional", "together"), [(5, 0.0, 32), (90, 0.0, 7), (300, 0.0, 32), (5, 0.1, 3)])
+def test_steps_together_are_as_one_by_one(most: int, optional: float, together: int) -> None:
+    """A log that was extended by some steps at a time holds what one holds to which they were appended."""
+    steps = random_steps(2 * ROWS + 9, 6, most, optional)
+    for step in steps:
+        step.pop("descriptor_rows", None)
+    names = ("step", "odometry", "pose", "points", "ids", "covariances")
+    rows: list[Any] = [tuple(step.get(name) for name in names) for step in steps]
+    log = RobotLog()
+    for first in range(0, len(rows), together):
+        log.extend(rows[first : first + together])
+    log.extend([])
+    assert_same(log.get_state(), log_of(steps).get_state())
+    with pytest.raises(ValueError, match="Log steps in order"):
+        log.extend([rows[-1], rows[-2]])
+    assert_same(log.get_state(), log_of(steps).get_state())
+
+
 def test_memory_of_a_long_run() -> None:
     """10,000 steps of 15 measurements take less than 6 MB, nine tenths of it numbers and not room to spare."""
     points, ids, move = np.zeros((15, 3)), np.arange(15), np.zeros(3)

@@ -1,0 +1,125 @@
+"""What all robots read in a step is one table: each finds there what it read, whoever else read anything."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from filter_contents import contents
+from hypothesis import given
+from hypothesis import strategies as st
+from same_bits import assert_same
+
+from slam_backend._kernels import IDLE, MOVED, PLACED, STOOD
+from slam_backend._step_input import check_step
+from slam_backend.camera import ROBOT_FROM_CAMERA, StereoCamera
+from slam_backend.filter import FastSlam
+from slam_backend.input_log import StepInput
+from slam_backend.measurements import Measurements, TeamMeasurements
+
+SIZE = 3  # of descriptors
+Reading = tuple[Any, Any, Any, Any]  # odometry, frame, names, pose
+NO_READING: Reading = (None, None, None, None)
+
+
+def reading(seed: int) -> Reading:
+    """Return what a robot may read: any of motion, frame, covariances, names (some of them -1) and pose, or nothing."""
+    rng = np.random.default_rng(seed)
+    move, seen, covered, named, placed = rng.random(5) < (0.5, 0.7, 0.4, 0.4, 0.2)
+    n = int(rng.integers(0, 5))
+    points = rng.uniform(1.0, 3.0, (n, 3))
+    covariances = np.array([np.diag(row) for row in rng.uniform(0.01, 0.02, (n, 3))]).reshape(n, 3, 3)
+    frame = Measurements(points, rng.normal(size=(n, SIZE)), covariances if covered else None)
+    return (
+        rng.normal(size=3) if move else None,
+        frame if seen else None,
+        rng.integers(-1, 3, n) if named and seen else None,
+        rng.normal(size=3) if placed else None,
+    )
+
+
+def checked(readings: list[Reading]) -> StepInput:
+    """Return the readings of some robots in one piece."""
+    moves, frames, names, poses = map(list, zip(*readings, strict=True))
+    return check_step(len(readings), SIZE, StereoCamera(), moves, frames, names, poses)
+
+
+@given(seeds=st.lists(st.integers(0, 10_000), min_size=1, max_size=4))
+def test_each_robot_finds_what_it_read(seeds: list[int]) -> None:
+    """Points are turned into robot axes, with descriptors and names beside; what is named -1 is left out."""
+    readings = list(map(reading, seeds))
+    inputs = checked(readings)
+    last = 0
+    for robot, (move, frame, names, pose) in enumerate(readings):
+        act, begin, end, covered, named, count = inputs.turns[robot]
+        assert inputs.table[robot].tolist() == list(inputs.turns[robot])
+        used = np.full(len(frame or ()), True) if names is None else names >= 0
+        assert (begin, end, count) == (last, last + used.sum(), -1 if frame is None else len(frame))
+        assert act == (PLACED if pose is not None else MOVED if move is not None else STOOD if end > begin else IDLE)
+        assert (covered, named) == (frame is not None and frame.covariances is not None, names is not None)
+        assert (robot in inputs.silent) == (frame is None and act == IDLE)
+        np.testing.assert_array_equal(inputs.moves[robot], 0.0 if move is None else move)
+        np.testing.assert_array_equal(inputs.exact.get(robot), pose)
+        assert (robot in inputs.masks) == (not used.all())
+        last = end
+        if frame is None or not len(frame):
+            continue
+        sightings = inputs.sightings[begin:end]
+        np.testing.assert_array_equal(sightings[:, :3], frame.points[used] @ ROBOT_FROM_CAMERA.T)
+        np.testing.assert_array_equal(inputs.descriptors[begin:end], frame.descriptors[used])
+        if covered:
+            turned = ROBOT_FROM_CAMERA @ frame.covariances[used] @ ROBOT_FROM_CAMERA.T
+            np.testing.assert_array_equal(sightings[:, 3:], turned[:, *np.triu_indices(3)])
+        if named:
+            np.testing.assert_array_equal(inputs.names[begin:end], names[used])
+    assert last == len(inputs.sightings) == len(inputs.descriptors)
+
+
+@given(counts=st.lists(st.integers(0, 4), min_size=1, max_size=4), spoilt=st.booleans(), seed=st.integers(0, 99))
+def test_frames_in_one_piece_are_as_cut_out(counts: list[int], spoilt: bool, seed: int) -> None:
+    """A team's frames give the same table, or the same refusal, in one piece or robot by robot."""
+    rng = np.random.default_rng(seed)
+    points, ends = rng.uniform(1.0, 3.0, (sum(counts), 3)), np.cumsum(counts).tolist()
+    if spoilt:
+        points[-1:, 2] = 0.0
+    team = TeamMeasurements.trusted(points, rng.normal(size=(sum(counts), SIZE)).astype(np.float32), ends)
+    moves = rng.normal(size=(len(counts), 3))
+    told = []
+    for frames in (team, team.of_each()):
+        try:
+            told.append(check_step(len(counts), SIZE, StereoCamera(), moves, frames, None, None))
+        except ValueError as refusal:
+            told.append(str(refusal))
+    assert isinstance(told[0], str) == (spoilt and len(points) > 0)
+    if len(points):
+        assert_same(told[0], told[1])
+
+
+@pytest.mark.parametrize("proposal", ["fastslam2", "fastslam1"])
+def test_robots_beside_change_nothing(proposal: Any) -> None:
+    """A filter makes the same of what its robots read, bit for bit, whether others stand in the table or not."""
+    alone, beside = (FastSlam(2, 12, proposal=proposal, seed=4, rejuvenate_every=7) for _ in range(2))
+    for step in range(25):
+        own, others = [reading(10 * step), reading(10 * step + 1)], [reading(10 * step + k) for k in range(2, 5)]
+        if any(mine[3] is not None for mine in own):
+            own = [NO_READING, NO_READING]
+        table = [others[0], own[0], others[1], own[1], others[2]]
+        assert_same(alone._step_checked(checked(own), (0, 1)), beside._step_checked(checked(table), (1, 3)))
+    assert_same(contents(alone), contents(beside))
+
+
+def test_logs_do_not_depend_on_who_looks() -> None:
+    """What a filter did is the same whether it is asked after each step or once in the end, and stays as it was."""
+    watched, unwatched = (FastSlam(2, 12, seed=4, rejuvenate_every=50) for _ in range(2))
+    for step in range(80):
+        rows = checked([reading(10 * step), reading(10 * step + 1)])
+        report = watched._step_checked(rows, (0, 1))
+        assert_same(unwatched._step_checked(rows, (0, 1)), report)
+        if (reads := [robot for robot in (0, 1) if watched.log(robot).last_step == step]) and step % 3 == 0:
+            for robot in reads:
+                *_, last = watched.log(robot)
+                used = report.associations[robot][rows.masks.get(robot, slice(None))]
+                np.testing.assert_array_equal(last.ids, used)
+                report.associations[robot][:] = 77  # the caller's own
+    for robot in (0, 1):
+        assert_same(unwatched.log(robot).get_state(), watched.log(robot).get_state())
+    assert_same(contents(unwatched), contents(watched))
