@@ -1,16 +1,17 @@
-"""Between which two rays of a scan the cells of a grid lie."""
+"""Which scans can be painted, and where the rows of a grid are crossed by rays."""
 
 import math
 from typing import Any
 
 import numpy as np
 
-from slam_backend._jit import jit
+from slam_backend._jit import inlined, jit
 from slam_backend.errors import FloatArray
-from vslam_env.navigation._painting_kernels.evidence import CELL, HALF_WIDTH
+from vslam_env.navigation._painting_kernels.evidence import CELL
+from vslam_env.navigation._painting_kernels.surveys import ALONG_X, ALONG_Y, TELLING
 
 READINGS_FINE, BAD_RANGES, BAD_ANGLES = 0, 1, 2
-FLAT = 1e-9  # a ray that rises less than this runs along the rows
+ASIDE = 1e12  # [cells] per row: how far off a ray crosses rows that it leads away from
 
 
 @jit
@@ -26,52 +27,46 @@ def fault_of_scan(ranges: FloatArray, angles: FloatArray) -> int:
 
 
 @jit
-def pairs_of_cells(rays: Any, x: float, y: float, first_row: int, first_col: int, height: int, width: int) -> Any:
-    """Tell for each cell of a box between which two rays from (x, y) its centre lies.
-
-    A search for each cell would cost more than all else that a scan takes. Here the cells of a row are visited in the
-    order in which the rays, ascending, pass them; where each ray crosses the row tells how many have passed, and the
-    definition is then asked to make sure of it.
+def look_to_side(seen: Any, side: float, slopes: Any, tops: Any) -> None:
+    """Tell how rays lead to the rows above the robot, or to those below.
 
     Args:
-        rays: (n, 2) float64. Directions of the rays, ascending, spanning less than pi.
-        x: Where they begin [m].
-        y: Likewise.
-        first_row: Of the box.
-        first_col: Likewise.
-        height: Of the box [cells].
-        width: Likewise.
+        seen: (11, n + 1) float64, of `turn`.
+        side: 1 for the rows above, -1 for those below.
+        slopes: (n,) float64. Written to: how far to the left a ray gets from row to row [cells], left as seen by the
+            robot that looks to these rows.
+        tops: (n,) float64. Written to: how far off the rows are of which it can tell [m]; less than 0 if it leads away.
+    """
+    aside = -ASIDE  # all cells lie to the left of what comes before the rays that lead there, none of what comes after
+    for i in range(len(slopes)):
+        slopes[i], tops[i] = aside, -1.0
+        if side * seen[ALONG_Y, i] > 0.0:
+            aside = ASIDE
+            slopes[i] = -seen[ALONG_X, i] / seen[ALONG_Y, i]
+            tops[i] = side * seen[TELLING, i] * seen[ALONG_Y, i] + 0.5 * CELL
+
+
+@inlined
+def cross_row(slopes: Any, begin: int, end: int, steps: float, beside: float, passed: Any) -> tuple[int, int]:
+    """Tell which rays the cells of a row lie to the left of.
+
+    Args:
+        slopes: (n,) float64, of `look_to_side`.
+        begin: The first ray that is asked about.
+        end: One past the last.
+        steps: How far the row is from the robot [cells].
+        beside: Where the robot is, counted from the rightmost cell [cells].
+        passed: (width + 1,) uint32, cells from right to left. Written to: one past the last ray that is crossed just
+            before a cell; 0 if none is.
 
     Returns:
-        (height, width) int16: k for a cell on ray k or to the left of it, and to the right of ray k + 1; -1 where there
-        are no two such rays.
+        The first cell to the left of the first of these rays, and the first to the left of the last one.
     """
-    count = len(rays)
-    slopes = np.empty((2, count))  # steps along x per step along y, of the rows below the robot and of those above
-    for i in range(count):
-        slopes[0, i], slopes[1, i] = rays[i, 0] / min(rays[i, 1], -FLAT), rays[i, 0] / max(rays[i, 1], FLAT)
-    pairs = np.empty((height, width), np.int16)
-    passed, crossings = np.empty(width + 1, np.int64), np.empty(count, np.int32)
-    for r in range(height):
-        v = (first_row + r + 0.5) * CELL - HALF_WIDTH - y
-        above = 1 if v > 0.0 else 0
-        start, sense = (width - 1, -1) if above else (0, 1)
-        beside = sense * ((x + HALF_WIDTH) / CELL - 0.5 - first_col - start)  # where the robot is on the way
-        for i in range(count):  # apart from what follows, so that this becomes vector instructions
-            crossing = beside - abs(v) / CELL * slopes[above, i]
-            crossings[i] = np.int32(np.ceil(min(max(crossing, 0.0), float(width))))
-        passed[:] = 0
-        for i in range(count):
-            passed[crossings[i]] = i + 1
-        guess = 0
-        for j in range(width):
-            guess = max(guess, passed[j])
-            c = start + sense * j
-            u = (first_col + c + 0.5) * CELL - HALF_WIDTH - x
-            number = guess
-            while number > 0 and rays[number - 1, 0] * v < rays[number - 1, 1] * u:
-                number -= 1
-            while number < count and rays[number, 0] * v >= rays[number, 1] * u:
-                number += 1
-            pairs[r, c] = number - 1 if number < count else -1
-    return pairs
+    passed[:] = 0
+    most = float(len(passed) - 1)
+    first, crossing = len(passed) - 1, 0
+    for i in range(begin, end):
+        crossing = math.ceil(min(max(beside + steps * slopes[i], 0.0), most))
+        passed[np.uint32(crossing)] = i + 1
+        first = min(first, crossing)
+    return first, crossing

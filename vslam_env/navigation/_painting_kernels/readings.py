@@ -3,6 +3,8 @@
 import math
 from typing import Any
 
+import numpy as np
+
 from slam_backend._jit import jit
 from slam_backend.errors import BoolArray, FloatArray, IntArray
 from vslam_env.navigation._painting_kernels.evidence import (
@@ -16,7 +18,8 @@ from vslam_env.navigation._painting_kernels.evidence import (
     judge,
 )
 from vslam_env.navigation._painting_kernels.rays import READINGS_FINE, fault_of_scan
-from vslam_env.navigation._painting_kernels.scans import paint_scan
+from vslam_env.navigation._painting_kernels.scans import paint_survey
+from vslam_env.navigation._painting_kernels.surveys import NUM_ROWS, directions_of, survey
 
 BAD_POSE = 3  # beside what `fault_of_scan` finds
 
@@ -28,6 +31,8 @@ def paint_disc(evidence: Any, cells: Any, changes: Any, x: float, y: float, radi
     first_col, last_col = cell_range(x - radius, x + radius)
     for row in range(first_row, last_row):
         for col in range(first_col, last_col):
+            if evidence[row, col] < 0:
+                continue
             v = (row + 0.5) * CELL - HALF_WIDTH - y
             u = (col + 0.5) * CELL - HALF_WIDTH - x
             distance = math.hypot(u, v)
@@ -80,17 +85,23 @@ def paint_readings(
     Returns:
         `READINGS_FINE`, or what is wrong, and with which of the n; nothing was written then.
     """
+    surveys, surveyed = np.empty((len(scans), NUM_ROWS, len(angles) + 1)), np.zeros(len(scans), np.bool_)
+    directions = directions_of(angles)
     for i in range(len(owners)):
-        x, y, theta = poses[owners[i], robots[i]]
+        robot = robots[i]
+        x, y, theta = poses[owners[i], robot]
         if not math.isfinite(x + y + theta):
             return BAD_POSE, i
-        fault = fault_of_scan(scans[robots[i]], angles)
-        if fault != READINGS_FINE:
-            return fault, i
+        if not surveyed[robot]:
+            fault = fault_of_scan(scans[robot], angles)
+            if fault != READINGS_FINE:
+                return fault, i
+            survey(scans[robot], directions, max_range, surveys[robot])
+            surveyed[robot] = True
     for i in range(len(owners)):
         owner, robot = owners[i], robots[i]
         x, y, theta = poses[owner, robot]
-        paint_scan(evidence[owner], cells[owner], changes[owner], x, y, theta, scans[robot], angles, max_range)
+        paint_survey(evidence[owner], cells[owner], changes[owner], x, y, theta, surveys[robot])
         paint_disc(evidence[owner], cells[owner], changes[owner], x, y, radius)
         if bumps[robot]:
             paint_bump(evidence[owner], cells[owner], changes[owner], x, y, theta, radius)
