@@ -170,12 +170,14 @@ def _fill(
             row[i] = _clip(pose[i], -POSE_LIMIT[i], POSE_LIMIT[i])
             row[3 + i] = _clip(math.sqrt(covariances[k, i, i]), 0.0, POSE_LIMIT[i])
         first, last = parts[k]
-        mean = largest = seen = 0.0
+        total = largest = 0.0
+        times = 0
         for landmark in range(first, last):
             sigma = math.sqrt(variances[landmark] / 3.0)
-            mean += sigma / (last - first)
+            total += sigma
             largest = max(largest, sigma)
-            seen += counts[landmark] / (last - first)
+            times += counts[landmark]
+        held = max(last - first, 1)
         c, s = math.cos(pose[2]), math.sin(pose[2])
         group_size = 1
         for mate in range(poses.shape[1]):
@@ -188,9 +190,9 @@ def _fill(
                 to[4] = _clip(sigmas[k, mate], -FAR, FAR)
                 present[k, mate - (mate > robots[k])] = 1
         row[6] = _clip(last - first, 0.0, MAP_STATS_LIMIT[0])
-        row[7] = _clip(mean, 0.0, MAP_STATS_LIMIT[1])
+        row[7] = _clip(total / held, 0.0, MAP_STATS_LIMIT[1])
         row[8] = _clip(largest, 0.0, MAP_STATS_LIMIT[2])
-        row[9] = _clip(seen, 0.0, MAP_STATS_LIMIT[3])
+        row[9] = _clip(times / held, 0.0, MAP_STATS_LIMIT[3])
         row[10] = _clip(ess[k], 0.0, MAP_STATS_LIMIT[4])
         row[11] = _clip(group_size, 0.0, MAP_STATS_LIMIT[5])
         for i in range(candidates.shape[1]):
