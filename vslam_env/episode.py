@@ -127,7 +127,7 @@ class Episode:
         self.ledger.score(belief.outlines, belief.points, self.true_starts, poses, self._figures)
         coverage = self._coverage.update(belief.grids, poses, self._found)
         return Standing(
-            figures=self._figures.copy(),
+            figures=self._figures.tolist(),
             collisions=self._collisions,
             bytes_sent=belief.bytes_sent,
             coverage=coverage,

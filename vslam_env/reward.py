@@ -3,12 +3,13 @@
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from slam_backend.errors import FloatArray, bad_argument, check_float
-from vslam_env.standing import Standing
+from vslam_env.standing import DISTANCES, FOUND, MAP_ERRORS, PLACED_RECALLS, POSE_SIGMAS, Standing
 
 __all__ = [
     "COSTS", "POTENTIALS", "TERMS", "RewardSpec", "RewardTerm", "Standing", "evaluate", "make_terms", "totals",
@@ -27,8 +28,11 @@ class RewardTerm(Protocol):
     def weight(self) -> float:
         """What the term is multiplied with."""
 
-    def __call__(self, before: Standing, after: Standing) -> FloatArray:
+    def __call__(self, before: Standing, after: Standing) -> ArrayLike:
         """Return what each robot gains (K,) by a step, unweighted. Neither standing may be written to."""
+
+
+Gain = Callable[[Standing, Standing], list[float]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,64 +40,63 @@ class _NamedTerm:
     name: str
     weight: float
 
-    def __call__(self, before: Standing, after: Standing) -> FloatArray:
+    def __call__(self, before: Standing, after: Standing) -> list[float]:
         return TERMS[self.name](before, after)
 
 
-def _map_error(before: Standing, after: Standing) -> FloatArray:
-    return before.map_errors - after.map_errors
+def _rise_of(row: int) -> Gain:
+    """Return the gain that pays how much a row of the figures has risen."""
+
+    def gain(before: Standing, after: Standing) -> list[float]:
+        return [now - then for then, now in zip(before.figures[row], after.figures[row], strict=True)]
+
+    return gain
 
 
-def _map_error_squared(before: Standing, after: Standing) -> FloatArray:
-    return before.map_errors**2 - after.map_errors**2
+def _fall_of(row: int) -> Gain:
+    """Return the gain that pays how much a row of the figures has fallen."""
+
+    def gain(before: Standing, after: Standing) -> list[float]:
+        return [then - now for then, now in zip(before.figures[row], after.figures[row], strict=True)]
+
+    return gain
 
 
-def _team_map_error(before: Standing, after: Standing) -> FloatArray:
-    return np.full(len(after.map_errors), before.map_errors.mean() - after.map_errors.mean())
+def _map_error_squared(before: Standing, after: Standing) -> list[float]:
+    errors = zip(before.figures[MAP_ERRORS], after.figures[MAP_ERRORS], strict=True)
+    return [then * then - now * now for then, now in errors]
 
 
-def _recall(before: Standing, after: Standing) -> FloatArray:
-    return after.placed_recalls - before.placed_recalls
+def _team_map_error(before: Standing, after: Standing) -> list[float]:
+    return [float(before.map_errors.mean() - after.map_errors.mean())] * len(after.collisions)
 
 
-def _pose_uncertainty(before: Standing, after: Standing) -> FloatArray:
-    return before.pose_sigmas - after.pose_sigmas
+def _coverage(before: Standing, after: Standing) -> list[float]:
+    return [after.coverage - before.coverage] * len(after.collisions)
 
 
-def _coverage(before: Standing, after: Standing) -> FloatArray:
-    return np.full(len(after.map_errors), after.coverage - before.coverage)
+def _collisions(before: Standing, after: Standing) -> list[float]:
+    return [float(gain) for gain in (before.collisions - after.collisions).tolist()]
 
 
-def _own_coverage(before: Standing, after: Standing) -> FloatArray:
-    return after.found - before.found
-
-
-def _collisions(before: Standing, after: Standing) -> FloatArray:
-    return (before.collisions - after.collisions).astype(np.float64)
-
-
-def _distance(before: Standing, after: Standing) -> FloatArray:
-    return before.distances - after.distances
-
-
-def _time(before: Standing, after: Standing) -> FloatArray:
-    return np.full(len(after.map_errors), before.time - after.time)
+def _time(before: Standing, after: Standing) -> list[float]:
+    return [before.time - after.time] * len(after.collisions)
 
 
 # Potentials telescope: what an episode pays in all is where it ends minus where it began, so that nothing is gained by
 # going to and fro. Costs only ever fall.
-POTENTIALS: dict[str, Callable[[Standing, Standing], FloatArray]] = {
-    "map_error": _map_error,
+POTENTIALS: dict[str, Gain] = {
+    "map_error": _fall_of(MAP_ERRORS),
     "map_error_squared": _map_error_squared,
     "team_map_error": _team_map_error,
-    "recall": _recall,
-    "pose_uncertainty": _pose_uncertainty,
+    "recall": _rise_of(PLACED_RECALLS),
+    "pose_uncertainty": _fall_of(POSE_SIGMAS),
     "coverage": _coverage,
-    "own_coverage": _own_coverage,
+    "own_coverage": _rise_of(FOUND),
 }
-COSTS: dict[str, Callable[[Standing, Standing], FloatArray]] = {
+COSTS: dict[str, Gain] = {
     "collisions": _collisions,
-    "distance": _distance,
+    "distance": _fall_of(DISTANCES),
     "time": _time,
 }
 TERMS = POTENTIALS | COSTS
@@ -148,21 +151,26 @@ def evaluate(
     robots = len(after.collisions)
     rewards = {}
     for term in terms:
-        given = term(before, after)
-        try:
-            value = np.asarray(given, dtype=np.float64)
-        except (TypeError, ValueError):  # no numbers at all
-            value = np.array(np.nan)
-        paid = value.tolist()
-        if value.shape != (robots,) or not all(map(math.isfinite, paid)):
+        given: Any = term(before, after)
+        paid: list[float] = given if isinstance(term, _NamedTerm) else _floats(given)
+        if len(paid) != robots or not all(map(math.isfinite, paid)):
             raise bad_argument(
                 f"reward term {term.name!r}", f"{robots} finite numbers", given, "Return one number for each robot."
             )
         weight = float(term.weight)
         if shared:
-            paid = [float(value.mean())] * robots
+            paid = [float(np.mean(paid))] * robots
         rewards[term.name] = [weight * each for each in paid]
     return rewards
+
+
+def _floats(given: Any) -> list[float]:
+    """Return what a term of one's own gave as a list; an empty one if it is no row of numbers."""
+    try:
+        row: FloatArray = np.asarray(given, dtype=np.float64)
+    except (TypeError, ValueError):  # no numbers at all
+        return []
+    return row.tolist() if row.ndim == 1 else []
 
 
 def totals(rewards: Mapping[str, Sequence[float]]) -> list[float]:

@@ -24,4 +24,4 @@ def scored(
     robots = len(true_poses)
     figures, nothing = np.full((NUM_FIGURES, robots), np.nan), np.zeros(robots, np.int64)
     ledger.score(outlines, points, true_starts, true_poses, figures)
-    return Standing(figures, nothing, nothing, 0.0, 0, 0.0)
+    return Standing(figures.tolist(), nothing, nothing, 0.0, 0, 0.0)

@@ -30,7 +30,7 @@ FIGURES: dict[str, list[float]] = {  # in the order of their rows
 
 def _standing(coverage: float = 0.25, collisions: tuple[int, int] = (0, 3), time: float = 3.0, **rows: Any) -> Standing:
     return Standing(
-        figures=np.array([*(FIGURES | rows).values()]),
+        figures=[*(FIGURES | rows).values()],
         collisions=np.array(collisions),
         bytes_sent=np.zeros(2, np.int64),
         coverage=coverage,
