@@ -56,13 +56,11 @@ class OdometryModel:
     def variances(self, odometry: FloatArray) -> FloatArray:
         """Return the variances (n, 3) [m^2, m^2, rad^2] of n odometry readings (n, 3), previous robot frames."""
         squares = odometry[:, 0] ** 2 + odometry[:, 1] ** 2
-        return np.column_stack(
-            [
-                self.sigma_along**2 * squares + self.floor_position**2,
-                self.sigma_across**2 * squares + self.floor_position**2,
-                self.sigma_heading**2 * squares + (self.sigma_turn * odometry[:, 2]) ** 2 + self.floor_heading**2,
-            ]
-        )
+        result = np.empty((len(odometry), 3))
+        result[:, 0] = self.sigma_along**2 * squares + self.floor_position**2
+        result[:, 1] = self.sigma_across**2 * squares + self.floor_position**2
+        result[:, 2] = self.sigma_heading**2 * squares + (self.sigma_turn * odometry[:, 2]) ** 2 + self.floor_heading**2
+        return result
 
     def sample(self, poses: FloatArray, odometry: FloatArray, rng: np.random.Generator) -> FloatArray:
         """Draw x_t^[m] ~ p(x_t | x_{t-1}^[m], u_t), each particle from its own past (Eq. 4).

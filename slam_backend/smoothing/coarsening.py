@@ -18,7 +18,9 @@ MOST_FRAMES = 100  # of a fresh key whose measurements stay raw: a robot that wa
 CONTRADICTION = 2.0  # times the kernel's squared distance: measurements farther off are dropped for good
 
 
-def coarsened(graph: PathGraph, camera: FloatArray, options: SmoothingOptions) -> PathGraph:
+def coarsened(
+    graph: PathGraph, camera: FloatArray, options: SmoothingOptions, sightings: Sightings | None = None
+) -> PathGraph:
     """Return the graph with old keys condensed and at most `most_keys` of them, if the fresh ones allow.
 
     A fresh key's measurements stay raw unless more than `MOST_FRAMES` frames stand to it. Odometry is chained over old
@@ -29,12 +31,14 @@ def coarsened(graph: PathGraph, camera: FloatArray, options: SmoothingOptions) -
         graph: At its mode, with what is known there of its spreads; see `at_mode`.
         camera: As in `find_mode`.
         options: How many keys, and how many of them fresh, of all robots together.
+        sightings: Of the graph, wherever linearised; None: they are gathered.
     """
     k, robots = graph.num_keys, len(graph.tips)
     fresh, raw, sighted = (np.empty(k, dtype=np.bool_) for _ in range(3))
     share = max(1, options.fresh_keys // robots)
     _kernels.look_at_keys(graph.robots, graph.frame_keys, share, MOST_FRAMES, fresh, raw)
-    graph, seen = _consistent(graph, raw, camera, options)
+    seen = Sightings.of(graph) if sightings is None else sightings.copy()
+    graph, seen = _consistent(graph, seen, raw, camera, options)
     rows = np.empty(len(seen.keys), dtype=np.int64)
     rows = rows[: _kernels.to_freeze(seen.frozen, seen.keys, raw, rows, sighted)]
     keys = {name: getattr(graph, name).copy() for name in OF_KEYS}
@@ -87,23 +91,22 @@ def _without_unused(graph: PathGraph, kept: BoolArray) -> PathGraph:
 
 
 def _consistent(
-    graph: PathGraph, raw: BoolArray, camera: FloatArray, options: SmoothingOptions
+    graph: PathGraph, seen: Sightings, raw: BoolArray, camera: FloatArray, options: SmoothingOptions
 ) -> tuple[PathGraph, Sightings]:
     """Return the graph without old measurements that the smoothed path contradicts, and its sightings, linearised."""
-    seen = _linearised(graph, camera, options)
+    _linearise(seen, graph, camera, options)
     if options.kernel:
         lost = seen.squares > CONTRADICTION * options.kernel
         if lost.any() and (lost := lost & ~raw[graph.frame_keys[graph.point_frames]]).any():
             graph = graph.with_columns(**_of_points(graph, ~lost))
-            seen = _linearised(graph, camera, options)
+            seen = Sightings.of(graph)
+            _linearise(seen, graph, camera, options)
     return graph, seen
 
 
-def _linearised(graph: PathGraph, camera: FloatArray, options: SmoothingOptions) -> Sightings:
-    """Return all that was measured as forms, linearised where the graph's poses and landmarks are."""
-    seen = Sightings.of(graph)
+def _linearise(seen: Sightings, graph: PathGraph, camera: FloatArray, options: SmoothingOptions) -> None:
+    """Linearise all that was measured where the graph's poses and landmarks are."""
     seen.linearise(graph, graph.poses, graph.landmarks, camera, options.noise_scale, options.kernel)
-    return seen
 
 
 def _of_points(graph: PathGraph, chosen: BoolArray) -> dict[str, np.ndarray]:

@@ -167,7 +167,7 @@ def settled(
     if graph.num_keys <= options.most_keys(len(graph.tips)):
         return at_mode(graph, mode)
     spreads = drawn_spreads(graph, mode, rng) if mode.crowded else mode.spreads()
-    return coarsened(at_mode(graph, mode, spreads), camera, options)
+    return coarsened(at_mode(graph, mode, spreads), camera, options, mode.sightings)
 
 
 def drawn(
@@ -187,7 +187,7 @@ def drawn(
         camera, num_particles, rng, options, looks: As of `rejuvenate`.
     """
     draws = draw_paths(grown, mode, num_particles, rng)
-    graph = coarsened(at_mode(grown, mode, draws.spreads), camera, options)
+    graph = coarsened(at_mode(grown, mode, draws.spreads), camera, options, mode.sightings)
     weights, ess = _weighed(draws)
     chosen = draws
     needed = options.least_ess * num_particles

@@ -1,6 +1,6 @@
 """`Sightings`: all that was measured from key poses, one quadratic form for each pair of key and landmark."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -59,6 +59,16 @@ class Sightings:
             counts=counts[:num],
             of_points=of_points,
             squares=np.zeros(n),
+        )
+
+    def copy(self) -> Self:
+        """Return the same with forms of their own, which may be linearised elsewhere."""
+        return replace(
+            self,
+            centres=self.centres.copy(),
+            infos=self.infos.copy(),
+            slopes=self.slopes.copy(),
+            squares=self.squares.copy(),
         )
 
     def linearise(

@@ -107,7 +107,7 @@ def find_mode(
     """
     sought = graph.previous >= 0
     columns = np.where(sought, 3 * np.cumsum(sought) - 3, FREE)
-    size = int(sought.sum())
+    size = int(np.count_nonzero(sought))
     sightings = Sightings.of(graph)
     poses, landmarks = graph.poses.copy(), graph.landmarks.copy()
     informations = np.zeros_like(graph.noises)
@@ -120,10 +120,8 @@ def find_mode(
 
     if not size:
         return given_up(NO_POSE)
-    noises = graph.noises[sought]
-    if not _kernels.invert(noises, of_sought := np.empty_like(noises)):
+    if not _kernels.invert(graph.noises, columns, informations):
         return given_up("odometry without noise")
-    informations[sought] = of_sought
     system = _System(graph, columns, size, informations, sightings, camera, options)
     cost = system.form(poses, landmarks)
     for iteration in range(1, most + 1):
@@ -131,12 +129,13 @@ def find_mode(
             return given_up("a landmark at no finite place", iteration)
         if not system.factor(damping):
             return given_up("a singular system", iteration)
-        change = system.solve()
-        if not np.abs(change[:size]).max() < LARGEST_STEP:
+        trial_poses, trial_landmarks = np.empty_like(poses), np.empty_like(landmarks)
+        rise, largest = _kernels.advance(
+            system.solve(), system.vector, columns, poses, landmarks, trial_poses, trial_landmarks
+        )
+        if not largest < LARGEST_STEP:
             return given_up("a descent that leaves the world", iteration)
-        expected = -0.5 * float((system.vector * change).sum()) - system.eased  # if the cost were a parabola
-        trial_poses, trial_landmarks = poses.copy(), landmarks + change[size:]
-        trial_poses[sought] += change[:size]
+        expected = -0.5 * rise - system.eased  # if the cost were a parabola
         near = creep * tolerance if iteration == most else tolerance
         if expected <= near and damping == 0.0:
             return Mode(

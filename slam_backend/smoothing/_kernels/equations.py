@@ -11,9 +11,8 @@ import numpy as np
 
 from slam_backend._jit import jit
 from slam_backend.errors import FloatArray, IntArray
-from slam_backend.smoothing._kernels.forms import _inverse, _spun
+from slam_backend.smoothing._kernels.forms import FREE, _inverse, _spun
 
-FREE = -1  # column of a pose that is given, not sought
 # Information [1/m^2] of a landmark about where it stands now, 1 km along each axis: where all its sightings have lost
 # their weight nothing else holds it. It takes part in every step, and moves nothing that has come to rest.
 WEAK = 1e-6
@@ -142,3 +141,38 @@ def form(
         eased += 0.5 * (p[0] * m0 * m0 + p[3] * m1 * m1 + p[5] * m2 * m2)
         eased += p[1] * m0 * m1 + p[2] * m0 * m2 + p[4] * m1 * m2
     return cost, eased
+
+
+@jit
+def advance(
+    change: FloatArray, vector: FloatArray, columns: IntArray, poses: FloatArray, landmarks: FloatArray,
+    new_poses: FloatArray, new_landmarks: FloatArray,
+) -> tuple[float, float]:  # fmt: skip
+    """Write where a change of all nodes leads.
+
+    Args:
+        change: (n + l, 3) of the poses that are sought, then of the landmarks.
+        vector, columns: As of `form`.
+        poses, landmarks: (k, 3), (l, 3) where they are.
+        new_poses, new_landmarks: (k, 3), (l, 3), results.
+
+    Returns:
+        By how much the cost rises along its slope, and the largest change of a pose, NaN if any is.
+    """
+    rise, largest = 0.0, 0.0
+    for node in range(len(change)):
+        for axis in range(3):
+            rise += vector[node, axis] * change[node, axis]
+    for key in range(len(poses)):
+        for axis in range(3):
+            new_poses[key, axis] = poses[key, axis]
+            if columns[key] != FREE:
+                step = change[columns[key] // 3, axis]
+                new_poses[key, axis] += step
+                if abs(step) > largest or math.isnan(step):
+                    largest = abs(step)
+    first_landmark = len(change) - len(landmarks)
+    for landmark in range(len(landmarks)):
+        for axis in range(3):
+            new_landmarks[landmark, axis] = landmarks[landmark, axis] + change[first_landmark + landmark, axis]
+    return rise, largest

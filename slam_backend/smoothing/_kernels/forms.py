@@ -13,6 +13,7 @@ import numpy as np
 from slam_backend._jit import inlined, jit
 from slam_backend.errors import BoolArray, FloatArray, IntArray
 
+FREE = -1  # column of a pose that is given, not sought
 MIN_DEPTH = 0.05  # [m]; a landmark predicted nearer than this to the camera plane is linearised where it was measured
 
 
@@ -45,13 +46,17 @@ def _inverse(a: FloatArray, out: FloatArray) -> float:
 
 
 @jit
-def invert(matrices: FloatArray, out: FloatArray) -> bool:
+def invert(matrices: FloatArray, columns: IntArray, out: FloatArray) -> bool:
     """Write the inverses of symmetric matrices (n, 3, 3) to `out`, likewise; return whether all are positive definite.
 
-    Where one is not, those after it are not written.
+    Zeros are written, whatever the matrix, where `columns` (n,) says `FREE`. Where one that is to be inverted is not
+    positive definite, those after it are not written.
     """
     upper, inverse = np.empty(6), np.empty(6)
     for n in range(len(matrices)):
+        if columns[n] == FREE:
+            out[n] = 0.0
+            continue
         a = matrices[n]
         upper[0], upper[1], upper[2], upper[3], upper[4], upper[5] = (
             a[0, 0], a[0, 1], a[0, 2], a[1, 1], a[1, 2], a[2, 2],

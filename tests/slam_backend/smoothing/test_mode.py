@@ -15,7 +15,7 @@ from small_problems import (
 from slam_backend.camera import StereoCamera
 from slam_backend.motion import OdometryModel
 from slam_backend.run_log import RobotLog
-from slam_backend.smoothing._kernels import invert
+from slam_backend.smoothing._kernels import FREE, advance, invert
 from slam_backend.smoothing.extending import extended
 from slam_backend.smoothing.graph import PathGraph
 from slam_backend.smoothing.options import SmoothingOptions
@@ -179,12 +179,33 @@ def test_small_matrices_are_inverted_as_by_lapack():
     rng = np.random.default_rng(5)
     roots = rng.normal(size=(50, 3, 3)) * [1e-3, 1e-2, 1.0]
     matrices = roots @ roots.transpose(0, 2, 1) + 1e-4 * np.eye(3)
-    found = np.empty_like(matrices)
-    assert invert(matrices, found)
-    np.testing.assert_allclose(found, np.linalg.inv(matrices), rtol=1e-7, atol=1e-7)
+    found, columns = np.empty_like(matrices), 3 * np.arange(50)
+    columns[[4, 20]] = FREE
+    expected = np.linalg.inv(matrices)
+    expected[[4, 20]] = 0.0
+    matrices[20] = 0.0
+    assert invert(matrices, columns, found)
+    np.testing.assert_allclose(found, expected, rtol=1e-7, atol=1e-7)
     for bad in (np.zeros((3, 3)), np.diag([1.0, -1.0, -1.0]), np.diag([-1.0, 1.0, 1.0])):
         matrices[7] = bad
-        assert not invert(matrices, found)
+        assert not invert(matrices, columns, found)
+
+
+def test_a_change_leads_where_it_says():
+    """Poses that are given stay; the slope is taken along all of it, and no change that is not finite looks small."""
+    rng = np.random.default_rng(8)
+    change, vector, poses, landmarks = (rng.normal(size=(n, 3)) for n in (5, 5, 4, 2))
+    columns = np.array([FREE, 0, 3, 6])
+    new_poses, new_landmarks = np.empty_like(poses), np.empty_like(landmarks)
+    rise, largest = advance(change, vector, columns, poses, landmarks, new_poses, new_landmarks)
+    assert rise == pytest.approx((change * vector).sum())
+    assert largest == np.abs(change[:3]).max()
+    np.testing.assert_array_equal(new_poses, poses + np.concatenate([np.zeros((1, 3)), change[:3]]))
+    np.testing.assert_array_equal(new_landmarks, landmarks + change[3:])
+    for row, axis in ((0, 0), (2, 2)):
+        bad = change.copy()
+        bad[row, axis] = np.nan
+        assert not advance(bad, vector, columns, poses, landmarks, new_poses, new_landmarks)[1] < np.inf
 
 
 def test_odometry_without_noise_is_refused_with_a_reason():
