@@ -112,9 +112,8 @@ def is_mirrored(
     """
     points = table[inside, 3:5]
     centre = points.mean(axis=0)
-    axis = np.linalg.eigh((points - centre).T @ (points - centre))[1][:, -1]
-    mirror = np.eye(3)
-    mirror[:2, :2] = 2.0 * np.outer(axis, axis) - np.eye(2)
+    x, y = np.linalg.eigh((points - centre).T @ (points - centre))[1][:, -1].tolist()
+    mirror = np.array([[2.0 * x * x - 1.0, 2.0 * x * y, 0.0], [2.0 * x * y, 2.0 * y * y - 1.0, 0.0], [0.0, 0.0, 1.0]])
     image = table.copy()
     image[:, 3:5] = centre + (table[:, 3:5] - centre) @ mirror[:2, :2]
     image[:, 12:] = (mirror @ table[:, 12:][:, UNPACK] @ mirror)[:, *UPPER]

@@ -75,6 +75,19 @@ def _nearest(a: Float32Array, b_columns: Float32Array) -> tuple[IntArray, Float3
 
 
 @jit
+def _mutual(a: Float32Array, b_columns: Float32Array, limit: float) -> IntArray:
+    """Compute `mutual_nearest`; `limit` is a squared distance."""
+    nearest_b, squares, nearest_a = _nearest(a, b_columns)
+    pairs = np.empty((len(a), 2), np.int64)
+    k = 0
+    for i in range(len(a)):
+        if nearest_a[nearest_b[i]] == i and squares[i] <= np.float32(limit):
+            pairs[k, 0], pairs[k, 1] = i, nearest_b[i]
+            k += 1
+    return pairs[:k]
+
+
+@jit
 def _unlike(
     a: Float32Array,
     partners: IntArray,
@@ -127,6 +140,21 @@ def _alike(a: Float32Array, b_columns: Float32Array, limit: float, most: int) ->
     return found, of_a, of_b
 
 
+@jit
+def _look_alikes(a: Float32Array, b_columns: Float32Array, limit: float, most: int) -> IntArray:
+    """Compute `look_alikes`; `limit` is a squared distance."""
+    found, of_a, of_b = _alike(a, b_columns, limit, most)
+    pairs = np.empty((found.size, 2), np.int64)
+    k = 0
+    for i in range(len(a)):
+        if of_a[i] <= most:
+            for j in found[i, : of_a[i]]:
+                if of_b[j] <= most:
+                    pairs[k, 0], pairs[k, 1] = i, j
+                    k += 1
+    return pairs[:k]
+
+
 def look_alikes(a: Float32Array, b: Float32Array, gate: float, most: int) -> IntArray:
     """Pair all descriptors within `gate`, but none that so pairs with more than `most`: those tell nothing.
 
@@ -141,11 +169,7 @@ def look_alikes(a: Float32Array, b: Float32Array, gate: float, most: int) -> Int
     """
     if not len(a) or not len(b):
         return np.empty((0, 2), np.int64)
-    found, of_a, of_b = _alike(_fresh(a), _fresh(b.T), gate * gate, most)
-    rows, places = np.nonzero((np.arange(most) < of_a[:, None]) & (of_a <= most)[:, None])
-    partners = found[rows, places]
-    pairs = np.column_stack([rows, partners])
-    return np.asarray(pairs[of_b[partners] <= most])
+    return _look_alikes(_fresh(a), _fresh(b.T), gate * gate, most)
 
 
 def num_alike(a: Float32Array, b: Float32Array, gate: float) -> int:
@@ -166,9 +190,7 @@ def mutual_nearest(a: Float32Array, b: Float32Array, gate: float) -> IntArray:
     """
     if not len(a) or not len(b):
         return np.empty((0, 2), np.int64)
-    nearest_b, squares, nearest_a = _nearest(_fresh(a), _fresh(b.T))
-    rows = np.flatnonzero((nearest_a[nearest_b] == np.arange(len(a))) & (squares <= gate * gate))
-    return np.column_stack([rows, nearest_b[rows]])
+    return _mutual(_fresh(a), _fresh(b.T), gate * gate)
 
 
 def unlike_other_places(
