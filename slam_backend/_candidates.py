@@ -3,10 +3,10 @@
 import numpy as np
 
 from slam_backend import _alignment_kernels as kernels
-from slam_backend._matching import Float32Array, look_alikes, mutual_nearest, num_alike, unlike_other_places
+from slam_backend._matching import look_alikes, mutual_nearest, num_alike, unlike_other_places
 from slam_backend._packed import OF_NINE
 from slam_backend.alignment_types import AlignmentOptions
-from slam_backend.errors import BoolArray, FloatArray, IntArray, bad_argument
+from slam_backend.errors import BoolArray, Float32Array, FloatArray, IntArray, bad_argument
 from slam_backend.landmark_map import LandmarkMap
 
 MOST_PAIRS = 10_000  # candidates by geometry alone

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from slam_backend import _alignment_kernels as kernels
 from slam_backend import _clique_kernels as cliques
 from slam_backend import _proposals as proposals
-from slam_backend._matching import look_alikes
+from slam_backend._matching import look_alikes, num_alike
 from slam_backend.alignment import METHODS, REASONS, AlignmentOptions, align_maps, candidate_matches, propose_motion
 from slam_backend.geometry import between, inverse, transform_points
 from slam_backend.landmark_map import LandmarkMap
@@ -308,6 +308,21 @@ def test_pairs_of_look_alikes_are_those_within_the_gate() -> None:
         assert look_alikes(a.descriptors, b.descriptors, 0.45, most).tolist() == np.argwhere(kept).tolist()
         assert kept.sum() > 10
     assert look_alikes(a.descriptors[:0], b.descriptors, 0.45, 3).shape == (0, 2)
+
+
+@pytest.mark.parametrize("size", [1, 6, 24, 30, 64])
+@pytest.mark.parametrize("length", [1.0, 10.0])
+def test_what_is_near_is_found_whatever_the_heads_say(size: int, length: float) -> None:
+    """Of descriptors of any size and length, near each other by their heads, their tails or both, none is lost."""
+    rng = np.random.default_rng(size)
+    a = length * rng.normal(size=(70, size)) / np.sqrt(size)
+    shift = rng.normal(size=(300, size)) * (rng.random((300, size)) < rng.random((300, 1)))
+    shift *= 0.9 * rng.random((300, 1)) / np.maximum(np.linalg.norm(shift, axis=1, keepdims=True), 1e-9)
+    a, b = a.astype(np.float32), (a[rng.integers(0, 70, 300)] + shift).astype(np.float32)
+    distances = np.linalg.norm(a[:, None].astype(float) - b[None].astype(float), axis=2)
+    surely, maybe = (np.count_nonzero(distances <= 0.45 + off) for off in (-2e-5 * length**2, 2e-5 * length**2))
+    assert surely <= num_alike(a, b, 0.45) <= maybe
+    assert surely > 100
 
 
 @pytest.mark.parametrize("method", ["ransac", "clique", "gnc"])
