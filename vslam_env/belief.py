@@ -58,12 +58,12 @@ class TeamBelief:
         rhythm = config.attempts if attempts else replace(config.attempts, enabled=False)
         merging = config.merging if attempts else replace(config.merging, watch_steps=0)
         self._team = TeamSlam(num_robots, config.alignment, seed, rhythm, merging, **options)
-        self._body = body
         self._grids = SharedGrids(num_robots, body)
         self.grids = self._grids.team
         self._candidates = TeamSlots(num_robots)
         self._slots = self._candidates.slots
         self._robots = np.arange(num_robots)
+        self._scanned = num_robots, len(body.ray_angles)  # shape of a tick's scans
         self._turns = _turns(num_robots, decision_ticks)
         self._tick = -1
         self._confirm_after = config.confirm_after
@@ -110,10 +110,9 @@ class TeamBelief:
         """
         if not isinstance(readings, TeamReadings):
             readings = TeamReadings.gathered(readings)
-        shape = len(self._robots), len(self._body.ray_angles)
-        if readings.scans.shape != shape:
+        if readings.scans.shape != self._scanned:
             got, cure = f"shape {readings.scans.shape}", "Give a range for each ray of each robot."
-            raise bad_argument("readings.scans", f"an array of shape {shape}", got, cure)
+            raise bad_argument("readings.scans", f"an array of shape {self._scanned}", got, cure)
         report = self._team.step(
             [None] * len(self._robots) if readings.odometry is None else readings.odometry,
             readings.measurements,
