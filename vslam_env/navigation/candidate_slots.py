@@ -29,17 +29,15 @@ NO_TEAMMATE = 60.0  # [m] stands for the distance of a teammate when there is no
 
 
 @jit
-def _costs(goals: Any, places: Any) -> Any:
-    """Return the distances (m, n), at most `SAME_GOAL`, between goals (m, 2 or more) and places (n, 2 or more).
+def _weigh_pairs(goals: Any, places: Any, costs: Any) -> None:
+    """Write the distances (m, n), at most `SAME_GOAL`, between goals (m, 2 or more) and places (n, 2 or more).
 
     They are `SAME_GOAL` for goals that are NaN, of empty slots.
     """
-    costs = np.empty((len(goals), len(places)))
     for i in range(len(goals)):
         for j in range(len(places)):
             distance = np.hypot(goals[i, 0] - places[j, 0], goals[i, 1] - places[j, 1])
             costs[i, j] = distance if distance < SAME_GOAL else SAME_GOAL
-    return costs
 
 
 @jit
@@ -57,22 +55,20 @@ def _visit(slots: Any, x: float, y: float, theta: float, teammates: Any, visits:
 
 
 @jit
-def _refill(costs: Any, slots: Any, sources: Any, found: Any, visits: Any) -> tuple[Any, Any]:
-    """Return the next rows and visits of the slots: old candidates stay where they were, new ones fill the gaps."""
+def _refill(costs: Any, slots: Any, sources: Any, found: Any, rows: Any, visits: Any) -> None:
+    """Write the next rows and visits of the slots: old candidates stay where they were, new ones fill the gaps."""
     chosen = np.full(NUM_SLOTS, -1, np.int64)
     is_new = np.ones(len(found), np.bool_)
     for k in range(len(slots)):
         if costs[slots[k], sources[k]] < SAME_GOAL:
             chosen[slots[k]], is_new[sources[k]] = sources[k], False
 
-    rows = np.full((NUM_SLOTS, NUM_COLUMNS), np.nan)
-    next_visits = np.zeros(NUM_SLOTS, np.int64)
+    rows[:] = np.nan
     new = 0
     for slot in range(NUM_SLOTS):
         source = chosen[slot]
-        if source >= 0:
-            next_visits[slot] = visits[slot]
-        else:
+        if source < 0:
+            visits[slot] = 0
             while new < len(found) and not is_new[new]:
                 new += 1
             if new == len(found):
@@ -81,7 +77,6 @@ def _refill(costs: Any, slots: Any, sources: Any, found: Any, visits: Any) -> tu
             new += 1
         for column in range(NUM_COLUMNS):
             rows[slot, column] = found[source, column]
-    return rows, next_visits
 
 
 @jit
@@ -182,9 +177,10 @@ class CandidateSlots:
         check_cells(cells)
         found = rows_of(ways_from(cells, x, y, ROBOT_RADIUS), self._given_up)
 
-        costs = _costs(self._rows, found)
+        costs = np.empty((NUM_SLOTS, len(found)))
+        _weigh_pairs(self._rows, found, costs)
         slots, sources = linear_sum_assignment(costs)
-        self._rows[:], self._visits = _refill(costs, slots, sources, found, self._visits)
+        _refill(costs, slots, sources, found, self._rows, self._visits)
 
     def _count_visits(self, x: float, y: float, theta: float, teammates: FloatArray) -> None:
         """Count who is at a goal, and give up what is unknown around goals where patience has run out."""

@@ -15,11 +15,11 @@ OUTSIDE = 3  # beyond the 60 x 60 m: neither known nor worth exploring
 def known_bounds(cells: Any) -> tuple[int, int, int, int]:
     """Return first row, first column, height and width of the cells (300, 300) that are known; zeros if none is."""
     first_row, last_row = 0, GRID_SIZE - 1
-    while first_row <= last_row and not _any_known(cells[first_row]):
+    while first_row <= last_row and not any_above_zero(cells[first_row]):
         first_row += 1
     if first_row > last_row:
         return 0, 0, 0, 0
-    while not _any_known(cells[last_row]):
+    while not any_above_zero(cells[last_row]):
         last_row -= 1
     columns = np.zeros(GRID_SIZE, np.uint8)
     for row in range(first_row, last_row + 1):
@@ -34,12 +34,12 @@ def known_bounds(cells: Any) -> tuple[int, int, int, int]:
 
 
 @jit
-def _any_known(cells: Any) -> bool:
-    """Tell whether any of some cells (n,) is known."""
+def any_above_zero(numbers: Any) -> bool:
+    """Tell whether any of some small numbers (n,), >= 0, is above 0; for cells, whether any is known."""
     seen = np.uint8(0)
-    for i in range(len(cells)):
-        seen = np.uint8(seen | cells[i])
-    return bool(seen != UNKNOWN)
+    for i in range(len(numbers)):
+        seen = np.uint8(seen | numbers[i])
+    return bool(seen > 0)
 
 
 @jit
@@ -59,5 +59,7 @@ def known_box(cells: Any, row: int, col: int, height: int, width: int) -> Any:
     box = np.full((height + 2 * PAD, width + 2 * PAD), OUTSIDE, np.uint8)
     first, last = max(col - PAD, 0), min(col + width + PAD, GRID_SIZE)
     for grid_row in range(max(row - PAD, 0), min(row + height + PAD, GRID_SIZE)):
-        box[grid_row - row + PAD, first - col + PAD : last - col + PAD] = cells[grid_row, first:last]
+        here, there = box[grid_row - row + PAD, first - col + PAD :], cells[grid_row, first:last]
+        for i in range(len(there)):  # an assignment of slices would take ten times as long
+            here[i] = there[i]
     return box

@@ -7,6 +7,7 @@ import numpy as np
 
 from slam_backend._jit import jit
 from vslam_env.navigation._painting_kernels import CELL, FREE, GRID_SIZE, HALF_WIDTH, UNKNOWN
+from vslam_env.navigation._search_kernels.boxes import any_above_zero
 from vslam_env.navigation._search_kernels.ways import UNREACHED
 
 MIN_CELLS = 3  # a robot needs 0.4 m; what is smaller is a speck or the corner of a wall
@@ -140,6 +141,8 @@ def frontier_rows(box: Any, cost: Any, parent: Any, ignored: Any, row: int, col:
     visited = np.zeros((height, width), np.int32)
     num_tried = 0
     for r in range(1, height - 1):
+        if not any_above_zero(mark[r]):
+            continue
         for c in range(1, width - 1):
             if mark[r, c] != 1:
                 continue

@@ -76,44 +76,44 @@ def wavefront(weights: Any, row: int, col: int) -> tuple[Any, Any]:
     weight = weights.ravel()
     cost = np.empty(weight.size, np.int32)
     num_open = 0
-    for cell in range(weight.size):
+    for i in range(weight.size):
         # Closed cells are below all costs, so that one comparison passes over closed and settled cells alike.
-        cost[cell] = UNREACHED if weight[cell] > 0 else -1
-        num_open += weight[cell] > 0
+        cost[i] = UNREACHED if weight[i] > 0 else -1
+        num_open += weight[i] > 0
     parent = np.full(weight.size, -1, np.int32)
-    entries = np.empty(8 * num_open + 1, np.int32)  # a cost falls at most once per neighbour
-    following = np.empty(8 * num_open + 1, np.int32)
+    # Cells, and which entry follows each; a cost falls at most once per neighbour.
+    entries = np.empty((8 * num_open + 1, 2), np.int32)
     heads = np.full(NUM_BUCKETS, -1, np.int32)
 
     offsets = np.array([1, width, -1, -width, 1 + width, width - 1, -1 - width, 1 - width])  # four straight ones first
 
-    used, waiting, current = 0, 0, 0
+    used, taken, current = 0, 0, 0
     if row >= 0:
         cost[row * width + col] = 0
-        entries[0], following[0], heads[0] = row * width + col, -1, 0
-        used = waiting = 1
-    while waiting > 0:
-        bucket = current & (NUM_BUCKETS - 1)
+        entries[0, 0], entries[0, 1], heads[0] = row * width + col, -1, 0
+        used = 1
+    # Unsigned places need no look at whether they count from the end, which takes a quarter more time.
+    while taken < used:
+        bucket = np.uint32(current & (NUM_BUCKETS - 1))
         while heads[bucket] >= 0:
-            cell = entries[heads[bucket]]
-            heads[bucket] = following[heads[bucket]]
-            waiting -= 1
+            entry = np.uint32(heads[bucket])
+            cell, heads[bucket] = np.uint32(entries[entry, 0]), entries[entry, 1]
+            taken += 1
             if cost[cell] != current:
                 continue
+            here = np.int32(weight[cell])
             for k in range(8):
-                neighbour = cell + offsets[k]
+                neighbour = np.uint32(np.int64(cell) + offsets[k])
                 step = STRAIGHT if k < 4 else DIAGONAL
-                through = current + step * (np.int64(weight[cell]) + weight[neighbour])
-                if through >= cost[neighbour]:
-                    continue
-                cost[neighbour], parent[neighbour] = through, cell
-                target = through & (NUM_BUCKETS - 1)
-                entries[used], following[used], heads[target] = neighbour, heads[target], used
-                used += 1
-                waiting += 1
+                through = np.int32(current + step * (here + np.int32(weight[neighbour])))
+                if through < cost[neighbour]:
+                    cost[neighbour], parent[neighbour] = through, cell
+                    target, place = np.uint32(through & (NUM_BUCKETS - 1)), np.uint32(used)
+                    entries[place, 0], entries[place, 1], heads[target] = neighbour, heads[target], used
+                    used += 1
         current += 1
-    for cell in range(weight.size):
-        cost[cell] &= UNREACHED  # turns -1 into it, and leaves all costs as they are
+    for i in range(weight.size):
+        cost[i] &= UNREACHED  # turns -1 into it, and leaves all costs as they are
     return cost.reshape(weights.shape), parent.reshape(weights.shape)
 
 
