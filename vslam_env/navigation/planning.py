@@ -63,7 +63,8 @@ class DistanceMap:
 
 def _cell_in_box(corner: tuple[int, int], x: float, y: float) -> tuple[int, int]:
     """Return the row and column of a point [m] in a box whose first cell is the grid's `corner`."""
-    x, y = (min(max(value, -2.0 * HALF_WIDTH), 2.0 * HALF_WIDTH) for value in (x, y))  # far off is as good as outside
+    far = 2.0 * HALF_WIDTH  # as good as anywhere outside
+    x, y = min(max(x, -far), far), min(max(y, -far), far)
     return math.floor((y + HALF_WIDTH) / CELL) - corner[0], math.floor((x + HALF_WIDTH) / CELL) - corner[1]
 
 
