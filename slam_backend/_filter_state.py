@@ -9,26 +9,22 @@ import numpy as np
 from slam_backend._existence_step import ExistenceStep
 from slam_backend._filter_arrays import FilterArrays
 from slam_backend._frame_buffers import FrameBuffers
-from slam_backend._kernels import IDLE, MOVED, PLACED, add_share
+from slam_backend._journal import LONGEST, Entry, may_follow, write_down
+from slam_backend._kernels import add_share
 from slam_backend._kernels.layout import CAMERA, RECOVERY
 from slam_backend._mixtures import pose_mixtures
 from slam_backend._particle_maps import MAPS_KEPT, ParticleMaps
 from slam_backend._rejuvenated_maps import write_maps
 from slam_backend._rejuvenation_step import RejuvenationStep
 from slam_backend._turns import assumed
-from slam_backend.errors import FloatArray, IntArray, bad_argument, check_int, check_seed
+from slam_backend.errors import IntArray, bad_argument, check_int, check_seed
 from slam_backend.filter_options import FilterOptions
-from slam_backend.input_log import UNHEARD, StepInput
 from slam_backend.reports import PoseEstimates
-from slam_backend.run_log import LogRow, RobotLog
+from slam_backend.run_log import RobotLog
 from slam_backend.smoothing.rejuvenation import Particles
 
 POSES = ("_poses", "_starts", "_means", "_covariances")  # (K, 3 or 6, P), of each robot
 KEPT = (*POSES, "_frame", "_blind", "_log_weights", "_path_log_weights", "_weights")
-# A step's number, what was read, which rows of it the filter's robots are, the landmarks (n,) that it was taken for,
-# and where the robots (K, 3) were thought to be.
-Entry = tuple[int, StepInput, tuple[int, ...], IntArray, FloatArray]
-LONGEST_JOURNAL = 32
 OTHERS_KEPT = ("steps", "estimates", "maps", "logs", "options", "rng")
 
 
@@ -138,25 +134,16 @@ class FilterState(FilterArrays):
             self._write_down()
         return self._robot_logs
 
+    def _note(self, entry: Entry) -> None:
+        """Take down in the journal what a step came to."""
+        journal = self._journal
+        if journal and (len(journal) == LONGEST or not may_follow(journal[-1], entry)):
+            self._write_down()
+        journal.append(entry)
+
     def _write_down(self) -> None:
         """Enter into the logs, and tell the smoother, what the steps in the journal came to."""
-        smoother = self._rejuvenation
-        for robot, log in enumerate(self._robot_logs):
-            written: list[LogRow] = []
-            for step, inputs, rows, found, means in self._journal:
-                row = rows[robot]
-                act, begin, end, covered, named, count = inputs.turns[row] if row >= 0 else UNHEARD
-                if count <= 0 and act == IDLE:
-                    continue
-                move, exact = inputs.moves[row] if act == MOVED else None, inputs.exact[row] if act == PLACED else None
-                points, ids = inputs.sightings[begin:end, :3], found[begin:end]
-                spreads = inputs.sightings[begin:end, 3:] if covered and count else None
-                written.append((step, move, exact, points, ids, spreads))
-                if smoother is not None:
-                    smoother.note(robot, step, means[robot], exact is not None)
-                    if not named:
-                        smoother.note_refused(robot, step, ids, inputs.descriptors[begin:end])
-            log.extend(written)
+        write_down(self._journal, self._robot_logs, self._rejuvenation)
         self._journal.clear()
 
     # ------------------------------------------------------------------ snapshots

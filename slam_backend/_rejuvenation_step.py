@@ -62,15 +62,15 @@ class RejuvenationStep:
 
     # ------------------------------------------------------------------ in each step
 
-    def note(self, robot: int, step: int, pose: FloatArray, exact: bool) -> None:
-        """Remember where a robot that read something was thought to be (3,), or that it was told so."""
-        if exact:
+    def note(self, robot: int, poses: Mapping[int, FloatArray], is_placed: bool) -> None:
+        """Remember where a robot was thought to be (3,), by step in which it read something, or that it was told so."""
+        if is_placed:
             self._exact = True
             for guesses, refused in zip(self._guesses, self._refused, strict=True):
                 guesses.clear()
                 refused.clear()
         if not (self._exact or self._noiseless):
-            self._guesses[robot][step] = pose
+            self._guesses[robot].update(poses)
 
     def note_refused(self, robot: int, step: int, ids: IntArray, descriptors: NDArray[np.float32]) -> None:
         """Remember what was neither matched nor new of all that a robot measured without names: ids (n,), looks."""

@@ -31,7 +31,7 @@ def in_one_table(
     """Return what N robots read in one step.
 
     Args:
-        moves: (N, 3) odometry of those that moved; not to be written to any more.
+        moves: (N, 3) odometry of those that moved; the caller is not to write to it any more.
         moved: (N,) which they are.
         exact: By robot the pose that it was told.
         spans, masks, sightings, descriptors, names: As of `Seen`.
@@ -40,7 +40,7 @@ def in_one_table(
     silent: list[int] = []
     for robot, (begin, end, covered, named, count) in enumerate(spans):
         if robot in exact:
-            act = _kernels.PLACED
+            act, moves[robot] = _kernels.PLACED, exact[robot]
         elif moved[robot]:
             act = _kernels.MOVED
         else:
@@ -51,7 +51,7 @@ def in_one_table(
     table: IntArray = np.array(turns, dtype=np.int64)
     table.setflags(write=False)
     moves.setflags(write=False)
-    return StepInput(turns, table, moves, exact, masks, sightings, descriptors, names, frozenset(silent))
+    return StepInput(turns, table, moves, masks, sightings, descriptors, names, frozenset(silent))
 
 
 def seen_by_team(frames: TeamMeasurements) -> Seen:

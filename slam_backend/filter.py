@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from slam_backend._filter_state import LONGEST_JOURNAL
+from slam_backend._journal import Entry
 from slam_backend._kernels import IDLE, PLACED
 from slam_backend._kernels.layout import ASSOCIATED, NEW_SLOTS
 from slam_backend._rejuvenation_step import RejuvenationStep
@@ -177,9 +177,7 @@ class FastSlam(FilterKnowledge):
         threshold = self.options.resample_threshold * maps.num_particles * (1.0 + 1e-9)
         report = report_of(inputs, rows, told, summary, threshold)
         found = told[ASSOCIATED].copy()  # the report's is the caller's
-        self._journal.append((self._steps, inputs, rows, found, self._estimates.means))
-        if len(self._journal) == LONGEST_JOURNAL:
-            self._write_down()
+        self._note(Entry(self._steps, inputs, rows, found, self._estimates.means, report.num_rejected))
         self._steps += 1
         for slots in deserted:
             maps.release(slots)
@@ -251,7 +249,7 @@ class FastSlam(FilterKnowledge):
             act, begin, end, _, _, _ = inputs.turns[row] if row >= 0 else UNHEARD
             active, used = active + (act != IDLE), used + end - begin
             if act == PLACED:
-                place(self, robot, inputs.exact[row])
+                place(self, robot, inputs.moves[row])
         if used:
             maps.make_room(used, inputs.descriptors.shape[1])
         if (most := len(inputs.sightings)) > len(buffers.found):

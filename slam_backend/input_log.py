@@ -19,8 +19,8 @@ class StepInput(NamedTuple):
     Attributes:
         turns: Of each robot.
         table: (N, 6) int64. The same.
-        moves: (N, 3) odometry [m, m, rad] of those that moved.
-        exact: By robot the pose (3,) [m, m, rad], own start frame, that it was told.
+        moves: (N, 3) [m, m, rad] odometry of those that moved, poses in their own start frames of those that were told
+            theirs.
         masks: By robot which of its measurements are used (n_i,) bool; only of robots that the caller gave some named
             -1, which are not.
         sightings: (n, 9) [m, m^2] all robots' measurements, one robot's after the other's, in robot axes: points (3)
@@ -34,7 +34,6 @@ class StepInput(NamedTuple):
     turns: Sequence[Turn]
     table: IntArray
     moves: FloatArray
-    exact: Mapping[int, FloatArray]
     masks: Mapping[int, BoolArray]
     sightings: FloatArray
     descriptors: Float32Array

@@ -1,12 +1,14 @@
 """`RobotLog`: all that one robot did and measured in a run, kept compactly for a smoother."""
 
 from bisect import bisect_left
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from slam_backend import _kernels
+from slam_backend._kernels.layout import END, GIVEN
 from slam_backend.errors import FloatArray, IntArray, bad_argument, check_array, check_choice, check_int
 from slam_backend.log_arrays import EXACT, ODOMETRY, REJECTED, STOOD, LogArrays, LogStep, join
 
@@ -15,9 +17,6 @@ MEASUREMENTS = 2048  # and so many measurements, unless one frame alone has more
 NO_MOTION = np.zeros(3)
 NO_POINTS = np.empty((0, 3))
 NO_IDS = np.empty(0, dtype=np.int64)
-
-# A step's number, odometry, exact pose, points, ids and covariances, as `RobotLog.append` takes them.
-LogRow = tuple[int, FloatArray | None, FloatArray | None, FloatArray, IntArray, FloatArray | None]
 
 
 class RobotLog:
@@ -104,7 +103,8 @@ class RobotLog:
             self._points, self._ids = np.empty((n, 3)), np.empty(n, dtype=np.int64)
         end = start + n
         self._steps[t] = step
-        self._kinds[t], self._motions[t] = _motion(odometry, pose)
+        self._kinds[t] = STOOD if motion is None else ODOMETRY if pose is None else EXACT
+        self._motions[t] = NO_MOTION if motion is None else motion
         self._given[t] = covariances is not None
         self._starts[t + 1] = end
         if n:
@@ -116,28 +116,40 @@ class RobotLog:
                 self._room_for_descriptor_rows()[start:end] = REJECTED if descriptor_rows is None else descriptor_rows
         self._num_rows, self._num_measurements, self._last = t + 1, end, step
 
-    def extend(self, rows: Sequence[LogRow]) -> None:
-        """Do what `append` does for each of some steps, faster where they are as usual: without covariances.
+    def extend(
+        self, row: int, steps: IntArray, table: IntArray, moves: FloatArray, sightings: FloatArray, ids: IntArray
+    ) -> None:
+        """Add the steps in which one of N robots did or measured anything, as `append` does one by one.
+
+        Args:
+            row: Which robot.
+            steps: (T,) their indices in the run.
+            table, moves: (T N, 6), (T N, 3). Of all steps one after the other, as in `StepInput`.
+            sightings, ids: (n, 9), (n,). Likewise, and the landmarks, -1 = rejected.
 
         Raises:
-            ValueError: If steps go back or shapes disagree; the log then holds no more than the steps before.
+            ValueError: If steps go back; the log then holds no more than the steps before.
         """
-        steps = [row[0] for row in rows]
-        counts = [len(row[4]) for row in rows]
-        t, last = self._num_rows, self._num_rows + len(rows)
-        start, end = self._num_measurements, self._num_measurements + sum(counts)
-        is_usual = self._covariances is None and self._descriptor_rows is None and all(row[5] is None for row in rows)
-        if not rows or not is_usual or last > ROWS or end > MEASUREMENTS or steps != sorted({self._last, *steps})[1:]:
-            for row in rows:
-                self.append(*row)
+        turns = table.reshape(len(steps), -1, 6)[:, row]
+        t, n = self._num_rows, self._num_measurements
+        is_plain = self._covariances is None and self._descriptor_rows is None and not turns[:, GIVEN].any()
+        if is_plain and t + len(steps) <= ROWS and n + len(ids) <= MEASUREMENTS and steps[0] > self._last:
+            self._num_rows, self._num_measurements = _kernels.write_rows(
+                row, steps, table, moves, sightings, ids, t, n,
+                self._steps, self._kinds, self._motions, self._given, self._starts, self._points, self._ids,
+            )  # fmt: skip
+            if self._num_rows > t:
+                self._last = int(self._steps[self._num_rows - 1])
             return
-        kinds, motions = zip(*[_motion(row[1], row[2]) for row in rows], strict=True)
-        np.concatenate(motions, out=self._motions[t:last].reshape(-1))
-        np.concatenate([row[3] for row in rows], out=self._points[start:end])
-        np.concatenate([row[4] for row in rows], out=self._ids[start:end])
-        self._steps[t:last], self._kinds[t:last], self._given[t:last] = steps, kinds, False
-        self._starts[t + 1 : last + 1] = np.cumsum(counts) + start
-        self._num_rows, self._num_measurements, self._last = last, end, steps[-1]
+        bases = np.cumsum([0, *table.reshape(len(steps), -1, 6)[:-1, -1, END]])
+        motions = moves.reshape(len(steps), -1, 3)[:, row]
+        for k, (act, begin, end, given, _, count) in enumerate(turns.tolist()):
+            if act != _kernels.IDLE or count > 0:
+                own = slice(bases[k] + begin, bases[k] + end)
+                move = motions[k] if act in (_kernels.MOVED, _kernels.PLACED) else None
+                spreads = sightings[own, 3:] if given and count else None
+                pose = motions[k] if act == _kernels.PLACED else None
+                self.append(int(steps[k]), move, pose, sightings[own, :3], ids[own], spreads)
 
     def _refusal(
         self, step: int, odometry: Any, pose: Any, points: Any, ids: Any, covariances: Any, descriptor_rows: Any
@@ -313,13 +325,6 @@ class RobotLog:
             self._room_for_descriptor_rows()[:n] = last.descriptor_rows
         newest = last if t else self._chunks[-1] if self._chunks else None
         self._last = -1 if newest is None else int(newest.steps[-1])
-
-
-def _motion(odometry: FloatArray | None, pose: FloatArray | None) -> tuple[int, FloatArray]:
-    """Return the kind of a step, and its motion or exact pose (3,)."""
-    if pose is not None:
-        return EXACT, pose
-    return (STOOD, NO_MOTION) if odometry is None else (ODOMETRY, odometry)
 
 
 def _restored(state: Mapping[str, Any]) -> RobotLog:

@@ -10,6 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from same_bits import assert_same
 
+from slam_backend._kernels import IDLE, MOVED, PLACED
+from slam_backend._kernels import STOOD as STOOD_STILL
 from slam_backend.log_arrays import EXACT, ODOMETRY, STOOD
 from slam_backend.run_log import MEASUREMENTS, ROWS, RobotLog
 
@@ -200,21 +202,36 @@ def test_a_frame_larger_than_a_chunk(before: int) -> None:
 
 
 @pytest.mark.parametrize(("most", "optional", "together"), [(5, 0.0, 32), (90, 0.0, 7), (300, 0.0, 32), (5, 0.1, 3)])
-def test_steps_together_are_as_one_by_one(most: int, optional: float, together: int) -> None:
-    """A log that was extended by some steps at a time holds what one holds to which they were appended."""
-    steps = random_steps(2 * ROWS + 9, 6, most, optional)
-    for step in steps:
-        step.pop("descriptor_rows", None)
-    names = ("step", "odometry", "pose", "points", "ids", "covariances")
-    rows: list[Any] = [tuple(step.get(name) for name in names) for step in steps]
-    log = RobotLog()
-    for first in range(0, len(rows), together):
-        log.extend(rows[first : first + together])
-    log.extend([])
-    assert_same(log.get_state(), log_of(steps).get_state())
+def test_steps_of_a_table_are_as_one_by_one(most: int, optional: float, together: int) -> None:
+    """A log that is told of many robots' steps, some at a time, holds those of its own, as if they were appended."""
+    count, row, rng = 3, 1, np.random.default_rng(6)
+    log, expected = RobotLog(), RobotLog()
+    for first in range(0, 2 * ROWS, together):
+        steps, turns, moves, sightings = np.arange(first, first + together), [], [], [np.empty((0, 9))]
+        ids = rng.integers(-1, 9, most * count * together)
+        last = 0
+        for step in steps.tolist():
+            end = 0
+            for robot in range(count):
+                n, act = int(rng.integers(0, most)) * int(rng.random() < 0.8), int(rng.choice([IDLE, MOVED, PLACED]))
+                begin, end, covered = end, end + n, rng.random() < optional
+                act = STOOD_STILL if n and act == IDLE else act
+                turns.append((act, begin, end, covered, False, n))
+                moves.append(rng.normal(size=3) * (act in (MOVED, PLACED)))
+                sightings.append(rng.normal(size=(n, 9)))
+                own = slice(last, last + n)
+                last += n
+                if robot == row and act != IDLE:
+                    motion, seen = moves[-1] if act in (MOVED, PLACED) else None, sightings[-1]
+                    pose, spreads = motion if act == PLACED else None, seen[:, 3:] if covered and n else None
+                    expected.append(step, motion, pose, seen[:, :3], ids[own], spreads)
+        table = np.array(turns, dtype=np.int64)
+        log.extend(row, steps, table, np.array(moves), np.concatenate(sightings), ids[:last])
+    assert len(log) > 1.5 * ROWS
+    assert_same(log.get_state(), expected.get_state())
     with pytest.raises(ValueError, match="Log steps in order"):
-        log.extend([rows[-1], rows[-2]])
-    assert_same(log.get_state(), log_of(steps).get_state())
+        log.extend(row, steps, table, np.array(moves), np.concatenate(sightings), ids[:last])
+    assert_same(log.get_state(), expected.get_state())
 
 
 def test_memory_of_a_long_run() -> None:
