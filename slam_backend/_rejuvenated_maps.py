@@ -8,6 +8,7 @@ from slam_backend._particle_maps import ParticleMaps
 from slam_backend.errors import FloatArray
 from slam_backend.smoothing.rejuvenation import Particles
 
+NONE = -1  # no landmark is called so
 XX, YY, ZZ = 3, 6, 8  # the diagonal of a landmark's covariance, in the rows of a tile
 
 
@@ -26,9 +27,8 @@ def write_maps(maps: ParticleMaps, best: int, particles: Particles, walk: float)
     """
     slots = slots_held(maps, best, 1)
     order = np.argsort(particles.ids)
-    ids = particles.ids[order]
-    at = np.minimum(ids.searchsorted(maps.ids[slots]), len(ids) - 1)
-    supported = ids[at] == maps.ids[slots]
+    at = particles.ids.searchsorted(maps.ids[slots], sorter=order)
+    supported = np.append(particles.ids[order], NONE)[at] == maps.ids[slots]
     slots, rows = slots[supported], order[at[supported]]
     m = maps.num_particles
     odds = maps.dense_odds(slots)

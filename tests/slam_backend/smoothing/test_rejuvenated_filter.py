@@ -1,5 +1,7 @@
 """`FastSlam(rejuvenate_every=...)`: what the smoother gives the filter, and that nothing is lost on the way."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from same_bits import assert_same
@@ -112,6 +114,24 @@ def test_all_particles_then_hold_the_same_landmarks_and_names_stay():
     np.testing.assert_array_equal(counts, np.repeat(seen[slam._maps.identities[slots]][:, None], 30, axis=1))
     full = covariances.transpose(0, 2, 1)[..., [[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
     assert np.linalg.eigvalsh(full).min() > 0.0
+
+
+@pytest.mark.parametrize("left", [0, 2])
+def test_landmarks_that_no_sighting_supports_are_given_up(left, monkeypatch):
+    """Of those that the filter held only those stay that the new particles have, be it none."""
+    run = small_run(2)
+    slam, kept = rejuvenated(run), []
+
+    def renew(new):
+        kept.append(new.ids[:left])
+        renew_all(replace(new, ids=new.ids[:left], tiles=new.tiles[:left], counts=new.counts[:left]))
+
+    renew_all = slam._renew
+    monkeypatch.setattr(slam, "_renew", renew)
+    readings = list(run.readings())
+    for reading in readings[:EVERY]:
+        slam.step(**reading)
+    np.testing.assert_array_equal(slam.map().ids, np.sort(kept[0]))
 
 
 def test_a_snapshot_goes_on_bit_for_bit():
