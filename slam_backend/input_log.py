@@ -40,6 +40,18 @@ class StepInput(NamedTuple):
     names: IntArray
     silent: frozenset[int]
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Let copies and what was pickled be read-only, too: else kernels would be compiled anew for it."""
+        return _restored, tuple(self)
+
+
+def _restored(*columns: Any) -> StepInput:
+    """Return a copy of an input of which these are the attributes."""
+    inputs = StepInput(*columns)
+    for array in (inputs.table, inputs.moves, inputs.sightings, inputs.descriptors):
+        array.setflags(write=False)
+    return inputs
+
 
 @lru_cache(maxsize=256)
 def rows_of(robots: tuple[int, ...], given: tuple[int, ...]) -> tuple[int, ...]:

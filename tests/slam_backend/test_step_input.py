@@ -1,5 +1,8 @@
 """What all robots read in a step is one table: each finds there what it read, whoever else read anything."""
 
+import copy
+import pickle
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -72,6 +75,18 @@ def test_each_robot_finds_what_it_read(seeds: list[int]) -> None:
         if named:
             np.testing.assert_array_equal(inputs.names[begin:end], names[used])
     assert last == len(inputs.sightings) == len(inputs.descriptors)
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda inputs: pickle.loads(pickle.dumps(inputs))])
+@pytest.mark.parametrize("readings", [[NO_READING], [reading(0), reading(3), NO_READING, reading(8)]])
+def test_copies_are_as_kernels_take_them(readings: list[Reading], copied: Callable[[StepInput], StepInput]) -> None:
+    """A copy holds the same, and can be written to no more than the original: kernels are compiled for that."""
+    inputs = checked(readings)
+    twin = copied(inputs)
+    assert_same(tuple(twin), tuple(inputs))
+    for name in ("table", "moves", "sightings", "descriptors", "names"):
+        assert getattr(twin, name).flags.writeable == getattr(inputs, name).flags.writeable, name
+    assert not inputs.sightings.flags.writeable
 
 
 @given(counts=st.lists(st.integers(0, 4), min_size=1, max_size=4), spoilt=st.booleans(), seed=st.integers(0, 99))
