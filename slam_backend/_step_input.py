@@ -37,6 +37,7 @@ def check_step(
     exact = {} if poses is None else _check_poses(poses, k)
     limit = min(FARTHEST_POINT, FLATTEST * camera.baseline * camera.sigma_px / camera.sigma_disparity_px)
     if isinstance(measurements, TeamMeasurements):
+        _check_ends(measurements)
         if identities is None and len(measurements.ends) == k and _are_usual(measurements, size, limit):
             return in_one_table(moves, moved, exact, *seen_by_team(measurements))
         measurements = measurements.of_each()
@@ -110,6 +111,15 @@ def _check_names(robot: int, names: Any, count: int) -> IntArray:
     return checked
 
 
+def _check_ends(frames: TeamMeasurements) -> None:
+    """Raise unless a team's frames end one after the other, the last of them with the last point: kernels trust it."""
+    ends, count = list(frames.ends), len(frames.points)
+    if not ends or ends[0] < 0 or ends[-1] != count or len(frames.descriptors) != count or ends != sorted(ends):
+        got = f"ends {ends} of {count} points and {len(frames.descriptors)} descriptors"
+        cure = "Say per robot where its points end."
+        raise bad_argument("measurements", "a descriptor per point, and rising ends up to the last one", got, cure)
+
+
 def _are_usual(frames: TeamMeasurements, size: int, limit: float) -> bool:
     """Tell whether all frames pass `_check_frame`, which takes the same, at a glance; else it has to say which."""
     nearest, farthest = frames.extent
@@ -142,7 +152,7 @@ def _check_frame(robot: int, frame: Any, size: int, limit: float) -> int:
             )
         size = own_size
     nearest, farthest = frame.extent
-    if nearest < _kernels.MIN_DEPTH or farthest > limit:
+    if not (nearest >= _kernels.MIN_DEPTH and farthest <= limit):
         _check_points(robot, frame, limit)
     return size
 
@@ -151,7 +161,7 @@ def _check_points(robot: int, frame: Measurements, limit: float) -> None:
     """Raise unless all points are so near that their covariances can be used, and ahead where they have none yet."""
     nearest, farthest = _kernels.extent(frame.points)  # of this frame alone; its `extent` may be that of several
     limit = limit if frame.covariances is None else FARTHEST_POINT
-    if farthest > limit:
+    if not farthest <= limit:
         cure = "Check the units, metres, and drop points without disparity."
         raise bad_argument(f"measurements[{robot}].points", f"numbers within +-{limit:g}", farthest, cure)
     if frame.covariances is None and nearest < _kernels.MIN_DEPTH:

@@ -1,5 +1,7 @@
 """Which landmarks may have caused a measurement, by their descriptors or names, for all particles at once."""
 
+import math
+
 import numpy as np
 
 from slam_backend._jit import any_order, jit, lanes
@@ -11,11 +13,16 @@ RUN = 64  # descriptors looked at together
 
 @jit
 def extent(points: FloatArray) -> tuple[float, float]:
-    """Return the smallest depth Z and the largest coordinate, by magnitude, of points (n, 3), camera frame."""
+    """Return the smallest depth Z and the largest coordinate, by magnitude, of points (n, 3), camera frame.
+
+    Both are NaN if any number is.
+    """
     nearest, farthest = np.inf, 0.0
     for n in range(len(points)):
         nearest = min(nearest, points[n, 2])
         for c in range(3):
+            if math.isnan(points[n, c]):
+                return np.nan, np.nan
             farthest = max(farthest, abs(points[n, c]))
     return nearest, farthest
 

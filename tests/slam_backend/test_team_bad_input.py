@@ -44,11 +44,13 @@ def test_a_team_that_cannot_be_built_says_why(arguments: dict[str, Any], message
         TeamSlam(**({"num_robots": 3} | arguments))
 
 
-ONE_BEHIND = TeamMeasurements.trusted(
-    np.concatenate([GOOD.points, GOOD.points, -GOOD.points]),
-    np.tile(GOOD.descriptors, (3, 1)),
-    [len(GOOD), 2 * len(GOOD), 3 * len(GOOD)],
-).of_each()
+def in_one_piece(points: list[np.ndarray], ends: list[int], descriptors: int = 3) -> TeamMeasurements:
+    """A team's frames, unchecked."""
+    return TeamMeasurements.trusted(np.concatenate(points), np.tile(GOOD.descriptors, (descriptors, 1)), ends)
+
+
+ONE_BEHIND = in_one_piece([GOOD.points, GOOD.points, -GOOD.points], [1, 2, 3]).of_each()
+NO_NUMBER = in_one_piece([GOOD.points, GOOD.points, GOOD.points * np.nan], [1, 2, 3])
 ASYMMETRIC = np.array([[True, True, False], [False, True, False], [False, False, True]])
 BAD_STEPS: list[tuple[dict[str, Any], str]] = [
     ({"odometry": STILL[:2]}, r"odometry: expected a sequence with one entry per robot \(3\), got .*2"),
@@ -71,6 +73,12 @@ BAD_STEPS: list[tuple[dict[str, Any], str]] = [
         r"measurements\[2\]\.points: expected depths Z >= .* m, got -2\.0\. Drop points at or behind the camera",
     ),
     ({"measurements": ONE_BEHIND}, r"measurements\[2\]\.points: expected depths Z >= .* m, got -2\.0\. Drop points at"),
+    ({"measurements": NO_NUMBER}, r"measurements\[2\]\.points: expected numbers within .*, got nan"),
+    ({"measurements": NO_NUMBER.of_each()}, r"measurements\[2\]\.points: expected numbers within .*, got nan"),
+    *(
+        ({"measurements": in_one_piece([GOOD.points] * 3, ends, count)}, r"measurements: expected a descriptor per po")
+        for ends, count in (([1, 2, 9], 3), ([1, 2, 2], 3), ([2, 1, 3], 3), ([-1, 2, 3], 3), ([1, 2, 3], 2), ([], 3))
+    ),
     ({"identities": [[1], [1]]}, r"identities: expected a sequence with one entry per robot \(3\)"),
     ({"identities": [[1], [1], [1, 2]]}, r"identities\[2\]: expected an array of shape"),
     ({"poses": [None, None, [0.0, np.inf, 0.0]]}, r"poses\[2\]: expected finite numbers, got NaN or infinity at"),
