@@ -183,7 +183,7 @@ class Episode:
             odometry,
             frames.measurements,
             scans,
-            self._simulator.bumped,
+            self._simulator.bumped.copy(),
             between(self.true_starts, poses) if config.oracle_pose else None,
             frames.true_ids if config.oracle_association else None,
             heard,

@@ -22,7 +22,8 @@ def _handed_out(env: ExplorationEnv, results: Any) -> list[Any]:
     beliefs = [env.belief(agent) for agent in agents]
     rows = [{f.name: getattr(b, f.name) for f in dataclasses.fields(b) if f.name != "grid"} for b in beliefs]
     truth = [env.true_poses, env.true_start_poses, env.true_landmarks, env.state(), env.episode.true_path[-1]]
-    return [results, rows, [belief.map for belief in beliefs], truth, env.readings, env.events, env._standing]
+    episode = [env.episode.readings, env.episode.frames, env.episode.true_poses]
+    return [results, rows, [belief.map for belief in beliefs], truth, episode, env.readings, env.events, env._standing]
 
 
 def _arrays(nest: Any) -> Iterator[np.ndarray]:
