@@ -90,6 +90,10 @@ class TeamMeasurements(NamedTuple):
         descriptors.setflags(write=False)
         return cls(points, descriptors, ends, _kernels.extent(points))
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Let copies and what was pickled be read-only, too."""
+        return TeamMeasurements.trusted, (self.points, self.descriptors, self.ends)
+
     def of_each(self) -> list[Measurements]:
         """Return the frame of each robot. They share memory with this, and its extent: what bounds all bounds each."""
         begins = [0, *self.ends[:-1]]

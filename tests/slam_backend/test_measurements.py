@@ -25,14 +25,14 @@ def test_frames_share_no_memory_and_cannot_be_written() -> None:
 
 
 def test_copies_cannot_be_written_either() -> None:
-    """Be they deep or from a file, of one frame or of one built with others: what was found of them stays so."""
+    """Be they deep or from a file, of a frame, of a team's or of a part of these: what was found of them stays so."""
     frame = Measurements(POINTS, LOOKS, np.tile(np.eye(3), (2, 1, 1)))
-    _, part = TeamMeasurements.trusted(np.array(POINTS), LOOKS.copy(), [1, 2]).of_each()
-    for one in (frame, part):
+    team = TeamMeasurements.trusted(np.array(POINTS), LOOKS.copy(), [1, 2])
+    for one in (frame, team, team.of_each()[1]):
         for other in (copy.copy(one), copy.deepcopy(one), pickle.loads(pickle.dumps(one))):
             assert other.extent == one.extent
             for name in ("points", "descriptors", "covariances"):
-                array, own = getattr(one, name), getattr(other, name)
+                array, own = getattr(one, name, None), getattr(other, name, None)
                 np.testing.assert_array_equal(own, array)
                 assert own is None or not own.flags.writeable
 
