@@ -113,6 +113,9 @@ class TeamBelief:
         if readings.scans.shape != self._scanned:
             got, cure = f"shape {readings.scans.shape}", "Give a range for each ray of each robot."
             raise bad_argument("readings.scans", f"an array of shape {self._scanned}", got, cure)
+        if len(readings.bumps) != len(self._robots):
+            got, cure = f"shape {readings.bumps.shape}", "Say of each robot whether it bumped into something."
+            raise bad_argument("readings.bumps", f"an array of shape ({len(self._robots)},)", got, cure)
         report = self._team.step(
             [None] * len(self._robots) if readings.odometry is None else readings.odometry,
             readings.measurements,

@@ -175,7 +175,7 @@ class SharedGrids:
         """
         self._draw(self._owners, self._robots, poses, scans, bumps)
         if self._kept:
-            self._strokes.append(Strokes(tick, self._owners, self._robots, poses.copy(), scans, bumps))
+            self._strokes.append(Strokes(tick, self._owners, self._robots, poses.copy(), scans.copy(), bumps.copy()))
 
     def _draw(self, owners: IntArray, robots: IntArray, poses: FloatArray, scans: FloatArray, bumps: BoolArray) -> None:
         """Paint readings into the grids, as `Strokes` has them."""

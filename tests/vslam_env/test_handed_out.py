@@ -12,6 +12,7 @@ from digests import digest
 from small_env import MEETING, small_env, turning, wander
 
 from vslam_env import ExplorationEnv
+from vslam_env.belief import TeamBelief
 
 STEPS = {"continuous": 130, "discrete": 130, "goal": 25}  # two robots meet, and their maps are merged
 
@@ -78,3 +79,23 @@ def test_who_writes_to_what_is_returned_changes_nothing(kind: dict[str, Any]) ->
                     array.fill(1)
         digests.append(said.hexdigest())
     assert digests[0] == digests[1]
+
+
+def test_a_belief_keeps_nothing_that_the_caller_may_write_to() -> None:
+    """Who reuses the arrays of a tick's readings changes nothing, though scans are kept for merges to be taken back."""
+    states = []
+    for writes in (False, True):
+        env, belief = small_env(max_cycles=200), None
+        for _ in _episode(env):
+            belief = belief or TeamBelief(env.config.belief, 2, env.episode.belief_seed, env.episode.body)
+            readings = copy.deepcopy(env.episode.readings)
+            belief.step(readings)
+            for array in _arrays(readings) if writes else ():
+                if array.flags.writeable:
+                    array.fill(1)
+        assert belief is not None
+        assert any(event.kind == "merge" for event in belief.events)
+        states.append(belief.get_state())
+    assert states[0]["grids"]["strokes"]
+    for one, other in zip(*map(_arrays, states), strict=True):
+        np.testing.assert_array_equal(one, other)

@@ -51,7 +51,7 @@ def test_observations_are_rebuilt_from_readings_alone(action_type: str, steps: i
                 assert value.tobytes() == expected[name].tobytes(), (tick, agent, name)
 
 
-def test_scans_of_another_length_are_refused_before_anything_changes() -> None:
+def test_scans_and_bumps_of_another_length_are_refused_before_anything_changes() -> None:
     """Beliefs that refused readings go on with right ones as if they had never been given the wrong ones."""
     env = small_env()
     readings, _ = _record(env, 3)
@@ -65,6 +65,8 @@ def test_scans_of_another_length_are_refused_before_anything_changes() -> None:
             refusing.step(now.of_each()[:1])
         with pytest.raises(ValueError, match=r"readings: expected those of each robot"):
             refusing.step([])
+        with pytest.raises(ValueError, match=r"readings.bumps: expected an array of shape \(2,\), got shape \(1,\)"):
+            refusing.step(now._replace(bumps=now.bumps[:1]))
         whole.step(now), refusing.step(now)
         np.testing.assert_array_equal(refusing.poses, whole.poses)
 
