@@ -15,7 +15,7 @@ from slam_backend._kernels.layout import CAMERA, RECOVERY
 from slam_backend._mixtures import pose_mixtures
 from slam_backend._particle_maps import MAPS_KEPT, ParticleMaps
 from slam_backend._rejuvenated_maps import write_maps
-from slam_backend._rejuvenation_step import RejuvenationStep
+from slam_backend._rejuvenation_step import SCHEDULE, RejuvenationStep
 from slam_backend._turns import assumed
 from slam_backend.errors import IntArray, bad_argument, check_int, check_seed
 from slam_backend.filter_options import FilterOptions
@@ -166,6 +166,9 @@ class FilterState(FilterArrays):
         """
         missing = [name for name in (*KEPT, *OTHERS_KEPT) if name not in state]
         missing = missing or [f"maps.{name}" for name in MAPS_KEPT if name not in state["maps"]]
+        if not missing and state["options"].rejuvenate_every is not None:
+            schedule = state.get("rejuvenation", {}).get("schedule", {})
+            missing = [f"rejuvenation.schedule.{name}" for name in SCHEDULE if name not in schedule]
         if missing:
             raise bad_argument("state", "a dict from FastSlam.get_state", f"no {missing[0]!r}", "Pass it unchanged.")
         shapes = [state[name].shape == getattr(self, name).shape for name in ("_poses", "_weights")]

@@ -303,8 +303,8 @@ class RejuvenationStep:
         if state["draft"] is not None:
             graph, damping, steps = state["draft"]
             self._draft = Draft(graph=PathGraph(**graph), damping=damping, steps=steps)
-        for name, value in state["schedule"].items():
-            setattr(self, name, value)
+        for name in SCHEDULE:
+            setattr(self, name, state["schedule"][name])
         self._guesses = [dict(guesses) for guesses in state["guesses"]]
         self._refused = [dict(refused) for refused in state["refused"]]
 

@@ -75,7 +75,7 @@ class Episode:
         )
 
         self.tick = 0
-        self._collisions = np.zeros(config.num_robots, np.int64)
+        self._keep_collisions(np.zeros(config.num_robots, np.int64))
         self._figures = np.zeros((NUM_FIGURES, config.num_robots))  # of `Standing`; ways are added up in their row
         self._found, self._distances = self._figures[FOUND], self._figures[DISTANCES]
         self.true_path: list[FloatArray] = []
@@ -113,7 +113,7 @@ class Episode:
         simulator, noise, stream = self._simulator, self._config.odometry, self._streams["odometry"]
         before = simulator.poses
         if simulator.step(commands):
-            self._collisions = self._collisions + simulator.bumped  # anew, for standings hold what was before
+            self._keep_collisions(self._collisions + simulator.bumped)
         self.tick += 1
         self._perceive(read_odometry(before, simulator.poses, self.setting.bias, noise, stream, self._distances))
 
@@ -167,11 +167,17 @@ class Episode:
         self.ledger.set_state(state["ledger"])
         self._coverage.set_state(state["coverage"])
         self.tick = state["tick"]
-        self._collisions, self._distances[:] = state["counts"]
+        collisions, self._distances[:] = state["counts"]
+        self._keep_collisions(collisions)
         self.readings, self._frames = state["last"]
         self.true_path, self.estimated_path, self.merge_ticks = (list(path) for path in state["paths"])
 
     # ------------------------------------------------------------------ within
+
+    def _keep_collisions(self, collisions: IntArray) -> None:
+        """Count on from these (K,), anew with each contact: standings hold what was before, read-only."""
+        collisions.setflags(write=False)
+        self._collisions = collisions
 
     def _perceive(self, odometry: FloatArray | None) -> None:
         """Read all other sensors at the true poses, and let the robots take it in."""

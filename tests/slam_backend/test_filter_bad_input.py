@@ -122,6 +122,15 @@ def test_unknown_estimates_and_states_are_refused() -> None:
         with pytest.raises(ValueError, match=rf"^state: expected a dict from .*, got no 'maps\.{name}'\."):
             slam.set_state(state | {"maps": maps})
     assert_same(slam.get_state(), state)
+    smoothed = FastSlam(1, 3, rejuvenate_every=10)
+    whole = smoothed.get_state()
+    schedule = whole["rejuvenation"]["schedule"]
+    for name in schedule:
+        others = {key: value for key, value in schedule.items() if key != name}
+        former = whole | {"rejuvenation": whole["rejuvenation"] | {"schedule": others}}
+        with pytest.raises(ValueError, match=rf"^state: .*, got no 'rejuvenation\.schedule\.{name}'\."):
+            smoothed.set_state(former)
+    assert_same(smoothed.get_state(), whole)
 
 
 def test_nothing_to_do_is_no_error() -> None:
