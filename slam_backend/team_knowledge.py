@@ -166,7 +166,7 @@ class TeamKnowledge(TeamState):
         branches, least = self.lineup.branches, max(min_count, 1)
         room = 0
         for branch in branches:
-            room += branch.filter._maps.table.shape[1]
+            room += branch.filter.map_room
         if into is None or len(into.rows.ids) < room:
             into = TeamOutlines.unwritten(self._num_robots, room)
         (rows, parts), last = into, 0
