@@ -71,22 +71,21 @@ def observed(view: View, scans: FloatArray, goal_actions: bool) -> list[Observat
         view.robots, points.poses, points.sigmas, points.own, points.covariances, points.ess,
         rows.variances, rows.counts, parts, scans, numbers, ranges, candidates, teammates, present,
     )  # fmt: skip
+    grids = local_grids(view)
     observations: list[Observation] = []
-    for row, picture, ahead, slots, mates, mask in zip(
-        numbers, local_grids(view), ranges, candidates, teammates, present, strict=True
-    ):
+    for i in range(count):  # by index: an array that is looped through ends with an error, and that costs microseconds
         observation: Observation = {
-            "pose": row[:3],
-            "pose_std": row[3:6],
-            "map_stats": row[6:],
-            "local_grid": picture,
-            "scan": ahead,
-            "candidates": slots,
-            "teammates": mates,
-            "teammates_mask": mask,
+            "pose": numbers[i, :3],
+            "pose_std": numbers[i, 3:6],
+            "map_stats": numbers[i, 6:],
+            "local_grid": grids[i],
+            "scan": ranges[i],
+            "candidates": candidates[i],
+            "teammates": teammates[i],
+            "teammates_mask": present[i],
         }
         if goal_actions:
-            observation["action_mask"] = action_mask(slots)
+            observation["action_mask"] = action_mask(candidates[i])
         observations.append(observation)
     return observations
 
