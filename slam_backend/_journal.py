@@ -5,7 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from slam_backend._kernels import IDLE, PLACED
+from slam_backend._kernels import PLACED
+from slam_backend._kernels.layout import ACT, COUNT
 from slam_backend._rejuvenation_step import RejuvenationStep
 from slam_backend.errors import FloatArray, IntArray
 from slam_backend.input_log import StepInput
@@ -47,27 +48,27 @@ def write_down(entries: Sequence[Entry], logs: Sequence[RobotLog], smoother: Rej
         logs: Of the robots; a step in which one did nothing and was given no measurement gets no row.
         smoother: Of the filter, if it has one.
     """
-    steps = np.array([entry.step for entry in entries])
-    table = np.concatenate([entry.inputs.table for entry in entries])
-    moves = np.concatenate([entry.inputs.moves for entry in entries])
-    sightings = np.concatenate([entry.inputs.sightings for entry in entries])
-    found = np.concatenate([entry.found for entry in entries])
-    for robot, (row, log) in enumerate(zip(entries[0].rows, logs, strict=True)):
+    numbers, inputs, rows, found_then, means_then, _ = zip(*entries, strict=True)
+    steps = np.array(numbers)
+    table = np.concatenate([read.table for read in inputs])
+    moves = np.concatenate([read.moves for read in inputs])
+    sightings = np.concatenate([read.sightings for read in inputs])
+    found, means = np.concatenate(found_then), np.concatenate(means_then).reshape(len(steps), -1, 3)
+    turns = table.reshape(len(steps), -1, 6)
+    for robot, (row, log) in enumerate(zip(rows[0], logs, strict=True)):
         if row >= 0:
             log.extend(row, steps, table, moves, sightings, found)
             if smoother is not None:
-                _tell(smoother, robot, row, entries)
+                acts = turns[:, row, ACT]
+                heard = np.flatnonzero(acts | (turns[:, row, COUNT] > 0))
+                smoother.note(robot, steps[heard], means[heard, robot], bool((acts == PLACED).any()))
+                _tell_refused(smoother, robot, row, entries)
 
 
-def _tell(smoother: RejuvenationStep, robot: int, row: int, entries: Sequence[Entry]) -> None:
-    """Tell the smoother where a robot that read something was thought to be, and what of it was refused."""
-    poses: dict[int, FloatArray] = {}
-    is_placed = False
-    for step, inputs, _, found, means, num_rejected in entries:
-        act, begin, end, _, named, count = inputs.turns[row]
-        if act != IDLE or count > 0:
-            poses[step] = means[robot]
-            is_placed |= act == PLACED
-            if num_rejected and not named:
-                smoother.note_refused(robot, step, found[begin:end], inputs.descriptors[begin:end])
-    smoother.note(robot, poses, is_placed)
+def _tell_refused(smoother: RejuvenationStep, robot: int, row: int, entries: Sequence[Entry]) -> None:
+    """Tell the smoother what of a robot's measurements was neither matched nor new."""
+    for entry in entries:
+        if entry.num_rejected:
+            _, begin, end, _, named, _ = entry.inputs.turns[row]
+            if not named:
+                smoother.note_refused(robot, entry.step, entry.found[begin:end], entry.inputs.descriptors[begin:end])

@@ -18,6 +18,7 @@ from slam_backend.log_arrays import LogArrays
 from slam_backend.run_log import RobotLog
 from slam_backend.smoothing.extending import first_rows
 from slam_backend.smoothing.graph import PathGraph
+from slam_backend.smoothing.guesses import Guesses
 from slam_backend.smoothing.reassociation import Refused, taken_up
 from slam_backend.smoothing.rejuvenation import Rejuvenation, rejuvenate
 from slam_backend.smoothing.slices import Draft, Smoother
@@ -57,20 +58,20 @@ class RejuvenationStep:
         self._failures = 0  # descents in a row
         self._exact = False  # a pose was given as exact: there never will be
         self._last_closing = 0  # step in which landmarks not seen for long were matched
-        self._guesses: list[dict[int, FloatArray]] = [{} for _ in range(num_robots)]
+        self._guesses = [Guesses.none() for _ in range(num_robots)]
         self._refused: list[dict[int, Refused]] = [{} for _ in range(num_robots)]
 
     # ------------------------------------------------------------------ in each step
 
-    def note(self, robot: int, poses: Mapping[int, FloatArray], is_placed: bool) -> None:
-        """Remember where a robot was thought to be (3,), by step in which it read something, or that it was told so."""
+    def note(self, robot: int, steps: IntArray, poses: FloatArray, is_placed: bool) -> None:
+        """Remember where a robot was thought to be (n, 3) after steps (n,) in which it read something, or was told."""
         if is_placed:
             self._exact = True
-            for guesses, refused in zip(self._guesses, self._refused, strict=True):
-                guesses.clear()
+            self._guesses = [Guesses.none() for _ in self._guesses]
+            for refused in self._refused:
                 refused.clear()
         if not (self._exact or self._noiseless):
-            self._guesses[robot].update(poses)
+            self._guesses[robot] = self._guesses[robot].with_later(steps, poses)
 
     def note_refused(self, robot: int, step: int, ids: IntArray, descriptors: NDArray[np.float32]) -> None:
         """Remember what was neither matched nor new of all that a robot measured without names: ids (n,), looks."""
@@ -213,8 +214,7 @@ class RejuvenationStep:
         options = self._options.smoothing
         self._graph, motion = joint_graph(own, other, starts, frames, renamed, camera, options)
         self._draft = None if options.slice_steps is None else Draft(graph=self._graph)
-        moved = [{step: compose(motion, guess) for step, guess in guesses.items()} for guesses in b._guesses]
-        self._guesses = [dict(guesses) for guesses in a._guesses] + moved
+        self._guesses = a._guesses + [Guesses(steps, compose(motion, poses)) for steps, poses in b._guesses]
         self._refused = [dict(refused) for refused in (*a._refused, *b._refused)]
         self._read, self._exact = a._read + b._read, a._exact or b._exact
         self._waited = self._every
@@ -266,10 +266,10 @@ class RejuvenationStep:
     def _keep(self, graph: PathGraph) -> None:
         """Go on from a graph at its mode."""
         self._graph, self._failures = graph, 0
-        for guesses, refused, latest in zip(self._guesses, self._refused, graph.latest.tolist(), strict=True):
-            for step in [step for step in guesses if step <= latest]:
-                del guesses[step]
-                refused.pop(step, None)
+        for robot, latest in enumerate(graph.latest.tolist()):
+            self._guesses[robot] = self._guesses[robot].after(latest)
+            for step in [step for step in self._refused[robot] if step <= latest]:
+                del self._refused[robot][step]
 
     def _rest(self) -> None:
         """Wait anew."""
@@ -292,7 +292,7 @@ class RejuvenationStep:
             "graph": None if self._graph is None else self._graph.to_mapping(),
             "draft": None if draft is None else (draft.graph.to_mapping(), draft.damping, draft.steps),
             "schedule": {name: getattr(self, name) for name in SCHEDULE},
-            "guesses": tuple(dict(guesses) for guesses in self._guesses),
+            "guesses": tuple((steps.copy(), poses.copy()) for steps, poses in self._guesses),
             "refused": tuple(dict(refused) for refused in self._refused),
         }
 
@@ -305,7 +305,7 @@ class RejuvenationStep:
             self._draft = Draft(graph=PathGraph(**graph), damping=damping, steps=steps)
         for name in SCHEDULE:
             setattr(self, name, state["schedule"][name])
-        self._guesses = [dict(guesses) for guesses in state["guesses"]]
+        self._guesses = [Guesses(*guesses) for guesses in state["guesses"]]
         self._refused = [dict(refused) for refused in state["refused"]]
 
 

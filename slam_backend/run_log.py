@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from slam_backend import _kernels
-from slam_backend._kernels.layout import END, GIVEN
+from slam_backend._kernels.layout import END
+from slam_backend._log_kernels import write_rows
 from slam_backend.errors import FloatArray, IntArray, bad_argument, check_array, check_choice, check_int
 from slam_backend.log_arrays import EXACT, ODOMETRY, REJECTED, STOOD, LogArrays, LogStep, join
 
@@ -130,26 +131,35 @@ class RobotLog:
         Raises:
             ValueError: If steps go back; the log then holds no more than the steps before.
         """
-        turns = table.reshape(len(steps), -1, 6)[:, row]
-        t, n = self._num_rows, self._num_measurements
-        is_plain = self._covariances is None and self._descriptor_rows is None and not turns[:, GIVEN].any()
-        if is_plain and t + len(steps) <= ROWS and n + len(ids) <= MEASUREMENTS and steps[0] > self._last:
-            self._num_rows, self._num_measurements = _kernels.write_rows(
-                row, steps, table, moves, sightings, ids, t, n,
-                self._steps, self._kinds, self._motions, self._given, self._starts, self._points, self._ids,
-            )  # fmt: skip
-            if self._num_rows > t:
-                self._last = int(self._steps[self._num_rows - 1])
+        k = 0
+        while k < len(steps):
+            if self._covariances is None and self._descriptor_rows is None and steps[k] > self._last:
+                most = min(MEASUREMENTS, len(self._ids))
+                k, self._num_rows, self._num_measurements = write_rows(
+                    row, k, steps, table, moves, sightings, ids, most, self._num_rows, self._num_measurements,
+                    self._steps, self._kinds, self._motions, self._given, self._starts, self._points, self._ids,
+                )  # fmt: skip
+                if self._num_rows:
+                    self._last = int(self._steps[self._num_rows - 1])
+            if k < len(steps):  # what cannot stand there yet
+                self._append_turn(k, row, steps, table, moves, sightings, ids)
+                k += 1
+
+    def _append_turn(
+        self, k: int, row: int, steps: IntArray, table: IntArray, moves: FloatArray, sightings: FloatArray,
+        ids: IntArray,
+    ) -> None:  # fmt: skip
+        """Append what a robot did and measured in step k, if it did; the others are as of `extend`."""
+        turns, motions = table.reshape(len(steps), -1, 6), moves.reshape(len(steps), -1, 3)
+        act, begin, end, given, _, count = turns[k, row].tolist()
+        if act == _kernels.IDLE and count <= 0:
             return
-        bases = np.cumsum([0, *table.reshape(len(steps), -1, 6)[:-1, -1, END]])
-        motions = moves.reshape(len(steps), -1, 3)[:, row]
-        for k, (act, begin, end, given, _, count) in enumerate(turns.tolist()):
-            if act != _kernels.IDLE or count > 0:
-                own = slice(bases[k] + begin, bases[k] + end)
-                move = motions[k] if act in (_kernels.MOVED, _kernels.PLACED) else None
-                spreads = sightings[own, 3:] if given and count else None
-                pose = motions[k] if act == _kernels.PLACED else None
-                self.append(int(steps[k]), move, pose, sightings[own, :3], ids[own], spreads)
+        base = int(turns[:k, -1, END].sum())
+        own = slice(base + begin, base + end)
+        move = motions[k, row] if act in (_kernels.MOVED, _kernels.PLACED) else None
+        pose = move if act == _kernels.PLACED else None
+        spreads = sightings[own, 3:] if given and count else None
+        self.append(int(steps[k]), move, pose, sightings[own, :3], ids[own], spreads)
 
     def _refusal(
         self, step: int, odometry: Any, pose: Any, points: Any, ids: Any, covariances: Any, descriptor_rows: Any

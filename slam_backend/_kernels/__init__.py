@@ -23,7 +23,6 @@ g = A^T S^-1 r to the gradient. A gate takes S + A P A^T, with P the covariance 
 from slam_backend._kernels.candidates import extent, to_robot_axes
 from slam_backend._kernels.landmark_updates import YOUNG
 from slam_backend._kernels.layout import CANDIDATE_ROWS, FAR, LANES, MIN_DEPTH, WORK_ROWS
-from slam_backend._kernels.logs import write_rows
 from slam_backend._kernels.places import carry_odds, refresh
 from slam_backend._kernels.resampling import resample
 from slam_backend._kernels.start_frames import stand
@@ -33,5 +32,5 @@ from slam_backend._kernels.weights import add_share, mixture
 __all__ = [
     "CANDIDATE_ROWS", "FAR", "IDLE", "LANES", "MIN_DEPTH", "MOVED", "PLACED", "STOOD", "WORK_ROWS", "YOUNG",
     "add_share", "carry_odds", "extent", "mixture", "refresh", "resample", "stand", "take_turns",
-    "to_robot_axes", "write_rows", "write_sigmas",
+    "to_robot_axes", "write_sigmas",
 ]  # fmt: skip

@@ -1,6 +1,6 @@
 """`extended`: a graph takes in what the robots did since; steps without measurements are chained away."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -13,9 +13,9 @@ from slam_backend.log_arrays import EXACT, LogArrays
 from slam_backend.motion import OdometryModel
 from slam_backend.smoothing._walking import choose, place, start_anew, walk
 from slam_backend.smoothing.graph import LEVER, OF_FRAMES, OF_KEYS, PathGraph
+from slam_backend.smoothing.guesses import Guesses
 
 LEAST_NOISE = 1e-5  # [m, rad] of odometry in one step: where a part has none, as with no floors, nothing is singular
-UNKNOWN = np.full(3, np.nan)  # a pose of which nothing is supposed
 
 
 class Places(NamedTuple):
@@ -44,7 +44,7 @@ def extended(
     logs: Sequence[LogArrays],
     motion: OdometryModel,
     mount: FloatArray,
-    guesses: Sequence[Mapping[int, FloatArray]] | None = None,
+    guesses: Sequence[Guesses] | None = None,
     rigid_within: float = 0.0,
     places: Places | None = None,
 ) -> PathGraph:
@@ -59,7 +59,7 @@ def extended(
         logs: Per robot, of the steps after `graph.latest`.
         motion: Noise of the odometry.
         mount: (3,) [m] of the camera on the robot.
-        guesses: Per robot where it may be after some of these steps (3,), map frame; else odometry says.
+        guesses: Per robot where it may be after some of these steps; else odometry says.
         rigid_within: [m]. See `SmoothingOptions`.
         places: Where the filter holds landmarks to be: those start there of which most sightings are new, for their
             first one may lie far off, and a robust kernel would then hold against the others that they contradict it.
@@ -128,12 +128,11 @@ def _walked(
     return used | {"tips": tips}, _Measured(names[: ends[-1]], points[: ends[-1]], frames[: ends[-1]], of_robots)
 
 
-def _supposed(logs: Sequence[LogArrays], guesses: Sequence[Mapping[int, FloatArray]] | None) -> FloatArray:
+def _supposed(logs: Sequence[LogArrays], guesses: Sequence[Guesses] | None) -> FloatArray:
     """Return (T, 3) [m, m, rad] where robots are thought to be after the steps of all logs; NaN: nobody says."""
     if guesses is None:
         return np.full((sum(map(len, logs)), 3), np.nan)
-    poses = [by_step.get(t, UNKNOWN) for log, by_step in zip(logs, guesses, strict=True) for t in log.steps.tolist()]
-    return np.concatenate([np.empty(0), *poses]).reshape(-1, 3)
+    return np.concatenate([guessed.at(log.steps) for log, guessed in zip(logs, guesses, strict=True)])
 
 
 def _with_room(column: NDArray[Any], extra: int) -> NDArray[Any]:
@@ -143,10 +142,10 @@ def _with_room(column: NDArray[Any], extra: int) -> NDArray[Any]:
     return longer
 
 
-def _guided(log: LogArrays, guesses: Mapping[int, FloatArray]) -> bool:
+def _guided(log: LogArrays, guesses: Guesses) -> bool:
     """Return whether there is a guess for the first step that measured something, and so for all."""
     t = int(log.starts.searchsorted(0, side="right")) - 1
-    return t == len(log) or int(log.steps[t]) in guesses
+    return t == len(log) or bool((guesses.steps == log.steps[t]).any())
 
 
 def _given(log: LogArrays, rows: IntArray) -> BoolArray:

@@ -18,6 +18,7 @@ from slam_backend.errors import BoolArray, FloatArray, IntArray
 from slam_backend.filter_options import FilterOptions
 from slam_backend.geometry import rotation
 from slam_backend.log_arrays import LogArrays
+from slam_backend.smoothing.guesses import Guesses
 
 NO_ONE = -1
 ROUNDING = 1e-12  # [m^2]; keeps covariances of sensors without noise invertible
@@ -67,7 +68,7 @@ class _Points(NamedTuple):
 def taken_up(
     logs: Sequence[LogArrays],
     refused: Sequence[Mapping[int, Refused]],
-    guesses: Sequence[Mapping[int, FloatArray]],
+    guesses: Sequence[Guesses],
     known: Known,
     options: FilterOptions,
 ) -> list[LogArrays]:
@@ -80,7 +81,7 @@ def taken_up(
     Args:
         logs: Per robot.
         refused: Per robot by step; steps that its log does not hold are passed over.
-        guesses: Per robot by step where it was (3,) [m, m, rad], map frame.
+        guesses: Per robot where it was.
         known: The map.
         options: Gates and camera of the filter.
     """
@@ -108,17 +109,18 @@ def taken_up(
 def _located(
     logs: Sequence[LogArrays],
     refused: Sequence[Mapping[int, Refused]],
-    guesses: Sequence[Mapping[int, FloatArray]],
+    guesses: Sequence[Guesses],
     options: FilterOptions,
 ) -> _Points | None:
     """Return where what was refused lies in the map, seen from the guessed poses; None if there is nothing."""
     found = []
-    for robot, (log, of_steps, poses) in enumerate(zip(logs, refused, guesses, strict=True)):
+    for robot, (log, of_steps, guessed) in enumerate(zip(logs, refused, guesses, strict=True)):
+        poses = guessed.at(log.steps)
         for step, what in of_steps.items():
             t = int(np.searchsorted(log.steps, step))
-            if t == len(log) or log.steps[t] != step or step not in poses:
+            if t == len(log) or log.steps[t] != step or np.isnan(poses[t, 0]):
                 continue
-            places, pose = log.starts[t] + what.rows, poses[step]
+            places, pose = log.starts[t] + what.rows, poses[t]
             turn = np.eye(3)
             turn[:2, :2] = rotation(pose[2])
             own = log.points[places]

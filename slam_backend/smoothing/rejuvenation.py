@@ -1,6 +1,6 @@
 """`rejuvenate`: new particles from the posterior of whole paths, in place of those that resampling has impoverished."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +16,7 @@ from slam_backend.smoothing.coarsening import at_mode, coarsened, compacted
 from slam_backend.smoothing.duplicates import find_duplicates, without_duplicates
 from slam_backend.smoothing.extending import Places, extended, first_rows
 from slam_backend.smoothing.graph import PathGraph
+from slam_backend.smoothing.guesses import Guesses
 from slam_backend.smoothing.holding import holding, move_poses, move_tiles
 from slam_backend.smoothing.options import SmoothingOptions
 from slam_backend.smoothing.sampling import Draws, draw_paths, drawn_spreads
@@ -96,7 +97,7 @@ def rejuvenate(
     num_particles: int,
     rng: np.random.Generator,
     options: SmoothingOptions,
-    guesses: Sequence[Mapping[int, FloatArray]] | None = None,
+    guesses: Sequence[Guesses] | None = None,
     looks: Looks | None = None,
     places: Places | None = None,
 ) -> Rejuvenation:
@@ -113,7 +114,7 @@ def rejuvenate(
         num_particles: M.
         rng: Source of the draws.
         options: What decides the rest.
-        guesses: Per robot where it may be after some of the new steps (3,), map frame.
+        guesses: Per robot where it may be after some of the new steps.
         looks: For landmarks that turn out to be one. None: all are what they are called.
         places: Where the filter holds landmarks to be, see `extended`.
 

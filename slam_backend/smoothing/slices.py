@@ -5,7 +5,7 @@ descent has ended, and then joins surplus keys; or, when all is at its mode, tak
 descent and draws. Between slices there is nothing but a graph, and how damped its next step is.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,6 +17,7 @@ from slam_backend.motion import OdometryModel
 from slam_backend.smoothing.coarsening import at_mode
 from slam_backend.smoothing.extending import Places, extended
 from slam_backend.smoothing.graph import PathGraph
+from slam_backend.smoothing.guesses import Guesses
 from slam_backend.smoothing.options import SmoothingOptions
 from slam_backend.smoothing.rejuvenation import Looks, Rejuvenation, at_given_poses, drawn, settled
 from slam_backend.smoothing.solving import NO_POSE, Mode, find_mode
@@ -58,14 +59,14 @@ class Smoother:
     rng: np.random.Generator
 
     def take_in(
-        self, graph: PathGraph, logs: Sequence[LogArrays], guesses: Sequence[Mapping[int, FloatArray]], places: Places
+        self, graph: PathGraph, logs: Sequence[LogArrays], guesses: Sequence[Guesses], places: Places
     ) -> PathGraph | Draft | str:
         """Take in all rows of the logs, which are few, and do the first steps.
 
         Args:
             graph: At its mode.
             logs: Per robot, of the steps after `graph.latest`.
-            guesses: Per robot where it may be after some of these steps (3,), map frame.
+            guesses: Per robot where it may be after some of these steps.
             places: Where the filter holds landmarks to be, see `extended`.
 
         Returns:
@@ -91,7 +92,7 @@ class Smoother:
         self,
         graph: PathGraph,
         logs: Sequence[LogArrays],
-        guesses: Sequence[Mapping[int, FloatArray]],
+        guesses: Sequence[Guesses],
         places: Places,
         num_particles: int,
         looks: Looks,

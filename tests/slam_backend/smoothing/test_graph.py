@@ -7,6 +7,7 @@ from slam_backend.run_log import RobotLog
 from slam_backend.smoothing.coarsening import at_mode
 from slam_backend.smoothing.extending import Places, chained, extended, first_rows
 from slam_backend.smoothing.graph import PathGraph
+from slam_backend.smoothing.guesses import Guesses
 from slam_backend.smoothing.options import SmoothingOptions
 from slam_backend.smoothing.rejuvenation import rejuvenate
 from slam_backend.smoothing.solving import find_mode
@@ -63,7 +64,7 @@ def test_a_landmark_seen_mostly_anew_starts_where_the_filter_has_it():
     start = at_mode(start, find_mode(start, camera, options))
     assert np.linalg.norm(start.landmarks[start.landmark_ids == name][0] - run.landmarks[name]) > 1.0
     rest = [log.since(first + 1)]
-    guesses = [dict(enumerate(run.true_paths[0]))]
+    guesses = [Guesses(np.arange(len(run.true_paths[0])), run.true_paths[0])]
     places = Places(np.arange(120), run.landmarks + 0.02)
 
     def error(guesses, places):
@@ -74,7 +75,7 @@ def test_a_landmark_seen_mostly_anew_starts_where_the_filter_has_it():
 
     assert error(guesses, places) < 0.05
     assert error(guesses, None) > 2.0
-    assert error([{}], places) == error([{}], None)
+    assert error([Guesses.none()], places) == error([Guesses.none()], None)
     few = [first_rows(rest[0], 1)]
     grown = extended(start, few, motion, mount, guesses, places=places)
     old = np.flatnonzero(np.isin(grown.landmark_ids, start.landmark_ids))

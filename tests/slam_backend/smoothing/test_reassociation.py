@@ -10,6 +10,7 @@ from slam_backend.geometry import inverse, transform_points
 from slam_backend.log_arrays import REJECTED
 from slam_backend.measurements import Measurements
 from slam_backend.run_log import RobotLog
+from slam_backend.smoothing.guesses import Guesses
 from slam_backend.smoothing.reassociation import Known, Refused, taken_up
 
 OPTIONS = FilterOptions(camera=StereoCamera(sigma_px=0.2, sigma_disparity_px=0.1, mount=(0.1, 0.0, 0.9)))
@@ -21,6 +22,11 @@ LOOK, OTHER_LOOK = np.eye(4, dtype=np.float32)[:2]
 def seen_from(pose, place):
     """Return a point (3,) as logs hold it: robot axes, from the camera centre."""
     return transform_points(inverse(pose), place[None])[0] - OPTIONS.camera.mount
+
+
+def guesses_of(poses):
+    """Return the robot's poses, by step, as the smoother takes them."""
+    return [Guesses(np.array(list(poses)), np.array(list(poses.values())))]
 
 
 def logs_and_refused(places, looks=None, covariances=None):
@@ -46,7 +52,7 @@ def known(off=(0.0, 0.5, 0.0), count=1, sigma=0.2, look=LOOK):
 def names(places, held, looks=None, poses=POSES):
     """Return the names (3,) of what was refused, after all."""
     logs, refused = logs_and_refused(places, looks)
-    found = taken_up(logs, refused, [poses], held, OPTIONS)[0]
+    found = taken_up(logs, refused, guesses_of(poses), held, OPTIONS)[0]
     assert found.ids[::2].tolist() == [3, 3, 3]
     assert logs[0].ids[1::2].tolist() == [REJECTED] * 3
     return found.ids[1::2].tolist()
@@ -88,14 +94,15 @@ def test_covariances_of_the_sensor_say_what_agrees():
     for sigma, found in ((0.2, [9, 9, 9]), (0.05, [REJECTED] * 3)):
         noise = np.tile(np.array([1.0, 0.0, 0.0, 1.0, 0.0, 1.0]) * sigma**2, (2, 1))
         logs, refused = logs_and_refused(apart, covariances=noise)
-        assert taken_up(logs, refused, [POSES], known(), OPTIONS)[0].ids[1::2].tolist() == found
+        assert taken_up(logs, refused, guesses_of(POSES), known(), OPTIONS)[0].ids[1::2].tolist() == found
 
 
 def test_nothing_refused_changes_no_log():
     """Without anything refused, or without a map, the logs are the same arrays."""
     logs, refused = logs_and_refused([PLACE] * 3)
     nothing = Known(*(array[:0] for array in known()))
-    for found in (taken_up(logs, [{}], [POSES], known(), OPTIONS), taken_up(logs, refused, [POSES], nothing, OPTIONS)):
+    for missed, held in (([{}], known()), (refused, nothing)):
+        found = taken_up(logs, missed, guesses_of(POSES), held, OPTIONS)
         assert found[0].ids is logs[0].ids
 
 

@@ -14,6 +14,7 @@ from slam_backend.motion import OdometryModel
 from slam_backend.smoothing import slices
 from slam_backend.smoothing.extending import Places, first_rows
 from slam_backend.smoothing.graph import PathGraph
+from slam_backend.smoothing.guesses import Guesses
 from slam_backend.smoothing.options import SmoothingOptions
 from slam_backend.smoothing.slices import Draft, Smoother
 from slam_backend.smoothing.solving import find_mode
@@ -31,7 +32,7 @@ def test_slices_end_where_all_at_once_does():
     logs = [log.arrays() for log in logs_of(run)]
     for upto in range(4, run.num_steps + 4, 4):
         part = [first_rows(log, upto).since(int(graph.latest[0]) + 1) for log in logs]
-        state = smoother.take_in(graph, part, [{}, {}], NOWHERE)
+        state = smoother.take_in(graph, part, 2 * [Guesses.none()], NOWHERE)
         while isinstance(state, Draft):
             state = smoother.descend(state)
             steps += 1
@@ -126,7 +127,7 @@ def test_a_descent_that_keeps_failing_blocks_nothing(slice_steps):
     assert any(reason.endswith("; what was measured since the last time is left out") for reason in told)
     graph: Mapping[str, np.ndarray] = slam.get_state()["rejuvenation"]["graph"]
     assert graph["latest"][0] > 6
-    assert len(slam.get_state()["rejuvenation"]["guesses"][0]) <= 2 * 6
+    assert len(slam.get_state()["rejuvenation"]["guesses"][0][0]) <= 2 * 6
 
 
 def test_where_there_is_nothing_to_smooth_slices_wait():

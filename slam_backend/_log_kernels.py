@@ -1,39 +1,46 @@
-"""What robots did and measured in many steps, written into the columns of a robot's log."""
+"""The compiled part of logs: what robots did and measured in many steps is written into a robot's columns."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend._jit import jit
-from slam_backend._kernels.layout import ACT, BEGIN, COUNT, END
-from slam_backend._kernels.turns import IDLE, MOVED, PLACED
+from slam_backend._kernels import IDLE, MOVED, PLACED
+from slam_backend._kernels.layout import ACT, BEGIN, COUNT, END, GIVEN
 from slam_backend.errors import BoolArray, FloatArray, IntArray
 from slam_backend.log_arrays import EXACT, ODOMETRY, STOOD
 
 
 @jit
 def write_rows(
-    row: int, numbers: IntArray, table: IntArray, moves: FloatArray, sightings: FloatArray, found: IntArray,
-    t: int, n: int,
+    row: int, first: int, numbers: IntArray, table: IntArray, moves: FloatArray, sightings: FloatArray,
+    found: IntArray, most: int, t: int, n: int,
     steps: IntArray, kinds: NDArray[np.int8], motions: FloatArray, given: BoolArray, starts: IntArray,
     points: FloatArray, ids: IntArray,
-) -> tuple[int, int]:  # fmt: skip
-    """Write the steps of one of N robots in which it did or measured anything; none has covariances.
+) -> tuple[int, int, int]:  # fmt: skip
+    """Write the steps of one of N robots in which it did or measured anything, up to one that cannot stand there.
+
+    That is one for which there is no room in the columns, or whose measurements come with covariances.
 
     Args:
         row: Which robot.
+        first: Of the steps to be written.
         numbers: (T,) of the steps.
         table, moves: (T N, 6), (T N, 3). Of all steps one after the other, as in `StepInput`.
         sightings, found: (n, 9), (n,). Likewise, and the landmarks that the measurements were taken for, -1 = none.
+        most: So many measurements may stand there.
         t, n: Rows and measurements that the columns hold.
         steps, kinds, motions, given, starts, points, ids: Columns of `LogArrays`, with room; written.
 
     Returns:
-        What they hold then.
+        The first step that was not written, T if there is none, and how many rows and measurements they hold then.
     """
     count, base = len(table) // len(numbers), 0
     for k in range(len(numbers)):
         turn = table[k * count + row]
-        if turn[ACT] != IDLE or turn[COUNT] > 0:
+        if k >= first and (turn[ACT] != IDLE or turn[COUNT] > 0):
+            used = turn[END] - turn[BEGIN]
+            if t == len(steps) or n + used > most or turn[GIVEN]:
+                return k, t, n
             steps[t], given[t] = numbers[k], False
             kinds[t] = EXACT if turn[ACT] == PLACED else ODOMETRY if turn[ACT] == MOVED else STOOD
             motions[t] = moves[k * count + row]
@@ -44,4 +51,4 @@ def write_rows(
             t += 1
             starts[t] = n
         base += table[(k + 1) * count - 1, END]
-    return t, n
+    return len(numbers), t, n
