@@ -23,7 +23,7 @@ from slam_backend._kernels import MOVED, PLACED
 from slam_backend.branches import ReplayedStep
 from slam_backend.errors import IntArray
 from slam_backend.landmark_map import LandmarkMap
-from slam_backend.reports import StepReport
+from slam_backend.reports import StepReport, num_named
 
 LANDMARK_BYTES = 8 + 9 * 8  # id, mean and covariance
 POSE_BYTES = 3 * 8
@@ -39,8 +39,13 @@ class ExchangeLedger:
     """
 
     def __init__(self, num_robots: int) -> None:
-        self.bytes_sent: IntArray = np.zeros(num_robots, dtype=np.int64)
+        self._sent = [0] * num_robots
         self._known: dict[tuple[int, int], dict[int, int]] = {}  # (from, to) -> landmark id -> its count when last sent
+
+    @property
+    def bytes_sent(self) -> IntArray:
+        """(K,) int64. A copy."""
+        return np.array(self._sent, np.int64)
 
     def record_step(
         self, robots: tuple[int, ...], live: tuple[int, ...], report: StepReport, descriptor_size: int
@@ -55,9 +60,9 @@ class ExchangeLedger:
         """
         for robot, associations, created_ids in zip(robots, report.associations, report.created, strict=True):
             if robot in live:
-                touched = _num_named(associations) if report.num_rejected else len(associations)
-                created = _num_named(created_ids) if report.num_created else 0
-                self.bytes_sent[robot] += POSE_BYTES + touched * LANDMARK_BYTES + created * 4 * descriptor_size
+                touched = num_named(associations) if report.num_rejected else len(associations)
+                created = num_named(created_ids) if report.num_created else 0
+                self._sent[robot] += POSE_BYTES + touched * LANDMARK_BYTES + created * 4 * descriptor_size
 
     def record_replay(self, replayed: Sequence[ReplayedStep]) -> None:
         """Count the buffered readings that returning robots send."""
@@ -66,8 +71,8 @@ class ExchangeLedger:
             for robot in done.robots:
                 act, _, _, covered, _, count = done.inputs.turns[robot]
                 if act in (MOVED, PLACED):
-                    self.bytes_sent[robot] += POSE_BYTES
-                self.bytes_sent[robot] += max(count, 0) * (each + covered * COVARIANCE_BYTES)
+                    self._sent[robot] += POSE_BYTES
+                self._sent[robot] += max(count, 0) * (each + covered * COVARIANCE_BYTES)
 
     def record_return(
         self, sender: int, known: Mapping[int, int], counts: Mapping[int, int], descriptor_size: int
@@ -82,7 +87,7 @@ class ExchangeLedger:
         """
         changed = sum(1 for name, count in counts.items() if known.get(name) != count)
         new = sum(1 for name in counts if name not in known)
-        self.bytes_sent[sender] += changed * LANDMARK_BYTES + new * 4 * descriptor_size
+        self._sent[sender] += changed * LANDMARK_BYTES + new * 4 * descriptor_size
 
     def record_maps(self, robot_a: int, robot_b: int, map_a: LandmarkMap, map_b: LandmarkMap) -> None:
         """Count the maps that two groups' first robots exchange to align them."""
@@ -91,24 +96,19 @@ class ExchangeLedger:
             counts = dict(zip(landmarks.ids.tolist(), landmarks.counts.tolist(), strict=True))
             new = sum(1 for name in counts if name not in known)
             changed = sum(1 for name, count in counts.items() if known.get(name, count) != count)
-            self.bytes_sent[sender] += (new + changed) * LANDMARK_BYTES + new * 4 * landmarks.descriptors.shape[1]
+            self._sent[sender] += (new + changed) * LANDMARK_BYTES + new * 4 * landmarks.descriptors.shape[1]
             known.update(counts)
 
     def record_straightened(self, robot_a: int, robot_b: int, map_a: LandmarkMap, map_b: LandmarkMap) -> None:
         """Count the maps once more, after both were straightened: all landmarks have moved, none looks otherwise."""
         for sender, landmarks in ((robot_a, map_a), (robot_b, map_b)):
-            self.bytes_sent[sender] += len(landmarks) * LANDMARK_BYTES
+            self._sent[sender] += len(landmarks) * LANDMARK_BYTES
 
     def get_state(self) -> dict[str, Any]:
         """Return a copy of the counts."""
-        return {"bytes_sent": self.bytes_sent.copy(), "known": copy.deepcopy(self._known)}
+        return {"bytes_sent": self.bytes_sent, "known": copy.deepcopy(self._known)}
 
     def set_state(self, state: Mapping[str, Any]) -> None:
         """Take over counts that `get_state` returned."""
-        self.bytes_sent = state["bytes_sent"].copy()
+        self._sent = state["bytes_sent"].tolist()
         self._known = copy.deepcopy(state["known"])
-
-
-def _num_named(ids: IntArray) -> int:
-    """Return how many measurements (n,) have the id of a landmark; -1 = none."""
-    return sum([name >= 0 for name in ids.tolist()])

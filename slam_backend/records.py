@@ -9,7 +9,7 @@ import numpy as np
 from slam_backend.branches import Branch, ReplayedStep
 from slam_backend.exchange import ExchangeLedger
 from slam_backend.input_log import InputLog
-from slam_backend.reports import LandmarksCreated, MapCopied, MapEntry, StepReport
+from slam_backend.reports import LandmarksCreated, MapCopied, MapEntry, StepReport, num_named
 
 
 class Records:
@@ -45,7 +45,7 @@ class Records:
     def note_created(self, branch: Branch, robots: Sequence[int], step: int, report: StepReport) -> None:
         """Write down which landmarks a step of a filter created."""
         for robot, ids in zip(branch.robots, report.created, strict=True):
-            if robot in robots and max(ids.tolist(), default=-1) >= 0:
+            if robot in robots and num_named(ids):
                 self.entries.append(LandmarksCreated(branch.number, robot, step, ids))
 
     def note_replay(self, branch: Branch, replayed: Sequence[ReplayedStep]) -> None:

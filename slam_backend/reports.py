@@ -72,6 +72,11 @@ class StepReport(NamedTuple):
     rejuvenation: "RejuvenationReport | None" = None
 
 
+def num_named(ids: IntArray) -> int:
+    """Return how many of the ids (n,) in a `StepReport` name a landmark."""
+    return len(ids) - ids.tolist().count(-1)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class RejuvenationReport:
     """What came of an attempt to rejuvenate a filter.
@@ -144,8 +149,7 @@ class MapDropped:
     number: int
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LandmarksCreated:
+class LandmarksCreated(NamedTuple):
     """What a robot read in a step created landmarks in a map.
 
     Attributes:

@@ -44,7 +44,7 @@ class TeamKnowledge(TeamState):
     @property
     def bytes_sent(self) -> IntArray:
         """(K,) bytes that each robot has sent; `slam_backend.exchange` says what is counted. A copy."""
-        return self._records.exchange.bytes_sent.copy()
+        return self._records.exchange.bytes_sent
 
     @property
     def maps(self) -> tuple[int, ...]:
