@@ -70,15 +70,7 @@ def match_table(map_a: LandmarkMap, map_b: LandmarkMap, matches: IntArray) -> Fl
     """
     table = np.empty((len(matches), kernels.MATCH_COLUMNS))
     for offset, source, rows in ((0, map_a, matches[:, 0]), (1, map_b, matches[:, 1])):
-        packed = rows_of(source)[rows]
-        table[:, 3 * offset : 3 * offset + 3] = packed[:, :3]
-        table[:, 6 + 6 * offset : 12 + 6 * offset] = packed[:, 3:]
+        packed = source.covariances[rows].reshape(-1, 9).take(OF_NINE, axis=1)
+        table[:, 3 * offset : 3 * offset + 3] = source.means[rows]
+        table[:, 6 + 6 * offset : 12 + 6 * offset] = packed
     return table
-
-
-def rows_of(landmarks: LandmarkMap) -> FloatArray:
-    """Return means [m] and upper triangles of covariances [m^2] in rows (N, 9); fresh, as kernels are compiled for."""
-    rows = np.empty((len(landmarks), 9))
-    rows[:, :3] = landmarks.means
-    rows[:, 3:] = landmarks.covariances.reshape(-1, 9).take(OF_NINE, axis=1)
-    return rows

@@ -10,7 +10,7 @@ from slam_backend._jit import jit
 from slam_backend.errors import BoolArray, Float32Array, FloatArray, IntArray
 
 BLOCK = 256  # columns whose products are held at once: with 64 numbers each they fit a core's own cache
-HEAD = 24  # numbers of a descriptor that are compared first; a multiple of four
+HEAD = 40  # numbers of a descriptor that are compared first, enough to tell most apart; a multiple of four
 SLACK = np.float32(1e-5)  # of squared lengths, far more than sums of their products are rounded
 
 
@@ -56,7 +56,7 @@ def _squared_distances(
     row: Float32Array, b_columns: Float32Array, lengths_b: Float32Array, start: int, stop: int, out: Float32Array
 ) -> None:
     """Write |row|^2 + |b|^2 - 2 row . b for the columns b from `start` to `stop` of `b_columns` (d, m) to `out`."""
-    out[:] = np.float32(0.0)
+    out[: stop - start] = np.float32(0.0)
     _add_products(row, 0, len(row), b_columns, start, stop, out)
     length = _squared_length(row, 0)
     for j in range(stop - start):
@@ -148,7 +148,7 @@ def _alike(a: Float32Array, b_columns: Float32Array, limit: float, most: int) ->
         lengths, tails = lengths_b[start:stop], tails_b[start:stop]
         for i in range(n):
             length, tail = _squared_length(a[i], 0), np.sqrt(_squared_length(a[i], head))
-            squares[:] = np.float32(0.0)
+            squares[: stop - start] = np.float32(0.0)
             _add_products(a[i], 0, head, b_columns, start, stop, squares)
             if not _may_be_near(squares, length, tail, lengths, tails, np.float32(limit)):
                 continue

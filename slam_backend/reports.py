@@ -74,7 +74,8 @@ class StepReport(NamedTuple):
 
 def num_named(ids: IntArray) -> int:
     """Return how many of the ids (n,) in a `StepReport` name a landmark."""
-    return len(ids) - ids.tolist().count(-1)
+    names: list[int] = ids.tolist()
+    return len(names) - names.count(-1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

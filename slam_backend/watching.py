@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from slam_backend import _alignment_kernels as kernels
-from slam_backend._candidates import may_suffice, rows_of
+from slam_backend._candidates import may_suffice
 from slam_backend.alignment import RIVAL_ANGLE, RIVAL_DISTANCE, Alignment, AlignmentOptions, align_maps
 from slam_backend.errors import FloatArray, IntArray
 from slam_backend.geometry import transform_points
@@ -105,7 +105,7 @@ class Watch:
         if any(moved_share(old, joint, options) > merging.max_moved for old in self.before):
             return True
         ids = joint.ids.tolist()
-        masks = [np.array([name in own for name in ids], np.bool_) for own in self.own]
+        masks = [np.fromiter(map(own.__contains__, ids), np.bool_, len(ids)) for own in self.own]
         looks = [joint.descriptors[mask] for mask in masks]
         if min(map(len, looks)) < options.min_inliers or not may_suffice(looks[0], looks[1], options):
             return False
@@ -126,7 +126,8 @@ def moved_share(old: LandmarkMap, joint: LandmarkMap, options: AlignmentOptions)
     Returns:
         In [0, 1]: of the landmarks that both maps hold, those beyond the gate at the rigid motion on which most agree.
     """
-    now, then = (rows_of(joint), joint.ids.copy()), (rows_of(old), old.ids.copy())  # kernels take what can be written
+    # Copies: the kernel is compiled for arrays that can be written alone.
+    now, then = ((each.means.copy(), each.covariances.copy(), each.ids.copy()) for each in (joint, old))
     return kernels.moved_share(*now, *then, options.min_inliers, options.position_floor**2, options.position_gate)
 
 

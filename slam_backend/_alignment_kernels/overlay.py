@@ -14,35 +14,50 @@ OUTSIDE = 1e-3  # weight of those beyond it; never nothing: the fit stays define
 
 @jit
 def moved_share(
-    now: FloatArray, ids_now: IntArray, old: FloatArray, ids_old: IntArray, least: int, floor: float, gate: float
-) -> float:
+    means: FloatArray, covariances: FloatArray, ids: IntArray, old_means: FloatArray, old_covariances: FloatArray,
+    old_ids: IntArray, least: int, floor: float, gate: float,
+) -> float:  # fmt: skip
     """Return the share of the landmarks in both maps that lie beyond the gate at the motion that the others agree on.
 
     Args:
-        now: (n, 9) the map as it is now: means and upper triangles of covariances; `ids_now` (n,) its names.
-        old: (m, 9) the map as it was, `ids_old` (m,) likewise.
+        means, covariances, ids: (n, 3), (n, 3, 3) and (n,): the map as it is now.
+        old_means, old_covariances, old_ids: (m, 3), (m, 3, 3) and (m,): the map as it was.
         least: With fewer landmarks in both, 1 at least, the share is 0.
         floor: Added to each variance [m^2].
         gate: Largest squared Mahalanobis residual [-].
     """
-    table = _matched(now, ids_now, old, ids_old)
+    table = _matched(means, covariances, ids, old_means, old_covariances, old_ids)
     return 0.0 if len(table) < least else _moved_away(table, floor, gate) / len(table)
 
 
 @jit
-def _matched(now: FloatArray, ids_now: IntArray, old: FloatArray, ids_old: IntArray) -> FloatArray:
+def _matched(
+    means: FloatArray, covariances: FloatArray, ids: IntArray, old_means: FloatArray, old_covariances: FloatArray,
+    old_ids: IntArray,
+) -> FloatArray:  # fmt: skip
     """Return the table (k, 18) of the landmarks that both maps hold, by ascending name; a is the map as it is now."""
-    table = np.empty((min(len(now), len(old)), 18))
-    order_now, order_old = np.argsort(ids_now), np.argsort(ids_old)
+    table = np.empty((min(len(ids), len(old_ids)), 18))
+    order, old_order = np.argsort(ids), np.argsort(old_ids)
     k, i = 0, 0
-    for place in order_old:
-        while i < len(order_now) and ids_now[order_now[i]] < ids_old[place]:
+    for old in old_order:
+        while i < len(order) and ids[order[i]] < old_ids[old]:
             i += 1
-        if i < len(order_now) and ids_now[order_now[i]] == ids_old[place]:
-            table[k, :3], table[k, 6:12] = now[order_now[i], :3], now[order_now[i], 3:]
-            table[k, 3:6], table[k, 12:] = old[place, :3], old[place, 3:]
+        if i < len(order) and ids[order[i]] == old_ids[old]:
+            _write(means[order[i]], covariances[order[i]], table[k, :3], table[k, 6:12])
+            _write(old_means[old], old_covariances[old], table[k, 3:6], table[k, 12:])
             k += 1
     return table[:k]
+
+
+@jit
+def _write(mean: FloatArray, covariance: FloatArray, place: FloatArray, packed: FloatArray) -> None:
+    """Write a mean (3,), and the upper triangle (6,) of its covariance (3, 3)."""
+    entry = 0
+    for row in range(3):
+        place[row] = mean[row]
+        for column in range(row, 3):
+            packed[entry] = covariance[row, column]
+            entry += 1
 
 
 @jit

@@ -310,7 +310,7 @@ def test_pairs_of_look_alikes_are_those_within_the_gate() -> None:
     assert look_alikes(a.descriptors[:0], b.descriptors, 0.45, 3).shape == (0, 2)
 
 
-@pytest.mark.parametrize("size", [1, 6, 24, 30, 64])
+@pytest.mark.parametrize("size", [1, 6, 40, 46, 64])
 @pytest.mark.parametrize("length", [1.0, 10.0])
 def test_what_is_near_is_found_whatever_the_heads_say(size: int, length: float) -> None:
     """Of descriptors of any size and length, near each other by their heads, their tails or both, none is lost."""
