@@ -9,9 +9,12 @@ from slam_backend.errors import bad_argument, check_int
 from training.env_budget import BudgetRow, measure_budget
 from training.env_timing import (
     StepTimes,
+    play_env,
+    play_in_turn,
+    play_peer,
+    ratio_of_bursts,
     record_actions,
     time_env,
-    time_peer,
     time_resets,
     time_simulator,
     time_snapshots,
@@ -44,7 +47,7 @@ class EnvBenchConfig(PlainConfig):
         steps: Timed per row.
         plays: How often the episode of a row is played, for the times that other programs do not disturb.
         seed: Of the episodes.
-        peer: Also simple_spread of MPE2.
+        peer: Also simple_spread of MPE2, in turn with the first row.
     """
 
     robots: tuple[int, ...] = (3, 1, 2, 4, 6, 8)
@@ -52,7 +55,7 @@ class EnvBenchConfig(PlainConfig):
     worlds: tuple[str, ...] = ("office", "fig5", "maze", "hall", "loops")
     modes: tuple[str, ...] = ("dict", "flat", "goal")
     steps: int = 600
-    plays: int = 3
+    plays: int = 5
     seed: int = 100
     peer: bool = True
 
@@ -126,6 +129,7 @@ class EnvBenchResult:
         reset: Of the base environment.
         snapshots: By name.
         peer: simple_spread with as many agents, or None where it is not installed or not asked for.
+        ratio: How many times as long as the peer's a step of the first row takes, burst by burst beside it; or None.
         complete: Whether nothing is missing.
     """
 
@@ -136,6 +140,7 @@ class EnvBenchResult:
     reset: StepTimes | None
     snapshots: Mapping[str, StepTimes]
     peer: StepTimes | None
+    ratio: float | None
     complete: bool
 
     def goals(self) -> list[dict[str, Any]]:
@@ -164,6 +169,7 @@ class EnvBenchResult:
             "reset": None if self.reset is None else asdict(self.reset),
             "snapshots": {name: asdict(times) for name, times in self.snapshots.items()},
             "peer": None if self.peer is None else asdict(self.peer),
+            "ratio_to_peer": self.ratio,
             "goals": self.goals(),
             "complete": self.complete,
         }
@@ -185,7 +191,24 @@ def run_bench(
     loads = config.loads()
     base = loads[0].config()
     rows: list[EnvRow] = []
-    results: dict[str, Any] = {"simulator": None, "budget": [], "reset": None, "snapshots": {}, "peer": None}
+    results: dict[str, Any] = {
+        "simulator": None,
+        "budget": [],
+        "reset": None,
+        "snapshots": {},
+        "peer": None,
+        "ratio": None,
+    }
+
+    def first_row(load: EnvLoad) -> None:
+        env = vslam_v0.parallel_env(config=load.config())
+        plays = [play_env(env, seed, WARM_UP + steps)]
+        if config.peer and (peer := play_peer(load.robots, seed, WARM_UP + steps)) is not None:
+            plays.append(peer)
+        own, *beside = play_in_turn(plays, WARM_UP, config.plays)
+        rows.append(EnvRow(load, len(env.world.walls), StepTimes.of(own)))
+        if beside:
+            results.update(peer=StepTimes.of(beside[0]), ratio=ratio_of_bursts(own, beside[0]))
 
     def row(load: EnvLoad) -> None:
         env = vslam_v0.parallel_env(config=load.config())
@@ -203,16 +226,15 @@ def run_bench(
     def keep(name: str, call: Callable[[], Any]) -> Callable[[], None]:
         return lambda: results.update({name: call()})
 
-    trials: list[tuple[str, Callable[[], None]]] = [(_title(load), partial(row, load)) for load in loads]
+    trials: list[tuple[str, Callable[[], None]]] = [(_title(loads[0]), partial(first_row, loads[0]))]
+    trials += [(_title(load), partial(row, load)) for load in loads[1:]]
     trials.insert(1, ("budget", budget))
     trials.insert(2, ("simulator", keep("simulator", lambda: time_simulator(base, seed, steps, WARM_UP))))
-    if config.peer:
-        trials.insert(3, ("peer", keep("peer", lambda: time_peer(loads[0].robots, steps, WARM_UP, seed))))
     resets = keep("reset", lambda: time_resets(vslam_v0.parallel_env(config=base), seed, min(20, steps)))
-    trials.insert(4, ("reset", resets))
+    trials.insert(3, ("reset", resets))
     begun, often = min(300, steps), min(60, 4 + steps)
     snapshots = keep("snapshots", lambda: time_snapshots(vslam_v0.parallel_env(config=base), seed, begun, often))
-    trials.insert(5, ("snapshots", snapshots))
+    trials.insert(4, ("snapshots", snapshots))
     complete = run_in_turn(trials, on_trial, should_stop)
     return EnvBenchResult(
         machine=describe_machine(),
@@ -222,13 +244,14 @@ def run_bench(
         reset=results["reset"],
         snapshots=results["snapshots"],
         peer=results["peer"],
+        ratio=results["ratio"],
         complete=complete,
     )
 
 
 def count_trials(config: EnvBenchConfig) -> int:
     """Return how often `run_bench` calls `on_trial`."""
-    return len(config.loads()) + 4 + config.peer
+    return len(config.loads()) + 4
 
 
 def _title(load: EnvLoad) -> str:

@@ -30,9 +30,10 @@ def print_env_result(console: Console, result: EnvBenchResult, asked_peer: bool)
     }
     beside = [(name, *_times(times)) for name, times in others.items() if times is not None]
     console.print(console_table(f"Beside [us]; {PEER} has neither walls nor SLAM", ("", *TIMES), beside))
-    if result.rows and result.peer is not None:
+    if result.peer is not None:
         ratio = result.rows[0].times.undisturbed_us / result.peer.undisturbed_us
-        console.print(f"Undisturbed, the first row takes {ratio:.2f} times what simple_spread does.", highlight=False)
+        told = f"{result.ratio:.2f} times as long as one of simple_spread beside it, {ratio:.2f} times undisturbed"
+        console.print(f"A step of the first row takes {told}.", highlight=False)
     if asked_peer and result.peer is None and result.complete:
         console.print(f"{PEER} is not installed: no peer was timed (pip install {PEER}).", highlight=False)
     print_goals(console, result.goals())

@@ -1,9 +1,9 @@
 """Environments timed step by step on actions that were recorded beforehand, so that no policy is timed with them."""
 
-import gc
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
@@ -20,6 +20,7 @@ from vslam_env.setting import draw_setting
 from vslam_env.world import Simulator, read_odometry
 
 PEER = "mpe2"  # the package whose simple_spread is timed beside
+BURST = 50  # calls in a row, of plays that take turns
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,24 +72,71 @@ def record_actions(env: ExplorationEnv, seed: int, steps: int) -> list[dict[str,
 
 def time_steps(call: Callable[[Any], Any], arguments: Sequence[Any], warm_up: int) -> FloatArray:
     """Return how long calls took (n - warm_up,) [s], nothing of their results kept."""
-    durations = np.empty(len(arguments), np.int64)
     with no_garbage_collection():
-        for i, argument in enumerate(arguments):
-            begin = time.perf_counter_ns()
-            call(argument)
-            durations[i] = time.perf_counter_ns() - begin
-    seconds: FloatArray = durations[warm_up:] / 1e9
-    return seconds
+        return _seconds(call, arguments)[warm_up:]
+
+
+def _seconds(call: Callable[[Any], Any], arguments: Sequence[Any]) -> FloatArray:
+    """Return how long each call took (n,) [s]."""
+    durations = np.empty(len(arguments), np.int64)
+    for i, argument in enumerate(arguments):
+        begin = time.perf_counter_ns()
+        call(argument)
+        durations[i] = time.perf_counter_ns() - begin
+    return durations / 1e9
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Play:
+    """What is played again and again, the same each time.
+
+    Attributes:
+        begin: Called before each play.
+        call: What is timed.
+        arguments: Of its calls, in order.
+    """
+
+    begin: Callable[[], object]
+    call: Callable[[Any], Any]
+    arguments: Sequence[Any]
+
+
+def play_in_turn(plays: Sequence[Play], warm_up: int, repeats: int) -> FloatArray:
+    """Return how long the calls of each play took (plays, repeats, n - warm_up) [s], if all have n of them.
+
+    The plays take turns in bursts of calls, each with its own order, so that a machine whose speed changes from one
+    second to the next changes it for all of them.
+    """
+    count = len(plays[0].arguments)
+    durations = np.empty((len(plays), repeats, count))
+    for repeat in range(repeats):
+        for play in plays:
+            play.begin()
+        with no_garbage_collection():
+            for burst, first in enumerate(range(0, count, BURST)):
+                chosen = slice(first, first + BURST)
+                for k in range(len(plays))[:: 1 if (burst + repeat) % 2 == 0 else -1]:
+                    durations[k, repeat, chosen] = _seconds(plays[k].call, plays[k].arguments[chosen])
+    return durations[:, :, warm_up:]
+
+
+def ratio_of_bursts(ours: FloatArray, others: FloatArray) -> float:
+    """Return how many times as long calls (repeats, n) [s] took as others beside them: the median over all bursts."""
+    firsts = range(0, ours.shape[1], BURST)
+    own, beside = (
+        np.array([np.median(each[:, first : first + BURST], axis=1) for first in firsts]) for each in (ours, others)
+    )
+    return float(np.median(own / beside))
+
+
+def play_env(env: ExplorationEnv, seed: int, steps: int) -> Play:
+    """Return an episode of the nearest-frontier policy."""
+    return Play(partial(env.reset, seed=seed), env.step, record_actions(env, seed, steps))
 
 
 def time_env(env: ExplorationEnv, seed: int, steps: int, warm_up: int, plays: int = 1) -> StepTimes:
     """Time `env.step` along an episode of the nearest-frontier policy, which is played again so many times."""
-    actions = record_actions(env, seed, warm_up + steps)
-    durations = []
-    for _ in range(plays):
-        env.reset(seed=seed)
-        durations.append(time_steps(env.step, actions, warm_up))
-    return StepTimes.of(np.array(durations))
+    return StepTimes.of(play_in_turn([play_env(env, seed, warm_up + steps)], warm_up, plays)[0])
 
 
 def time_simulator(config: EnvConfig, seed: int, steps: int, warm_up: int) -> StepTimes:
@@ -134,16 +182,13 @@ def time_snapshots(env: ExplorationEnv, seed: int, steps: int, repeats: int) -> 
     }
 
 
-def time_peer(agents: int, steps: int, warm_up: int, seed: int) -> StepTimes | None:
-    """Time simple_spread of MPE2 under random actions, or return None where it is not installed."""
+def play_peer(agents: int, seed: int, steps: int) -> Play | None:
+    """Return an episode of MPE2's simple_spread under random actions, or None where it is not installed."""
     if find_spec(PEER) is None:
         return None
-    peer = import_module(f"{PEER}.simple_spread_v3").parallel_env(N=agents, max_cycles=warm_up + steps + 1)
+    peer = import_module(f"{PEER}.simple_spread_v3").parallel_env(N=agents, max_cycles=steps + 1)
     peer.reset(seed=seed)
     for agent in peer.agents:
         peer.action_space(agent).seed(seed)
-    actions = [{a: peer.action_space(a).sample() for a in peer.agents} for _ in range(warm_up + steps)]
-    durations = time_steps(peer.step, actions, warm_up)
-    peer.close()
-    gc.collect()
-    return StepTimes.of(durations)
+    actions = [{a: peer.action_space(a).sample() for a in peer.agents} for _ in range(steps)]
+    return Play(partial(peer.reset, seed=seed), peer.step, actions)

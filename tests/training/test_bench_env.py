@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from training import env_budget, env_timing
 from training.bench_env import EnvBenchConfig, run_bench
 from training.cli import app
-from training.env_timing import StepTimes, record_actions, time_peer
+from training.env_timing import BURST, Play, StepTimes, play_in_turn, play_peer, ratio_of_bursts, record_actions
 from vslam_env import vslam_v0
 
 runner = CliRunner()
@@ -91,7 +91,29 @@ def test_the_best_repeat_of_a_call_is_the_undisturbed_one() -> None:
 def test_a_missing_peer_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where the peer package is not installed, nothing is timed in its place."""
     monkeypatch.setattr(env_timing, "PEER", "a_package_that_nobody_has")
-    assert time_peer(3, 2, 1, 0) is None
+    assert play_peer(3, 0, 2) is None
+
+
+def test_plays_take_turns() -> None:
+    """Each play begins anew and makes all its calls in order, burst by burst beside the other."""
+    heard: list[tuple[str, int]] = []
+    count = 2 * BURST + 3
+
+    def play(name: str) -> Play:
+        return Play(lambda: heard.append((name, -1)), lambda i: heard.append((name, i)), range(count))
+
+    assert play_in_turn([play("a"), play("b")], 5, 2).shape == (2, 2, count - 5)
+    for name in "ab":
+        assert [i for each, i in heard if each == name] == [-1, *range(count)] * 2
+    first, second, third = range(BURST), range(BURST, 2 * BURST), range(2 * BURST, count)
+    turns = [("a", first), ("b", first), ("b", second), ("a", second), ("a", third), ("b", third)]
+    assert heard[2 : 2 + 2 * count] == [(name, i) for name, calls in turns for i in calls]
+
+
+def test_what_slows_both_plays_leaves_their_ratio() -> None:
+    """Calls that take three times as long as those beside them do so whatever the machine does from burst to burst."""
+    slowed = np.repeat([1.0, 7.0, 2.0], BURST) * np.array([[1.0], [4.0]])
+    assert ratio_of_bursts(3e-6 * slowed, 1e-6 * slowed) == pytest.approx(3.0)
 
 
 def test_loads_differ_from_the_base_one_by_one() -> None:
