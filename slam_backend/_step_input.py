@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from slam_backend import _kernels
-from slam_backend._step_table import in_one_table, seen_by_each, seen_by_team
+from slam_backend._step_table import in_one_table, read_by_team, seen_by_each
 from slam_backend.camera import StereoCamera
 from slam_backend.errors import FloatArray, IntArray, bad_argument, check_array
 from slam_backend.input_log import StepInput
@@ -33,14 +33,15 @@ def check_step(
     Raises:
         ValueError: If one is ill-formed; the text names it.
     """
-    moves, moved = _check_moves(odometry, k)
-    exact = {} if poses is None else _check_poses(poses, k)
     limit = min(FARTHEST_POINT, FLATTEST * camera.baseline * camera.sigma_px / camera.sigma_disparity_px)
     if isinstance(measurements, TeamMeasurements):
-        _check_ends(measurements)
-        if identities is None and len(measurements.ends) == k and _are_usual(measurements, size, limit):
-            return in_one_table(moves, moved, exact, *seen_by_team(measurements))
-        measurements = measurements.of_each()
+        if identities is None and poses is None:
+            inputs = _read_at_a_glance(k, size, limit, odometry, measurements)
+            if inputs is not None:
+                return inputs
+        measurements = _cut_out(measurements)
+    moves, moved = _check_moves(odometry, k)
+    exact = {} if poses is None else _check_poses(poses, k)
     frames = _one_each("measurements", measurements, k)
     names = [None] * k if identities is None else list(_one_each("identities", identities, k))
     for robot in range(k):
@@ -49,6 +50,31 @@ def check_step(
         if names[robot] is not None:
             names[robot] = _check_names(robot, names[robot], 0 if frame is None else len(frame))
     return in_one_table(moves, moved, exact, *seen_by_each(frames, names))
+
+
+def _read_at_a_glance(k: int, size: int, limit: float, odometry: Any, frames: TeamMeasurements) -> StepInput | None:
+    """Return what k robots read if all moved and looked and nothing is amiss; None: it has to be looked at one by one.
+
+    Args:
+        k, size, odometry, frames: As of `check_step`.
+        limit: As of `_check_frame`, which takes all that is taken here.
+    """
+    if type(odometry) is not np.ndarray or odometry.dtype != np.float64 or odometry.shape != (k, 3):
+        return None
+    count, own_size = frames.descriptors.shape
+    if len(frames.ends) != k or len(frames.points) != count or (size and own_size != size):
+        return None
+    return read_by_team(odometry.copy(), frames, FARTHEST_MOVE, limit)
+
+
+def _cut_out(frames: TeamMeasurements) -> list[Measurements]:
+    """Return each robot's frame of those of a team, or raise unless their ends rise up to the last point."""
+    ends, count = frames.ends.tolist(), len(frames.points)
+    if not ends or ends[0] < 0 or ends[-1] != count or len(frames.descriptors) != count or ends != sorted(ends):
+        got = f"ends {ends} of {count} points and {len(frames.descriptors)} descriptors"
+        cure = "Say per robot where its points end."
+        raise bad_argument("measurements", "a descriptor per point, and rising ends up to the last one", got, cure)
+    return frames.of_each()
 
 
 def _one_each(name: str, value: Any, k: int) -> Any:
@@ -64,10 +90,6 @@ def _one_each(name: str, value: Any, k: int) -> Any:
 
 def _check_moves(odometry: Any, k: int) -> tuple[FloatArray, Sequence[bool]]:
     """Return the odometry (k, 3) of k robots, checked, and which of them have any; zeros for the others."""
-    if type(odometry) is np.ndarray and odometry.dtype == np.float64 and odometry.shape == (k, 3):
-        moves: FloatArray = odometry.copy()
-        if math.hypot(*moves.ravel().tolist()) <= FARTHEST_MOVE:  # and so each of them; NaN is not
-            return moves, [True] * k
     moves, moved = np.zeros((k, 3)), [False] * k
     for robot, move in enumerate(_one_each("odometry", odometry, k)):
         if move is not None:
@@ -111,22 +133,6 @@ def _check_names(robot: int, names: Any, count: int) -> IntArray:
     return checked
 
 
-def _check_ends(frames: TeamMeasurements) -> None:
-    """Raise unless a team's frames end one after the other, the last of them with the last point: kernels trust it."""
-    ends, count = list(frames.ends), len(frames.points)
-    if not ends or ends[0] < 0 or ends[-1] != count or len(frames.descriptors) != count or ends != sorted(ends):
-        got = f"ends {ends} of {count} points and {len(frames.descriptors)} descriptors"
-        cure = "Say per robot where its points end."
-        raise bad_argument("measurements", "a descriptor per point, and rising ends up to the last one", got, cure)
-
-
-def _are_usual(frames: TeamMeasurements, size: int, limit: float) -> bool:
-    """Tell whether all frames pass `_check_frame`, which takes the same, at a glance; else it has to say which."""
-    nearest, farthest = frames.extent
-    fits = not size or frames.descriptors.shape[1] == size
-    return fits and nearest >= _kernels.MIN_DEPTH and farthest <= limit
-
-
 def _check_frame(robot: int, frame: Any, size: int, limit: float) -> int:
     """Check a robot's frame.
 
@@ -159,7 +165,7 @@ def _check_frame(robot: int, frame: Any, size: int, limit: float) -> int:
 
 def _check_points(robot: int, frame: Measurements, limit: float) -> None:
     """Raise unless all points are so near that their covariances can be used, and ahead where they have none yet."""
-    nearest, farthest = _kernels.extent(frame.points)  # of this frame alone; its `extent` may be that of several
+    nearest, farthest = frame.extent
     limit = limit if frame.covariances is None else FARTHEST_POINT
     if not farthest <= limit:
         cure = "Check the units, metres, and drop points without disparity."

@@ -6,22 +6,36 @@ import numpy as np
 
 from slam_backend import _kernels
 from slam_backend.errors import BoolArray, Float32Array, FloatArray, IntArray
-from slam_backend.input_log import StepInput, Turn
+from slam_backend.input_log import StepInput
 from slam_backend.measurements import Measurements, TeamMeasurements
 
-NO_COVARIANCES = np.zeros((0, 3, 3))
-NO_COVARIANCES.setflags(write=False)
 NO_SIGHTINGS = np.zeros((0, 9))
-NO_SIGHTINGS.setflags(write=False)
 NO_DESCRIPTORS = np.zeros((0, 0), dtype=np.float32)
 NO_DESCRIPTORS.setflags(write=False)
 NO_NAMES = np.zeros(0, dtype=np.int64)
 
-Span = tuple[int, int, bool, bool, int]  # of one robot: its `Turn` without what it did
+Span = tuple[int, int, bool, bool, int]  # of one robot: its row of the table without what it did
 # One robot's points, covariances or None, descriptors, names or None.
 Used = tuple[FloatArray, FloatArray | None, Float32Array, IntArray | None]
 # Of all robots their spans; masks, sightings, descriptors and names as in `StepInput`.
 Seen = tuple[list[Span], dict[int, BoolArray], FloatArray, Float32Array, IntArray]
+
+
+def read_by_team(
+    moves: FloatArray, frames: TeamMeasurements, farthest_move: float, farthest_point: float
+) -> StepInput | None:
+    """Return what N robots read that have all moved and looked; None if anything is amiss, or a limit is passed.
+
+    Args:
+        moves: (N, 3) odometry; the caller is not to write to it any more.
+        frames: Of the N robots.
+        farthest_move, farthest_point: Limits [m, rad] to the odometry and [m] to points, as of `_kernels.read_team`.
+    """
+    points, descriptors, ends = frames
+    table, sightings = np.empty((len(moves), 6), np.int64), np.empty((len(points), 9))
+    if not _kernels.read_team(moves, points, ends, farthest_move, farthest_point, table, sightings):
+        return None
+    return StepInput(table.tolist(), table, moves, {}, sightings, descriptors, NO_NAMES, frozenset())
 
 
 def in_one_table(
@@ -36,7 +50,7 @@ def in_one_table(
         exact: By robot the pose that it was told.
         spans, masks, sightings, descriptors, names: As of `Seen`.
     """
-    turns: list[Turn] = []
+    turns: list[tuple[int, ...]] = []
     silent: list[int] = []
     for robot, (begin, end, covered, named, count) in enumerate(spans):
         if robot in exact:
@@ -48,19 +62,8 @@ def in_one_table(
             if count < 0:
                 silent.append(robot)
         turns.append((act, begin, end, covered, named, count))
-    table: IntArray = np.array(turns, dtype=np.int64)
-    table.setflags(write=False)
-    moves.setflags(write=False)
-    return StepInput(turns, table, moves, masks, sightings, descriptors, names, frozenset(silent))
-
-
-def seen_by_team(frames: TeamMeasurements) -> Seen:
-    """Return what a team's frames hold, which have no names."""
-    spans, begin = [], 0
-    for end in frames.ends:
-        spans.append((begin, end, False, False, end - begin))
-        begin = end
-    return spans, {}, _sightings(frames.points, NO_COVARIANCES), frames.descriptors, NO_NAMES
+    table = np.array(turns, dtype=np.int64)
+    return StepInput(table.tolist(), table, moves, masks, sightings, descriptors, names, frozenset(silent))
 
 
 def seen_by_each(frames: Sequence[Measurements | None], names: Sequence[IntArray | None]) -> Seen:
@@ -99,7 +102,7 @@ def _masked(
 def _joined(used: Sequence[Used]) -> tuple[FloatArray, Float32Array, IntArray]:
     """Return sightings, descriptors and names of all measurements, one robot's after the other's.
 
-    Only names may be written, whatever came in: kernels are compiled for one kind of array.
+    What was measured may not be written, whatever came in: kernels are compiled for one kind of array.
     """
     if not used:
         return NO_SIGHTINGS, NO_DESCRIPTORS, NO_NAMES
@@ -115,15 +118,11 @@ def _joined(used: Sequence[Used]) -> tuple[FloatArray, Float32Array, IntArray]:
             covariances = np.concatenate([np.zeros((len(own[0]), 3, 3)) if own[1] is None else own[1] for own in used])
         if named:
             names = np.concatenate([np.zeros(len(own[0]), np.int64) if own[3] is None else own[3] for own in used])
-    covariances = NO_COVARIANCES if covariances is None else covariances
-    for array in (points, covariances, descriptors):
-        array.setflags(write=False)
-    return _sightings(points, covariances), descriptors, NO_NAMES if names is None else names
-
-
-def _sightings(points: FloatArray, covariances: FloatArray) -> FloatArray:
-    """Return points (n, 3) and their covariances (n, 3, 3), or none (0, 3, 3), in robot axes; see `StepInput`."""
+    points.setflags(write=False)
+    descriptors.setflags(write=False)
     sightings = np.empty((len(points), 9))
-    _kernels.to_robot_axes(points, covariances, sightings)
-    sightings.setflags(write=False)
-    return sightings
+    _kernels.to_robot_axes(points, sightings)
+    if covariances is not None:
+        covariances.setflags(write=False)
+        _kernels.noises_to_robot_axes(covariances, sightings)
+    return sightings, descriptors, NO_NAMES if names is None else names

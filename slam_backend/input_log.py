@@ -9,8 +9,8 @@ from slam_backend.errors import BoolArray, Float32Array, FloatArray, IntArray
 
 # Of one robot: what it did, where its used measurements begin and end among all n, whether these come with covariances,
 # and with names; and how many it was given, used or not, -1 where it has no frame. `_kernels.layout` names the numbers.
-Turn = tuple[int, int, int, bool, bool, int]
-UNHEARD: Turn = (IDLE, 0, 0, False, False, -1)
+Turn = Sequence[int]
+UNHEARD = (IDLE, 0, 0, 0, 0, -1)
 
 
 class StepInput(NamedTuple):
@@ -25,7 +25,7 @@ class StepInput(NamedTuple):
             -1, which are not.
         sightings: (n, 9) [m, m^2] all robots' measurements, one robot's after the other's, in robot axes: points (3)
             relative to the camera centre, and their covariances (6), upper triangles by rows, where they have any.
-        descriptors: (n, d).
+        descriptors: (n, d), read-only as those of the frames.
         names: (n,) the caller's names, or (0,) where no robot has any.
         silent: Robots of which there is nothing to take in. An empty frame is something: it says that nothing was there
             to see.
@@ -41,15 +41,14 @@ class StepInput(NamedTuple):
     silent: frozenset[int]
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Let copies and what was pickled be read-only, too: else kernels would be compiled anew for it."""
+        """Let copies' descriptors be read-only, too: else kernels would be compiled anew for them."""
         return _restored, tuple(self)
 
 
 def _restored(*columns: Any) -> StepInput:
     """Return a copy of an input of which these are the attributes."""
     inputs = StepInput(*columns)
-    for array in (inputs.table, inputs.moves, inputs.sightings, inputs.descriptors):
-        array.setflags(write=False)
+    inputs.descriptors.setflags(write=False)
     return inputs
 
 

@@ -1,14 +1,13 @@
 """What one robot's camera reports in one step: points, descriptors and, if the sensor knows them, covariances."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from slam_backend import _kernels
-from slam_backend.errors import FloatArray, bad_argument, check_array
+from slam_backend.errors import FloatArray, IntArray, bad_argument, check_array
 
 LARGEST_DESCRIPTOR = 1e6  # of one component; squares of distances then stay far from the end of float32
 LEAST_VARIANCE, LARGEST_VARIANCE = 1e-14, 1e12  # [m^2]; log-weights then keep their differences in float64
@@ -74,33 +73,29 @@ class TeamMeasurements(NamedTuple):
     Attributes:
         points: (n, 3) float64 [m], read-only. Each in the frame of its camera, robot by robot.
         descriptors: (n, d) float32, read-only. Likewise.
-        ends: Per robot where its points end; they begin where those before it end.
-        extent: Of all points, as of `Measurements`.
+        ends: (K,) int64. Per robot where its points end; they begin where those before it end.
     """
 
     points: FloatArray
     descriptors: NDArray[np.float32]
-    ends: Sequence[int]
-    extent: tuple[float, float]
+    ends: IntArray
 
     @classmethod
-    def trusted(cls, points: FloatArray, descriptors: NDArray[np.float32], ends: Sequence[int]) -> Self:
+    def trusted(cls, points: FloatArray, descriptors: NDArray[np.float32], ends: ArrayLike) -> Self:
         """Build them in a hot loop: no copies, no checks. The caller must not write to the arrays afterwards."""
         points.setflags(write=False)
         descriptors.setflags(write=False)
-        return cls(points, descriptors, ends, _kernels.extent(points))
+        return cls(points, descriptors, np.asarray(ends, np.int64))
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Let copies and what was pickled be read-only, too."""
-        return TeamMeasurements.trusted, (self.points, self.descriptors, self.ends)
+        return TeamMeasurements.trusted, tuple(self)
 
     def of_each(self) -> list[Measurements]:
-        """Return the frame of each robot. They share memory with this, and its extent: what bounds all bounds each."""
-        begins = [0, *self.ends[:-1]]
-        return [
-            _restored(self.points[begin:end], self.descriptors[begin:end], None, self.extent)
-            for begin, end in zip(begins, self.ends, strict=True)
-        ]
+        """Return the frame of each robot. They share memory with this."""
+        ends = self.ends.tolist()
+        cut = [(self.points[a:b], self.descriptors[a:b]) for a, b in zip([0, *ends[:-1]], ends, strict=True)]
+        return [_restored(points, looks, None, _kernels.extent(points)) for points, looks in cut]
 
 
 def _restored(

@@ -20,10 +20,10 @@ special case. With A = (dr/dx) C and S = Sigma + R, a match adds J = A^T S^-1 A 
 g = A^T S^-1 r to the gradient. A gate takes S + A P A^T, with P the covariance of xi.
 """
 
-from slam_backend._kernels.candidates import extent, to_robot_axes
 from slam_backend._kernels.landmark_updates import YOUNG
 from slam_backend._kernels.layout import CANDIDATE_ROWS, FAR, LANES, MIN_DEPTH, WORK_ROWS
 from slam_backend._kernels.places import carry_odds, refresh
+from slam_backend._kernels.readings import extent, noises_to_robot_axes, read_team, to_robot_axes
 from slam_backend._kernels.resampling import resample
 from slam_backend._kernels.start_frames import stand
 from slam_backend._kernels.turns import IDLE, MOVED, PLACED, STOOD, take_turns, write_sigmas
@@ -31,6 +31,6 @@ from slam_backend._kernels.weights import add_share, mixture
 
 __all__ = [
     "CANDIDATE_ROWS", "FAR", "IDLE", "LANES", "MIN_DEPTH", "MOVED", "PLACED", "STOOD", "WORK_ROWS", "YOUNG",
-    "add_share", "carry_odds", "extent", "mixture", "refresh", "resample", "stand", "take_turns",
-    "to_robot_axes", "write_sigmas",
+    "add_share", "carry_odds", "extent", "mixture", "noises_to_robot_axes", "read_team", "refresh", "resample", "stand",
+    "take_turns", "to_robot_axes", "write_sigmas",
 ]  # fmt: skip

@@ -1,7 +1,5 @@
 """Which landmarks may have caused a measurement, by their descriptors or names, for all particles at once."""
 
-import math
-
 import numpy as np
 
 from slam_backend._jit import any_order, jit, lanes
@@ -9,40 +7,6 @@ from slam_backend._kernels.layout import REJECTED
 from slam_backend.errors import Float32Array, FloatArray, IntArray
 
 RUN = 64  # descriptors looked at together
-
-
-@jit
-def extent(points: FloatArray) -> tuple[float, float]:
-    """Return the smallest depth Z and the largest coordinate, by magnitude, of points (n, 3), camera frame.
-
-    Both are NaN if any number is.
-    """
-    nearest, farthest = np.inf, 0.0
-    for n in range(len(points)):
-        nearest = min(nearest, points[n, 2])
-        for c in range(3):
-            if math.isnan(points[n, c]):
-                return np.nan, np.nan
-            farthest = max(farthest, abs(points[n, c]))
-    return nearest, farthest
-
-
-@jit
-def to_robot_axes(points: FloatArray, covariances: FloatArray, sightings: FloatArray) -> None:
-    """Turn points (n, 3) and covariances (n, 3, 3), or none (0, 3, 3), from camera axes to the robot's.
-
-    Args:
-        points, covariances: As measured.
-        sightings: (n, 9), written: points (3) relative to the camera centre, x ahead, y left, z up, and covariances
-            (6), upper triangles by rows, zeros for none.
-    """
-    turned, noises = sightings[:, :3], sightings[:, 3:]
-    for i in range(len(points)):
-        turned[i, 0], turned[i, 1], turned[i, 2] = points[i, 2], -points[i, 0], -points[i, 1]
-        noises[i] = 0.0
-    for i in range(len(covariances)):
-        noises[i, 0], noises[i, 1], noises[i, 2] = covariances[i, 2, 2], -covariances[i, 2, 0], -covariances[i, 2, 1]
-        noises[i, 3], noises[i, 4], noises[i, 5] = covariances[i, 0, 0], covariances[i, 0, 1], covariances[i, 1, 1]
 
 
 @lanes

@@ -86,7 +86,7 @@ def test_copies_are_as_kernels_take_them(readings: list[Reading], copied: Callab
     assert_same(tuple(twin), tuple(inputs))
     for name in ("table", "moves", "sightings", "descriptors", "names"):
         assert getattr(twin, name).flags.writeable == getattr(inputs, name).flags.writeable, name
-    assert not inputs.sightings.flags.writeable
+    assert not inputs.descriptors.flags.writeable
 
 
 @given(counts=st.lists(st.integers(0, 4), min_size=1, max_size=4), spoilt=st.booleans(), seed=st.integers(0, 99))

@@ -50,6 +50,7 @@ def in_one_piece(points: list[np.ndarray], ends: list[int], descriptors: int = 3
 
 
 ONE_BEHIND = in_one_piece([GOOD.points, GOOD.points, -GOOD.points], [1, 2, 3]).of_each()
+TOGETHER = in_one_piece([GOOD.points] * 3, [1, 2, 3])
 NO_NUMBER = in_one_piece([GOOD.points, GOOD.points, GOOD.points * np.nan], [1, 2, 3])
 ASYMMETRIC = np.array([[True, True, False], [False, True, False], [False, False, True]])
 BAD_STEPS: list[tuple[dict[str, Any], str]] = [
@@ -60,6 +61,16 @@ BAD_STEPS: list[tuple[dict[str, Any], str]] = [
     ({"odometry": np.diag([0.0, 0.0, np.nan])}, r"odometry\[2\]: expected finite numbers, got"),
     ({"odometry": np.diag([0.0, 0.0, 2e4])}, r"odometry\[2\]: expected numbers within \+-10000, got"),
     ({"odometry": np.zeros((3, 2))}, r"odometry\[0\]: expected an array of shape \(3,\), got shape \(2,\)"),
+    (
+        {"odometry": np.diag([0.0, 0.0, np.nan]), "measurements": TOGETHER},
+        r"odometry\[2\]: expected finite numbers, got",
+    ),
+    ({"odometry": np.diag([0.0, 0.0, -2e4]), "measurements": TOGETHER}, r"odometry\[2\]: expected numbers within \+-1"),
+    ({"odometry": np.zeros((3, 3)), "measurements": NO_NUMBER}, r"measurements\[2\]\.points: expected numbers within"),
+    (
+        {"odometry": np.zeros((3, 3)), "measurements": in_one_piece([GOOD.points] * 2 + [-GOOD.points], [1, 2, 3])},
+        r"measurements\[2\]\.points: expected depths Z >= .* m, got -2\.0\. Drop points at",
+    ),
     ({"odometry": [None, None, "ahead"]}, r"odometry\[2\]: expected an array of shape \(3,\), got 'ahead'"),
     ({"measurements": [GOOD, GOOD]}, r"measurements: expected a sequence with one entry per robot \(3\), got .*2"),
     ({"measurements": GOOD}, r"measurements: expected a sequence with one entry per robot \(3\)"),
@@ -76,7 +87,11 @@ BAD_STEPS: list[tuple[dict[str, Any], str]] = [
     ({"measurements": NO_NUMBER}, r"measurements\[2\]\.points: expected numbers within .*, got nan"),
     ({"measurements": NO_NUMBER.of_each()}, r"measurements\[2\]\.points: expected numbers within .*, got nan"),
     *(
-        ({"measurements": in_one_piece([GOOD.points] * 3, ends, count)}, r"measurements: expected a descriptor per po")
+        (
+            {"measurements": in_one_piece([GOOD.points] * 3, ends, count), "odometry": moves},
+            r"measurements: expected a descriptor per po",
+        )
+        for moves in (STILL, np.zeros((3, 3)))
         for ends, count in (([1, 2, 9], 3), ([1, 2, 2], 3), ([2, 1, 3], 3), ([-1, 2, 3], 3), ([1, 2, 3], 2), ([], 3))
     ),
     ({"identities": [[1], [1]]}, r"identities: expected a sequence with one entry per robot \(3\)"),
