@@ -207,7 +207,9 @@ class CandidateSlots:
         places = positions_array(teammates, "teammates")
         poses = np.zeros((1, 1 + len(places), 3))
         poses[0, 0], poses[0, 1:, :2] = pose_floats(pose), places
-        return np.asarray(_described(self._rows[None], poses)[0])
+        features = np.empty((1, NUM_SLOTS, NUM_FEATURES), np.float32)
+        _describe(self._rows[None], poses, features)
+        return np.asarray(features[0])
 
     def get_state(self) -> dict[str, Any]:
         """Return a copy of all that `set_state` needs to continue bit by bit."""
@@ -244,11 +246,6 @@ class TeamSlots:
         Returns:
             `CandidateSlots.features` (K, 16, 5). A fresh array.
         """
-        return _described(self._rows, poses)
-
-
-def _described(rows: FloatArray, poses: FloatArray) -> NDArray[np.float32]:
-    """Return what `TeamSlots.features` does, of slots with these rows (K, 16, ...)."""
-    features = np.empty((len(rows), NUM_SLOTS, NUM_FEATURES), np.float32)
-    _describe(rows, poses, features)
-    return features
+        features = np.empty((len(self._rows), NUM_SLOTS, NUM_FEATURES), np.float32)
+        _describe(self._rows, poses, features)
+        return features

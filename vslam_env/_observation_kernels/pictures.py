@@ -4,11 +4,9 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam_backend._jit import jit
 from vslam_env.navigation import CELL, FREE, GRID_SIZE, OCCUPIED, UNKNOWN
-from vslam_env.robot_belief import View
 
 SIZE = 48
 CHANNELS = ("free", "occupied", "landmarks")
@@ -17,18 +15,18 @@ REACH = 0.75 * SIZE  # [cells] more than from the robot to a corner of its pictu
 
 
 @jit
-def _paint(cells: Any, pose: Any, start_from_group: Any, means: Any, local: Any) -> None:
+def paint(cells: Any, pose: Any, start_from_group: Any, means: Any, local: Any) -> None:
     """Sample the seen grid at the centres of the local cells, and mark the cells that hold landmarks.
 
-    Each row of `local` (3, 48, 48) is written in short loops without branches, which become vector instructions but for
-    the look-up itself.
+    Rows go from 4.8 m ahead to 4.8 m behind, columns from 4.8 m to the left to 4.8 m to the right. Each row is written
+    in short loops without branches, which become vector instructions but for the look-up itself.
 
     Args:
         cells: (300, 300) uint8. Of the seen grid.
         pose: (3,) [m, m, rad], start frame. Of the robot.
         start_from_group: (3,) [m, m, rad]. Moves the landmarks to the start frame.
         means: (n, 3) [m]. Of the landmarks.
-        local: Written to.
+        local: (3, 48, 48) uint8. Channels free, occupied, landmarks, of cells of 0.2 m, 0 or 255. Written to.
     """
     x, y = pose[0], pose[1]
     c, s = math.cos(pose[2]), math.sin(pose[2])
@@ -65,23 +63,3 @@ def _paint(cells: Any, pose: Any, start_from_group: Any, means: Any, local: Any)
         col = math.floor(middle - (c * dy - s * dx) / CELL)
         if 0 <= row < SIZE and 0 <= col < SIZE:
             local[2, row, col] = MARK
-
-
-@jit
-def _paint_all(cells: Any, poses: Any, starts: Any, means: Any, parts: Any, local: Any) -> None:
-    """Write what `local_grids` returns; cells (n, 300, 300), poses and starts (n, 3), parts (n, 2) as in `View`."""
-    for k in range(len(poses)):
-        _paint(cells[k], poses[k], starts[k], means[parts[k, 0] : parts[k, 1]], local[k])
-
-
-def local_grids(view: View) -> NDArray[np.uint8]:
-    """Return the robots' surroundings as they believe them to be.
-
-    Returns:
-        (n, 3, 48, 48) uint8, robot frames, cells of 0.2 m that are 0 or 255. Channels free, occupied, landmarks. Rows
-        go from 4.8 m ahead to 4.8 m behind, columns from 4.8 m to the left to 4.8 m to the right. A fresh array.
-    """
-    local = np.empty((len(view.robots), len(CHANNELS), SIZE, SIZE), np.uint8)
-    points, (rows, parts) = view.points, view.outlines
-    _paint_all(view.cells, points.own, points.starts, rows.means, parts, local)
-    return local

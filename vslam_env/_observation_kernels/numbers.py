@@ -1,0 +1,86 @@
+"""The parts of observations that are no pictures, clipped to the bounds of their spaces."""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from slam_backend._jit import jit
+
+MOST_TEAMMATES = 7
+POSE_LIMIT = np.array([30.0, 30.0, np.pi])
+FAR = 90.0  # [m] more than the diagonal of the seen grid
+MAP_STATS_LIMIT = np.array([10_000.0, 10.0, 10.0, 10_000.0, 1.0, 1.0 + MOST_TEAMMATES])
+
+
+@jit
+def _clip(value: float, low: float, high: float) -> Any:
+    """Clip to bounds that are rounded as those of the space are."""
+    return min(max(np.float32(value), np.float32(low)), np.float32(high))
+
+
+@jit
+def write_numbers(
+    pose: Any, covariance: Any, variances: Any, counts: Any, ess: float, group_size: int, row: Any
+) -> None:
+    """Write `pose`, `pose_std` and `map_stats` of a robot.
+
+    Args:
+        pose, covariance: (3,) [m, m, rad], (3, 3). Where it is.
+        variances, counts: (m,) float64 [m^2], (m,) int64. Of its landmarks: the traces of their covariances, and how
+            often each was measured.
+        ess: Of its filter, as a share of the particles.
+        group_size: Robots that share its map.
+        row: (12,) float32. Written to.
+    """
+    for i in range(3):
+        row[i] = _clip(pose[i], -POSE_LIMIT[i], POSE_LIMIT[i])
+        row[3 + i] = _clip(math.sqrt(covariance[i, i]), 0.0, POSE_LIMIT[i])
+    total = largest = 0.0
+    times = 0
+    for landmark in range(len(variances)):
+        sigma = math.sqrt(variances[landmark] / 3.0)
+        total += sigma
+        largest = max(largest, sigma)
+        times += counts[landmark]
+    held = max(len(variances), 1)
+    row[6] = _clip(len(variances), 0.0, MAP_STATS_LIMIT[0])
+    row[7] = _clip(total / held, 0.0, MAP_STATS_LIMIT[1])
+    row[8] = _clip(largest, 0.0, MAP_STATS_LIMIT[2])
+    row[9] = _clip(times / held, 0.0, MAP_STATS_LIMIT[3])
+    row[10] = _clip(ess, 0.0, MAP_STATS_LIMIT[4])
+    row[11] = _clip(group_size, 0.0, MAP_STATS_LIMIT[5])
+
+
+@jit
+def write_teammates(robot: int, pose: Any, poses: Any, sigmas: Any, teammates: Any, present: Any) -> int:
+    """Write where a robot believes the others of its group to be; return how many these are.
+
+    Args:
+        robot: Its index.
+        pose: (3,) [m, m, rad], start frame. Its own.
+        poses, sigmas: (N, 3), (N,). Of all robots, start frame; NaN: it does not know.
+        teammates: (7, 5) float32. Written to, as what follows.
+        present: (7,) int8. `teammates_mask`.
+    """
+    teammates[:], present[:] = 0.0, 0
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    known = 0
+    for mate in range(len(poses)):
+        if mate != robot and not np.isnan(poses[mate, 0]):
+            known += 1
+            to, place = teammates[mate - (mate > robot)], poses[mate]
+            dx, dy, turn = place[0] - pose[0], place[1] - pose[1], place[2] - pose[2]
+            to[0], to[1] = _clip(c * dx + s * dy, -FAR, FAR), _clip(c * dy - s * dx, -FAR, FAR)
+            to[2], to[3] = np.float32(math.cos(turn)), np.float32(math.sin(turn))
+            to[4] = _clip(sigmas[mate], -FAR, FAR)
+            present[mate - (mate > robot)] = 1
+    return known
+
+
+@jit
+def clip_candidates(features: Any) -> None:
+    """Clip the features (16, 5) float32 of a robot's candidates."""
+    for i in range(features.shape[0]):
+        for j in range(features.shape[1]):
+            features[i, j] = _clip(features[i, j], -FAR, FAR)

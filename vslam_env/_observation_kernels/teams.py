@@ -1,0 +1,37 @@
+"""All that some robots observe, written in one call."""
+
+from typing import Any
+
+from slam_backend._jit import jit
+from vslam_env._observation_kernels.numbers import clip_candidates, write_numbers, write_teammates
+from vslam_env._observation_kernels.pictures import paint
+
+
+@jit
+def observe_team(
+    robots: Any, poses: Any, sigmas: Any, own: Any, covariances: Any, starts: Any, ess: Any,
+    means: Any, variances: Any, counts: Any, parts: Any, cells: Any, scans: Any,
+    numbers: Any, ranges: Any, candidates: Any, teammates: Any, present: Any, pictures: Any,
+) -> None:  # fmt: skip
+    """Write what robots observe.
+
+    Args:
+        robots: As in `View`.
+        poses, sigmas, own, covariances, starts, ess: Of its points.
+        means, variances, counts, parts: (N, 3) [m], (N,) float64 [m^2], (N,) int64, (n, 2) int64. Of its outlines.
+        cells: Of the view.
+        scans: (n, R) float64 [m].
+        numbers: (n, 12) float32: `pose`, `pose_std`, `map_stats`. Written to, as all that follow.
+        ranges: (n, R) float32: `scan`.
+        candidates: (n, 16, 5) float32, as they are without bounds.
+        teammates: (n, 7, 5) float32.
+        present: (n, 7) int8: `teammates_mask`.
+        pictures: (n, 3, 48, 48) uint8: `local_grid`.
+    """
+    ranges[:] = scans
+    for k in range(len(robots)):
+        held = slice(parts[k, 0], parts[k, 1])
+        known = write_teammates(robots[k], own[k], poses[k], sigmas[k], teammates[k], present[k])
+        write_numbers(own[k], covariances[k], variances[held], counts[held], ess[k], 1 + known, numbers[k])
+        clip_candidates(candidates[k])
+        paint(cells[k], own[k], starts[k], means[held], pictures[k])
