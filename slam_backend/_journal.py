@@ -60,8 +60,8 @@ def write_down(entries: Sequence[Entry], logs: Sequence[RobotLog], smoother: Rej
             log.extend(row, steps, table, moves, sightings, found)
             if smoother is not None:
                 acts = turns[:, row, ACT]
-                heard = np.flatnonzero(acts | (turns[:, row, COUNT] > 0))
-                smoother.note(robot, steps[heard], means[heard, robot], bool((acts == PLACED).any()))
+                (heard,) = (acts | (turns[:, row, COUNT] > 0)).nonzero()
+                smoother.note(robot, steps[heard], means[heard, robot], PLACED in acts.tolist())
                 _tell_refused(smoother, robot, row, entries)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend._jit import inlined, jit
-from slam_backend.errors import FloatArray, IntArray
+from slam_backend.errors import BoolArray, FloatArray, IntArray
 from slam_backend.log_arrays import ODOMETRY, REJECTED
 
 
@@ -112,18 +112,22 @@ def walk(
 
 @jit
 def choose(
-    ids: IntArray, points: FloatArray, starts: IntArray, num: int, frame: int, names: IntArray,
-    taken: FloatArray, rows: IntArray, frames: IntArray, counts: IntArray,
+    ids: IntArray, points: FloatArray, given: BoolArray, covariances: FloatArray, starts: IntArray, num: int,
+    frame: int, counts: IntArray, taken: FloatArray, noises: FloatArray, taken_given: BoolArray, frames: IntArray,
+    names: IntArray,
 ) -> int:  # fmt: skip
     """Take the measurements of a log of T steps that bear a name.
 
     Args:
         ids, points: (n,) int64, (n, 3) [m]. Names of the measurements, `REJECTED` for none; and where they lie.
+        given: (T,) whether those of a step came with covariances.
+        covariances: (n, 6) [m^2], (0, 6) where there are none at all.
         starts: (T + 1,) int64. Those of step t are starts[t] to starts[t + 1].
         num, frame: How many measurements and frames there are before.
-        names, taken, rows, frames: (m, ...), written from row `num` on: name and point of each that is taken, its row
-            in the log, and its frame; a step of which any is taken makes one.
         counts: (T,) int64, result: how many of each step are taken.
+        taken, noises, taken_given, frames, names: (m, ...), written from row `num` on: point of each that is taken, its
+            covariance, zeros without, whether it was given, its frame, and its name; a step of which any is taken makes
+            one frame.
 
     Returns:
         How many measurements there are then.
@@ -132,7 +136,11 @@ def choose(
         first = num
         for row in range(starts[t], starts[t + 1]):
             if ids[row] != REJECTED:
-                names[num], taken[num], rows[num], frames[num] = ids[row], points[row], row, frame
+                taken[num], taken_given[num], frames[num], names[num] = points[row], given[t], frame, ids[row]
+                if len(covariances) > 0:
+                    noises[num] = covariances[row]
+                else:
+                    noises[num] = 0.0
                 num += 1
         counts[t] = num - first
         frame += num > first
@@ -150,27 +158,62 @@ def rename(names: IntArray, aliases: IntArray) -> None:
 
 
 @jit
+def number(names: IntArray, order: IntArray, ids: IntArray, first: IntArray) -> int:
+    """Number the landmarks of measurements; those that are new come after the known ones.
+
+    Args:
+        names: (n,) int64. Of each measurement's landmark; changed: its row of `ids`.
+        order: (l,) int64. Rows of the known landmarks by ascending name.
+        ids: (l + n,) int64. Their names, each once; those of the new ones are written from row l on.
+        first: (n,) int64, result, of which the first rows are written: the first measurement of each new one.
+
+    Returns:
+        How many landmarks there are then.
+    """
+    known, num = len(order), len(order)
+    for n in range(len(names)):
+        name, low, high = names[n], 0, known
+        while low < high:
+            middle = (low + high) // 2
+            if ids[order[middle]] < name:
+                low = middle + 1
+            else:
+                high = middle
+        row = order[low] if low < known and ids[order[low]] == name else known
+        if row == known:
+            while row < num and ids[row] != name:
+                row += 1
+            if row == num:
+                ids[num], first[num - known] = name, n
+                num += 1
+        names[n] = row
+    return num
+
+
+@jit
 def place(
     poses: FloatArray, frame_keys: IntArray, offsets: FloatArray, frames: IntArray, points: FloatArray,
-    mount: FloatArray, places: FloatArray,
+    chosen: IntArray, mount: FloatArray, places: FloatArray,
 ) -> None:  # fmt: skip
-    """Write where measured points lie in the map.
+    """Write where some measured points lie in the map.
 
     Args:
         poses: (k, 3) float64 [m, m, rad]. Of the keys, map frame.
         frame_keys, offsets: (f,), (f, 3) key of each frame, and the frame seen from it.
         frames, points: (n,), (n, 3) [m] frame of each point, and the point, robot axes, from the camera centre.
+        chosen: (m,) which of them.
         mount: (3,) [m] of the camera on the robot.
-        places: (n, 3) [m], map frame, result.
+        places: (m, 3) [m], map frame, result.
     """
-    for n in range(len(points)):
-        pose, offset = poses[frame_keys[frames[n]]], offsets[frames[n]]
+    for i in range(len(chosen)):
+        point, frame = points[chosen[i]], frames[chosen[i]]
+        pose, offset = poses[frame_keys[frame]], offsets[frame]
         c, s = math.cos(pose[2]), math.sin(pose[2])
         x, y = pose[0] + c * offset[0] - s * offset[1], pose[1] + s * offset[0] + c * offset[1]
         c, s = math.cos(pose[2] + offset[2]), math.sin(pose[2] + offset[2])
-        ahead, left = points[n, 0] + mount[0], points[n, 1] + mount[1]
-        places[n, 0], places[n, 1] = x + c * ahead - s * left, y + s * ahead + c * left
-        places[n, 2] = points[n, 2] + mount[2]
+        ahead, left = point[0] + mount[0], point[1] + mount[1]
+        places[i, 0], places[i, 1] = x + c * ahead - s * left, y + s * ahead + c * left
+        places[i, 2] = point[2] + mount[2]
 
 
 @jit

@@ -1,21 +1,23 @@
 """`extended`: a graph takes in what the robots did since; steps without measurements are chained away."""
 
+import math
 from collections.abc import Sequence
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend.errors import BoolArray, FloatArray, IntArray, bad_argument
+from slam_backend.errors import FloatArray, IntArray, bad_argument
 from slam_backend.geometry import compose, rotation
 from slam_backend.log_arrays import EXACT, LogArrays
 from slam_backend.motion import OdometryModel
-from slam_backend.smoothing._walking import choose, place, start_anew, walk
-from slam_backend.smoothing.graph import LEVER, OF_FRAMES, OF_KEYS, PathGraph
+from slam_backend.smoothing._walking import choose, number, place, rename, start_anew, walk
+from slam_backend.smoothing.graph import LEVER, OF_FRAMES, OF_KEYS, OF_LANDMARKS, OF_POINTS, PathGraph
 from slam_backend.smoothing.guesses import Guesses
 
 LEAST_NOISE = 1e-5  # [m, rad] of odometry in one step: where a part has none, as with no floors, nothing is singular
+NO_COVARIANCES = np.empty((0, 6))
+NO_COVARIANCES.setflags(write=False)  # as those of logs are
 
 
 class Places(NamedTuple):
@@ -28,15 +30,6 @@ class Places(NamedTuple):
 
     ids: IntArray
     means: FloatArray
-
-
-class _Measured(NamedTuple):
-    """New measurements: names of their landmarks (n,), points (n, 3), frames (n,); rows (m,) in each robot's log."""
-
-    names: IntArray
-    points: FloatArray
-    frames: IntArray
-    rows: list[IntArray]
 
 
 def extended(
@@ -68,71 +61,75 @@ def extended(
     Raises:
         ValueError: If a log holds a pose that was given as exact: there is nothing to smooth.
     """
-    columns, new = _walked(graph, logs, motion, _supposed(logs, guesses), rigid_within)
-    landmark_ids, rows, first = _numbered(graph.landmark_ids, graph.known_as(new.names))
-    first_seen = np.empty((len(first), 3))
+    steps, most = sum(map(len, logs)), sum(len(log.ids) for log in logs)
+    room = {OF_KEYS: steps, OF_FRAMES: steps, OF_POINTS: most, OF_LANDMARKS: most}
+    columns = {name: _with_room(getattr(graph, name), more) for names, more in room.items() for name in names}
+    supposed = _supposed(logs, guesses)
+    keys, frames, points, tips = _walked(graph, logs, motion, supposed, rigid_within, columns)
+    old, known = len(graph.points), len(graph.landmarks)
+    new, first = columns["point_landmarks"][old:points], np.empty(points - old, dtype=np.int64)  # as yet names
+    rename(new, graph.aliases)
+    landmarks = number(new, graph.landmark_ids.argsort(), columns["landmark_ids"], first)
     place(
-        columns["poses"], columns["frame_keys"], columns["frame_offsets"], new.frames[first], new.points[first], mount,
-        first_seen,
+        columns["poses"], columns["frame_keys"], columns["frame_offsets"], columns["point_frames"][old:points],
+        columns["points"][old:points], first[: landmarks - known], mount, columns["landmarks"][known:landmarks],
     )  # fmt: skip
-    landmarks = np.concatenate([graph.landmarks, first_seen])
-    if places is not None and len(places.ids) and guesses is not None and all(map(_guided, logs, guesses)):
+    if places is not None and len(places.ids) and guesses is not None and all(map(_guided, logs, supposed)):
         start_anew(
-            graph.frozen_landmarks, graph.counts, graph.point_landmarks, rows, landmark_ids, places.ids, places.means,
-            landmarks,
+            graph.frozen_landmarks, graph.counts, graph.point_landmarks, new, columns["landmark_ids"][:landmarks],
+            places.ids, places.means, columns["landmarks"][:landmarks],
         )  # fmt: skip
-    latest = [log.steps[-1] if len(log) else before for log, before in zip(logs, graph.latest, strict=True)]
+    latest = [int(log.steps[-1]) if len(log) else before for log, before in zip(logs, graph.latest, strict=True)]
+    used = {OF_KEYS: keys, OF_FRAMES: frames, OF_POINTS: points, OF_LANDMARKS: landmarks}
     return graph.with_columns(
-        **columns,
-        points=np.concatenate([graph.points, new.points]),
-        point_noises=np.concatenate([graph.point_noises, *map(_noises, logs, new.rows)]),
-        given=np.concatenate([graph.given, *map(_given, logs, new.rows)]),
-        point_frames=np.concatenate([graph.point_frames, new.frames]),
-        point_landmarks=np.concatenate([graph.point_landmarks, rows]),
-        landmark_ids=landmark_ids,
-        landmarks=landmarks,
+        **{name: columns[name][:num] for names, num in used.items() for name in names},
+        tips=tips,
         latest=np.array(latest, dtype=np.int64),
     )
 
 
 def _walked(
-    graph: PathGraph, logs: Sequence[LogArrays], motion: OdometryModel, guesses: FloatArray, rigid_within: float
-) -> tuple[dict[str, NDArray[Any]], _Measured]:
-    """Walk through the robots' new steps: the graph's columns of keys and frames with the new ones, what was measured.
+    graph: PathGraph, logs: Sequence[LogArrays], motion: OdometryModel, supposed: Sequence[FloatArray],
+    rigid_within: float, columns: dict[str, NDArray[Any]],
+) -> tuple[int, int, int, IntArray]:  # fmt: skip
+    """Walk through the robots' new steps: which of them become keys, and what was measured.
 
     Args:
         graph, logs, motion, rigid_within: As of `extended`.
-        guesses: (T, 3) of `_supposed`.
+        supposed: Of `_supposed`.
+        columns: Of the graph with room; those of keys, frames and measurements are written, with landmarks' names in
+            place of their rows.
+
+    Returns:
+        How many keys, frames and measurements there are then, and the newest key of each robot (K,).
     """
-    steps, most = len(guesses), sum(len(log.ids) for log in logs)
-    columns = {name: _with_room(getattr(graph, name), steps) for name in (*OF_KEYS, *OF_FRAMES)}
-    tips, counts, points = graph.tips.copy(), np.empty(steps, dtype=np.int64), np.empty((most, 3))
-    names, rows, frames = (np.empty(most, dtype=np.int64) for _ in range(3))
+    tips = graph.tips.copy()
     variances = motion.variances(np.concatenate([log.motions for log in logs]))
     if not motion.is_exact:
         variances = np.maximum(variances, LEAST_NOISE**2)
-    num_keys, num_frames, ends, first = graph.num_keys, len(graph.frame_keys), [0], 0
+    of_points = [columns[name] for name in OF_POINTS]
+    of_keys_and_frames = [columns[name] for name in (*OF_KEYS, *OF_FRAMES)]
+    keys, frames, points, first = graph.num_keys, len(graph.frame_keys), len(graph.points), 0
     for robot, log in enumerate(logs):
-        if (log.kinds == EXACT).any():
+        if EXACT in log.kinds.tolist():
             raise bad_argument("logs", "odometry", "a pose that was given as exact", "There is nothing to smooth.")
-        own = slice(first, first := first + len(log))
-        end = choose(log.ids, log.points, log.starts, ends[-1], num_frames, names, points, rows, frames, counts[own])
-        num_keys, num_frames = walk(
-            log.kinds, log.motions, variances[own], counts[own], guesses[own], robot, rigid_within, LEVER, num_keys,
-            num_frames, tips, *columns.values(),
+        own, counts = slice(first, first := first + len(log)), np.empty(len(log), dtype=np.int64)
+        covariances = NO_COVARIANCES if log.covariances is None else log.covariances
+        points = choose(
+            log.ids, log.points, log.given, covariances, log.starts, points, frames, counts, *of_points
         )  # fmt: skip
-        ends.append(end)
-    used = {name: columns[name][:num_keys] for name in OF_KEYS}
-    used |= {name: columns[name][:num_frames] for name in OF_FRAMES}
-    of_robots = [rows[start:end] for start, end in pairwise(ends)]
-    return used | {"tips": tips}, _Measured(names[: ends[-1]], points[: ends[-1]], frames[: ends[-1]], of_robots)
+        keys, frames = walk(
+            log.kinds, log.motions, variances[own], counts, supposed[robot], robot, rigid_within, LEVER, keys, frames,
+            tips, *of_keys_and_frames,
+        )  # fmt: skip
+    return keys, frames, points, tips
 
 
-def _supposed(logs: Sequence[LogArrays], guesses: Sequence[Guesses] | None) -> FloatArray:
-    """Return (T, 3) [m, m, rad] where robots are thought to be after the steps of all logs; NaN: nobody says."""
+def _supposed(logs: Sequence[LogArrays], guesses: Sequence[Guesses] | None) -> list[FloatArray]:
+    """Return (T, 3) [m, m, rad] of each log: where its robot is thought to be after its steps; NaN: nobody says."""
     if guesses is None:
-        return np.full((sum(map(len, logs)), 3), np.nan)
-    return np.concatenate([guessed.at(log.steps) for log, guessed in zip(logs, guesses, strict=True)])
+        return [np.full((len(log), 3), np.nan) for log in logs]
+    return [guessed.at(log.steps) for log, guessed in zip(logs, guesses, strict=True)]
 
 
 def _with_room(column: NDArray[Any], extra: int) -> NDArray[Any]:
@@ -142,34 +139,10 @@ def _with_room(column: NDArray[Any], extra: int) -> NDArray[Any]:
     return longer
 
 
-def _guided(log: LogArrays, guesses: Guesses) -> bool:
-    """Return whether there is a guess for the first step that measured something, and so for all."""
+def _guided(log: LogArrays, poses: FloatArray) -> bool:
+    """Return whether it is supposed where (T, 3) the first step that measured something was, and so all."""
     t = int(log.starts.searchsorted(0, side="right")) - 1
-    return t == len(log) or bool((guesses.steps == log.steps[t]).any())
-
-
-def _given(log: LogArrays, rows: IntArray) -> BoolArray:
-    """Return (n,) whether the sensor gave the covariances of these measurements."""
-    if not log.given.any():
-        return np.zeros(len(rows), dtype=np.bool_)
-    return np.repeat(log.given, np.diff(log.starts))[rows]
-
-
-def _noises(log: LogArrays, rows: IntArray) -> FloatArray:
-    """Return these covariances (n, 6) [m^2], robot axes; zeros where none were given."""
-    return np.zeros((len(rows), 6)) if log.covariances is None else log.covariances[rows]
-
-
-def _numbered(known: IntArray, names: IntArray) -> tuple[IntArray, IntArray, list[int]]:
-    """Return all names, known ones (l,) first, the row of each of `names` (n,), and which of these were new."""
-    row_of = {name: row for row, name in enumerate(known.tolist())}
-    new, rows = [], []
-    for n, name in enumerate(names.tolist()):
-        if name not in row_of:
-            row_of[name] = len(row_of)
-            new.append(n)
-        rows.append(row_of[name])
-    return np.concatenate([known, names[new]]), np.array(rows, dtype=np.int64), new
+    return t == len(log) or not math.isnan(poses[t, 0])
 
 
 def chained(
@@ -195,7 +168,9 @@ def chained(
 
 def first_rows(log: LogArrays, count: int) -> LogArrays:
     """Return the first `count` steps of a log, all if it has no more; the arrays are views."""
-    end = int(log.starts[min(count, len(log))])
+    if count >= len(log):
+        return log
+    end = int(log.starts[count])
     return LogArrays(
         steps=log.steps[:count], kinds=log.kinds[:count], motions=log.motions[:count], given=log.given[:count],
         starts=log.starts[: count + 1], points=log.points[:end], ids=log.ids[:end],

@@ -9,7 +9,7 @@ from small_problems import camera_of, graph_of, logs_of, small_run
 from slam_backend.geometry import between, compose, transform_points, wrap_angle
 from slam_backend.log_arrays import ODOMETRY, REJECTED, STOOD
 from slam_backend.motion import OdometryModel
-from slam_backend.smoothing._walking import choose, place, rename, start_anew, walk
+from slam_backend.smoothing._walking import choose, number, place, rename, start_anew, walk
 from slam_backend.smoothing.extending import chained, extended
 from slam_backend.smoothing.graph import LEVER, PathGraph
 from slam_backend.smoothing.options import SmoothingOptions
@@ -88,17 +88,39 @@ def test_the_compiled_walk_is_the_plain_one(steps, rigid_within, seed):
         np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
 
 
-def test_measurements_with_names_are_taken():
+@pytest.mark.parametrize("covered", [False, True])
+def test_measurements_with_names_are_taken(covered):
     """Which rows bear a name, and of which frame they are if each step with such a row makes one; others stay."""
     ids, starts = np.array([4, REJECTED, 9, REJECTED, 4, 2]), np.array([0, 0, 3, 4, 5, 6])
-    points, taken = np.random.default_rng(3).normal(size=(6, 3)), np.zeros((8, 3))
-    names, rows, frames, counts = np.full(8, -7), np.full(8, -7), np.full(8, -7), np.empty(5, dtype=np.int64)
-    assert choose(ids, points, starts, 2, 5, names, taken, rows, frames, counts) == 6
+    rng, rows = np.random.default_rng(3), [0, 2, 4, 5]
+    points, covariances = rng.normal(size=(6, 3)), rng.normal(size=(6 if covered else 0, 6))
+    given_steps = np.array([False, True, False, False, True]) & covered
+    taken, noises, marks = np.full((8, 3), -7.0), np.full((8, 6), -7.0), np.zeros(8, dtype=np.bool_)
+    names, frames, counts = np.full(8, -7), np.full(8, -7), np.empty(5, dtype=np.int64)
+    num = choose(ids, points, given_steps, covariances, starts, 2, 5, counts, taken, noises, marks, frames, names)
+    assert num == 6
     assert counts.tolist() == [0, 2, 0, 1, 1]
-    assert rows.tolist() == [-7, -7, 0, 2, 4, 5, -7, -7]
     assert names.tolist() == [-7, -7, 4, 9, 4, 2, -7, -7]
     assert frames.tolist() == [-7, -7, 5, 5, 6, 7, -7, -7]
-    np.testing.assert_array_equal(taken[2:6], points[[0, 2, 4, 5]])
+    assert marks.tolist() == [False, False, covered, covered, False, covered, False, False]
+    np.testing.assert_array_equal(taken[2:6], points[rows])
+    np.testing.assert_array_equal(noises[2:6], covariances[rows] if covered else np.zeros((4, 6)))
+    assert (taken[[0, 1, 6, 7]] == -7.0).all()
+
+
+@given(st.lists(st.integers(0, 9), unique=True, max_size=8), st.lists(st.integers(0, 12), max_size=20))
+def test_landmarks_are_numbered_as_they_come(known, names):
+    """A known landmark keeps its row, a new one gets the next at its first measurement."""
+    expected = {name: row for row, name in enumerate(known)}
+    first = [n for n, name in enumerate(names) if name not in known and name not in names[:n]]
+    for n in first:
+        expected[names[n]] = len(expected)
+    rows, ids, firsts = np.array(names, dtype=np.int64), np.full(len(known) + len(names), -7), np.full(len(names), -7)
+    ids[: len(known)] = known
+    assert number(rows, np.argsort(known).astype(np.int64), ids, firsts) == len(expected)
+    assert rows.tolist() == [expected[name] for name in names]
+    assert ids[: len(expected)].tolist() == list(expected)
+    assert firsts[: len(first)].tolist() == first
 
 
 @given(st.lists(st.integers(0, 5), max_size=8), st.lists(st.tuples(st.integers(0, 5), st.integers(0, 5)), max_size=4))
@@ -116,11 +138,12 @@ def test_points_are_placed_by_their_frames():
     rng = np.random.default_rng(6)
     poses, offsets, mount = rng.normal(size=(3, 3)), rng.normal(size=(5, 3)), rng.normal(size=3)
     frame_keys, frames, points = rng.integers(0, 3, 5), rng.integers(0, 5, 20), rng.normal(size=(20, 3))
-    found = np.empty((20, 3))
-    place(poses, frame_keys, offsets, frames, points, mount, found)
-    for n, frame in enumerate(frames):
-        at = compose(poses[frame_keys[frame]], offsets[frame])
-        np.testing.assert_allclose(found[n], transform_points(at, points[n] + mount), atol=1e-12)
+    chosen = rng.permutation(20)[:12]
+    found = np.empty((12, 3))
+    place(poses, frame_keys, offsets, frames, points, chosen, mount, found)
+    for n, place_of_n in zip(chosen, found, strict=True):
+        at = compose(poses[frame_keys[frames[n]]], offsets[frames[n]])
+        np.testing.assert_allclose(place_of_n, transform_points(at, points[n] + mount), atol=1e-12)
 
 
 def test_landmarks_start_anew_that_have_more_new_measurements_than_old():
