@@ -8,17 +8,18 @@ path, and what the motions scattered is kept as one covariance, of which any est
 (Rao and Blackwell: the motion, given all else, is integrated out and not sampled).
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
-from slam_backend._jit import lanes
+from slam_backend._jit import jit, lanes
 from slam_backend.errors import FloatArray, IntArray
-from slam_backend.geometry import compose, inverse, wrap_angle
+from slam_backend.geometry import inverse
 from slam_backend.smoothing._kernels import LANES
 from slam_backend.smoothing.graph import LEVER
 
-PLANE = [0, 1, 3, 6]  # rows of a tile: where a landmark is in the plane, and its variances there
+XX, YY = 3, 6  # rows of a tile: variances of a landmark in the plane
 LEAST_SHARED = 2  # landmarks that say how a particle is turned
 
 
@@ -27,10 +28,12 @@ class Held:
     """How particles are moved.
 
     Attributes:
+        poses: (K, 3, M) float64 [m, m, rad], map frame. Newest poses of the particles, moved.
         motions: (M, 3) float64 [m, m, rad], map frame. What moves each particle.
         scatter: (3, 3) float64 [m, m, rad]. Covariance of their inverses, which the particles no longer show.
     """
 
+    poses: FloatArray
     motions: FloatArray
     scatter: FloatArray
 
@@ -55,18 +58,18 @@ def holding(
     """
     if len(seen) < LEAST_SHARED:
         return None
-    m = poses.shape[2]
-    rows = tiles[seen[:, None], :, PLANE].reshape(len(seen), len(PLANE), -1)[:, :, :m]
-    targets = landmarks[seen, :2]
-    off = rows[:, :2] - targets[:, :, None]
-    squares = off * off
-    spread = (squares[:, 0] + squares[:, 1] + rows[:, 2] + rows[:, 3]) @ weights
-    motions = _fitted(rows[:, :2], targets, 1.0 / np.maximum(spread, 1e-300))
-    moved = compose(motions, poses.transpose(0, 2, 1)).transpose(0, 2, 1)
-    if not _scatter(moved, means, weights) < _scatter(poses, means, weights):
+    n, m = len(seen), poses.shape[2]
+    targets, points, squares = landmarks[seen, :2], np.empty((n, 2, m)), np.empty((n, m))
+    look_at(tiles, seen, targets, points, squares)
+    motions = _fitted(points, targets, 1.0 / np.maximum(squares @ weights, 1e-300))
+    moved, off, off_moved = np.empty_like(poses), np.empty(m), np.empty(m)
+    move(poses, motions, moved)
+    measure_off(poses, means, LEVER, off)
+    measure_off(moved, means, LEVER, off_moved)
+    if not (off_moved * weights).sum() < (off * weights).sum():
         return None
     back = inverse(motions)
-    return Held(motions, np.asarray(np.einsum("m,mi,mj->ij", weights, back, back)))  # (9)
+    return Held(moved, motions, np.asarray(np.einsum("m,mi,mj->ij", weights, back, back)))  # (9)
 
 
 def _fitted(points: FloatArray, targets: FloatArray, weights: FloatArray) -> FloatArray:
@@ -81,16 +84,57 @@ def _fitted(points: FloatArray, targets: FloatArray, weights: FloatArray) -> Flo
     return np.stack([ahead, target[1] - (s * centres[0] + c * centres[1]), turns], axis=1)
 
 
-def _scatter(poses: FloatArray, means: FloatArray, weights: FloatArray) -> float:
-    """Return the mean square [m^2] of how far poses (K, 3, M) are from means (K, 3), headings felt at `LEVER`."""
-    off = poses - means[:, :, None]
-    off[:, 2] = LEVER * wrap_angle(off[:, 2])
-    return float(((off * off).sum(axis=(0, 1)) * weights).sum())
+@jit
+def look_at(
+    tiles: FloatArray, seen: IntArray, targets: FloatArray, points: FloatArray, squares: FloatArray
+) -> None:  # fmt: skip
+    """Write where particles hold some landmarks to be in the plane, and how far off that may be.
+
+    Args:
+        tiles, seen: As of `holding`.
+        targets: (n, 2) [m] where they are in the most probable path.
+        points: (n, 2, M) [m], result.
+        squares: (n, M) [m^2], result: squared distances from there, and the variances of the landmarks.
+    """
+    num_lanes = tiles.shape[3]
+    for n in range(len(seen)):
+        for block in range(tiles.shape[1]):
+            tile, first = tiles[seen[n], block], block * num_lanes
+            for lane in range(min(num_lanes, squares.shape[1] - first)):
+                x, y = tile[0, lane], tile[1, lane]
+                points[n, 0, first + lane], points[n, 1, first + lane] = x, y
+                dx, dy = x - targets[n, 0], y - targets[n, 1]
+                squares[n, first + lane] = dx * dx + dy * dy + tile[XX, lane] + tile[YY, lane]
 
 
-def move_poses(poses: FloatArray, motions: FloatArray, chosen: IntArray) -> None:
-    """Move the chosen robots' poses (K, 3, M) of each particle, in place, by its motion (M, 3)."""
-    poses[chosen] = compose(motions, poses[chosen].transpose(0, 2, 1)).transpose(0, 2, 1)
+@jit
+def move(poses: FloatArray, motions: FloatArray, moved: FloatArray) -> None:
+    """Write poses (K, 3, M) of each particle moved by its motion (M, 3); `moved` may be `poses`."""
+    for robot in range(len(poses)):
+        for i in range(len(motions)):
+            x, y, heading = poses[robot, 0, i], poses[robot, 1, i], poses[robot, 2, i]
+            c, s = math.cos(motions[i, 2]), math.sin(motions[i, 2])
+            moved[robot, 0, i] = motions[i, 0] + c * x - s * y
+            moved[robot, 1, i] = motions[i, 1] + s * x + c * y
+            moved[robot, 2, i] = (motions[i, 2] + heading + math.pi) % (2.0 * math.pi) - math.pi
+
+
+@jit
+def measure_off(poses: FloatArray, means: FloatArray, lever: float, squares: FloatArray) -> None:
+    """Write how far off particles are.
+
+    Args:
+        poses: (K, 3, M) [m, m, rad].
+        means: (K, 3) likewise.
+        lever: [m] At which headings are felt.
+        squares: (M,) [m^2], result: sum over the robots of squared distances.
+    """
+    squares[:] = 0.0
+    for robot in range(len(poses)):
+        for i in range(len(squares)):
+            dx, dy = poses[robot, 0, i] - means[robot, 0], poses[robot, 1, i] - means[robot, 1]
+            turn = lever * ((poses[robot, 2, i] - means[robot, 2] + math.pi) % (2.0 * math.pi) - math.pi)
+            squares[i] = squares[i] + dx * dx + dy * dy + turn * turn
 
 
 def move_tiles(tiles: FloatArray, motions: FloatArray) -> None:

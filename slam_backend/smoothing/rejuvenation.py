@@ -17,7 +17,7 @@ from slam_backend.smoothing.duplicates import find_duplicates, without_duplicate
 from slam_backend.smoothing.extending import Places, extended, first_rows
 from slam_backend.smoothing.graph import PathGraph
 from slam_backend.smoothing.guesses import Guesses
-from slam_backend.smoothing.holding import holding, move_poses, move_tiles
+from slam_backend.smoothing.holding import holding, move, move_tiles
 from slam_backend.smoothing.options import SmoothingOptions
 from slam_backend.smoothing.sampling import Draws, draw_paths, drawn_spreads
 from slam_backend.smoothing.solving import NO_POSE, Mode, find_mode
@@ -241,9 +241,10 @@ def _particles(graph: PathGraph, mode: Mode, draws: Draws, weights: FloatArray) 
     rows = np.flatnonzero(in_view[seen])
     if (held := holding(tiles, rows, mode.landmarks[seen], poses, means, weights)) is not None:
         move_tiles(tiles, held.motions)
-        move_poses(poses, held.motions, np.arange(len(poses)))
-        move_poses(starts, held.motions, np.flatnonzero(mode.columns[graph.heads] >= 0))
-        frame = held.scatter
+        poses, frame = held.poses, held.scatter
+        for head in np.flatnonzero(mode.columns[graph.heads] >= 0).tolist():
+            own = starts[head : head + 1]
+            move(own, held.motions, own)
     for array in (poses, starts):
         array[:, 2] = wrap_angle(array[:, 2])
     means[:, 2] = wrap_angle(means[:, 2])

@@ -14,7 +14,7 @@ from slam_backend.geometry import between, compose, inverse, rotation, transform
 from slam_backend.smoothing import rejuvenation
 from slam_backend.smoothing._kernels import LANES
 from slam_backend.smoothing.graph import RIGID, PathGraph
-from slam_backend.smoothing.holding import holding, move_tiles
+from slam_backend.smoothing.holding import holding, look_at, measure_off, move, move_tiles
 from training.stereo_runs import RunSpec, simulate_run
 
 SCATTER = np.array([[0.04, 0.01, -0.02], [0.01, 0.09, 0.03], [-0.02, 0.03, 0.05]])
@@ -77,6 +77,26 @@ def test_landmarks_are_moved_as_one_by_one():
     move_tiles(tiles, motions)
     np.testing.assert_allclose(unlaned(tiles, 70), moved_plainly(values, motions), atol=1e-12)
     np.testing.assert_array_equal(tiles[:, 1, :, 70 - LANES :], before[:, 1, :, 70 - LANES :])
+
+
+def test_what_holding_looks_at_is_as_by_arrays():
+    """Where landmarks are in the plane and how far off, poses moved, and how far off these: of each particle."""
+    rng = np.random.default_rng(4)
+    count, seen = LANES + 9, np.array([4, 0, 3])
+    values, motions, poses = random_maps(5, count, rng), rng.normal(size=(count, 3)), rng.normal(size=(2, 3, count))
+    targets, means, points = rng.normal(size=(3, 2)), rng.normal(size=(2, 3)), np.empty((3, 2, count))
+    look_at(laned(values), seen, targets, points, found := np.empty((3, count)))
+    np.testing.assert_array_equal(points, values[seen, :2])
+    off = values[seen, :2] - targets[:, :, None]
+    np.testing.assert_allclose(found, (off**2).sum(axis=1) + values[seen, 3] + values[seen, 6], rtol=1e-12)
+    move(poses, motions, moved := np.empty_like(poses))
+    np.testing.assert_allclose(moved, compose(motions, poses.transpose(0, 2, 1)).transpose(0, 2, 1), atol=1e-12)
+    measure_off(poses, means, 3.0, squares := np.empty(count))
+    off = poses - means[:, :, None]
+    off[:, 2] = 3.0 * wrap_angle(off[:, 2])
+    np.testing.assert_allclose(squares, (off**2).sum(axis=(0, 1)), rtol=1e-12)
+    move(poses, motions, poses)
+    np.testing.assert_array_equal(poses, moved)
 
 
 def test_a_scattered_frame_scatters_poses_and_points():
