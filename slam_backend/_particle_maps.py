@@ -145,23 +145,30 @@ class ParticleMaps(MapStore):
 
     def load_tiles(
         self, tiles: FloatArray, counts: NDArray[np.integer[Any]], descriptors: NDArray[np.float32], ids: IntArray,
-        identities: IntArray, next_id: int, odds: FloatArray | None = None, chosen: IntArray | None = None,
-        last_seen: IntArray | None = None,
+        identities: IntArray, next_id: int, odds: FloatArray | None = None, last_seen: IntArray | None = None,
     ) -> None:  # fmt: skip
         """Replace all landmarks by these, each held by a particle: `load` with values as `blocks` holds them.
 
         Args:
             tiles: (n, P / lanes, 9, lanes) float64.
             counts, descriptors, ids, identities, next_id, odds, last_seen: As of `load`.
-            chosen: (n,) rows of `tiles`; all else is of these, in their order. None: all of them.
+        """
+        self.load_names(counts, descriptors, ids, identities, next_id, odds, last_seen)
+        self.blocks[: len(ids)] = tiles
+
+    def load_names(
+        self, counts: NDArray[np.integer[Any]], descriptors: NDArray[np.float32], ids: IntArray, identities: IntArray,
+        next_id: int, odds: FloatArray | None = None, last_seen: IntArray | None = None,
+    ) -> None:  # fmt: skip
+        """Do what `load_tiles` does but for the values: the first n of `blocks` are then to be written.
+
+        Args:
+            counts: (n, M), or (n, 1) where all particles have the same.
+            descriptors, ids, identities, next_id, odds, last_seen: As of `load`.
         """
         n, m = len(ids), self.num_particles
         self._begin(n, descriptors.shape[1] if n else self.descriptors.shape[1])
         self.tops[2] = next_id
-        if chosen is None:
-            self.blocks[:n] = tiles
-        else:
-            np.take(tiles, chosen, axis=0, out=self.blocks[:n], mode="clip")  # else it would go through a buffer
         self.counts[:n, :m], self.counts[:n, m:] = counts, 0
         self.ids[:n], self.identities[:n], self.last_seen[:n] = ids, identities, 0 if last_seen is None else last_seen
         self.descriptors[:n] = descriptors

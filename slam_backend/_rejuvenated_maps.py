@@ -5,7 +5,7 @@ import numpy as np
 from slam_backend._best_map import slots_held
 from slam_backend._jit import jit
 from slam_backend._particle_maps import ParticleMaps
-from slam_backend.errors import FloatArray
+from slam_backend.errors import FloatArray, IntArray
 from slam_backend.smoothing.rejuvenation import Particles
 
 NONE = -1  # no landmark is called so
@@ -30,23 +30,32 @@ def write_maps(maps: ParticleMaps, best: int, particles: Particles, walk: float)
     at = particles.ids.searchsorted(maps.ids[slots], sorter=order)
     supported = np.append(particles.ids[order], NONE)[at] == maps.ids[slots]
     slots, rows = slots[supported], order[at[supported]]
-    m = maps.num_particles
     odds = maps.dense_odds(slots)
     if odds is not None:
         held = maps.dense(slots)[1] > 0
         mean = (odds * held).sum(axis=1) / np.maximum(held.sum(axis=1), 1)
-        odds = np.broadcast_to(mean[:, None], (len(mean), m))
-    maps.load_tiles(
-        particles.tiles, np.broadcast_to(particles.counts[rows, None], (len(rows), m)), maps.descriptors[slots],
-        maps.ids[slots], maps.identities[slots], maps.next_id, odds, rows, maps.last_seen[slots],
+        odds = mean[:, None]
+    maps.load_names(
+        particles.counts[rows, None], maps.descriptors[slots], maps.ids[slots], maps.identities[slots], maps.next_id,
+        odds, maps.last_seen[slots],
     )  # fmt: skip
-    widen(maps.blocks[: len(rows)], walk)
+    write_tiles(particles.tiles, rows, walk, maps.blocks)
 
 
 @jit
-def widen(tiles: FloatArray, walk: float) -> None:
-    """Add a variance [m^2] along each axis to landmarks (n, P / lanes, 9, lanes), in place."""
-    for tile in tiles.reshape(-1, 9, tiles.shape[3]):
-        for row in (XX, YY, ZZ):
-            for lane in range(tiles.shape[3]):
-                tile[row, lane] += walk  # (7) of docs/smoothing.md
+def write_tiles(tiles: FloatArray, rows: IntArray, walk: float, blocks: FloatArray) -> None:
+    """Write some landmarks of new particles, with a variance [m^2] along each axis added to theirs.
+
+    Args:
+        tiles: (l, P / lanes, 9, lanes) means and covariances.
+        rows: (n,) which of them.
+        walk: The variance.
+        blocks: (>= n, P / lanes, 9, lanes), of which the first are written.
+    """
+    for n in range(len(rows)):
+        for b in range(tiles.shape[1]):
+            tile, block = tiles[rows[n], b], blocks[n, b]
+            for row in range(9):
+                added = walk if row in (XX, YY, ZZ) else 0.0
+                for lane in range(tiles.shape[3]):
+                    block[row, lane] = tile[row, lane] + added  # (7) of docs/smoothing.md

@@ -101,14 +101,13 @@ def merge_filters(
     new_ids = next_id + np.arange(len(own))
     held = np.flatnonzero((counts > 0).any(axis=1))
     joint._maps.load_tiles(
-        tiles,
+        tiles[held],
         counts[held],
         stack_descriptors(descriptors, looks_b[own])[held],
         np.concatenate([ids_a, new_ids])[held],
         np.concatenate([identities, of_b.identities[own]])[held],
         next_id + len(own),
         np.concatenate([odds_a, odds_b[own]])[held],
-        held,
     )
     renamed = np.concatenate([pairs[:, ::-1], np.column_stack([ids_b[own], new_ids])]).astype(np.int64)
     finish(joint, a, b, renamed)
