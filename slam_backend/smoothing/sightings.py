@@ -1,6 +1,6 @@
 """`Sightings`: all that was measured from key poses, one quadratic form for each pair of key and landmark."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
@@ -63,13 +63,10 @@ class Sightings:
 
     def copy(self) -> Self:
         """Return the same with forms of their own, which may be linearised elsewhere."""
-        return replace(
-            self,
-            centres=self.centres.copy(),
-            infos=self.infos.copy(),
-            slopes=self.slopes.copy(),
-            squares=self.squares.copy(),
-        )
+        return type(self)(
+            self.keys, self.landmarks, self.starts, self.frozen, self.centres.copy(), self.infos.copy(),
+            self.slopes.copy(), self.counts, self.of_points, self.squares.copy(),
+        )  # fmt: skip
 
     def linearise(
         self, graph: PathGraph, poses: FloatArray, landmarks: FloatArray, camera: FloatArray, scale: float,

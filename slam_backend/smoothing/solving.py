@@ -7,7 +7,6 @@ import numpy as np
 
 from slam_backend.errors import FloatArray, IntArray
 from slam_backend.smoothing import _kernels
-from slam_backend.smoothing._kernels import FREE
 from slam_backend.smoothing.graph import LEVER, PathGraph
 from slam_backend.smoothing.options import SmoothingOptions
 from slam_backend.smoothing.sightings import Sightings
@@ -105,12 +104,11 @@ def find_mode(
         damping: Of the first one.
         looseness: Times the tolerance of the options.
     """
-    sought = graph.previous >= 0
-    columns = np.where(sought, 3 * np.cumsum(sought) - 3, FREE)
-    size = int(np.count_nonzero(sought))
+    columns, informations = np.empty(graph.num_keys, dtype=np.int64), np.empty(graph.noises.shape)
+    size = _kernels.seek(graph.previous, columns)
+    is_noisy = _kernels.invert(graph.noises, columns, informations)
     sightings = Sightings.of(graph)
     poses, landmarks = graph.poses.copy(), graph.landmarks.copy()
-    informations = np.zeros_like(graph.noises)
     tolerance = looseness * options.tolerance
     creep = CREEP if most is None else 1.0
     most = options.max_iterations if most is None else most
@@ -120,7 +118,7 @@ def find_mode(
 
     if not size:
         return given_up(NO_POSE)
-    if not _kernels.invert(graph.noises, columns, informations):
+    if not is_noisy:
         return given_up("odometry without noise")
     system = _System(graph, columns, size, informations, sightings, camera, options)
     cost = system.form(poses, landmarks)

@@ -5,7 +5,7 @@ from slam_backend.smoothing._kernels.drawing import draw
 from slam_backend.smoothing._kernels.dropping import drop_unused
 from slam_backend.smoothing._kernels.equations import advance, form
 from slam_backend.smoothing._kernels.factoring import covariance, factorise, solve
-from slam_backend.smoothing._kernels.forms import FREE, condense, invert
+from slam_backend.smoothing._kernels.forms import FREE, condense, invert, seek
 from slam_backend.smoothing._kernels.gathering import gather
 from slam_backend.smoothing._kernels.ordering import lay_out, minimum_degree, neighbours
 from slam_backend.smoothing._kernels.paths import LANES, POSE_ROWS, WORK_ROWS, odometry_of_paths, replay, to_lanes
@@ -14,5 +14,5 @@ from slam_backend.smoothing._kernels.scattering import scatter_of_links
 __all__ = [
     "FREE", "LANES", "POSE_ROWS", "WORK_ROWS", "add_sightings", "advance", "condense", "covariance", "draw",
     "drop_unused", "factorise", "form", "gather", "invert", "join_keys", "lay_out", "look_at_keys", "minimum_degree",
-    "neighbours", "odometry_of_paths", "replay", "scatter_of_links", "solve", "to_freeze", "to_lanes",
+    "neighbours", "odometry_of_paths", "replay", "scatter_of_links", "seek", "solve", "to_freeze", "to_lanes",
 ]  # fmt: skip

@@ -46,6 +46,24 @@ def _inverse(a: FloatArray, out: FloatArray) -> float:
 
 
 @jit
+def seek(previous: IntArray, columns: IntArray) -> int:
+    """Give each pose that is sought the rows after those of the one before.
+
+    Args:
+        previous: (k,) key that odometry comes from, -1 where a pose is given.
+        columns: (k,), result: first row of each pose, `FREE` if it is given.
+
+    Returns:
+        How many are sought.
+    """
+    num = 0
+    for b in range(len(previous)):
+        columns[b] = 3 * num if previous[b] >= 0 else FREE
+        num += previous[b] >= 0
+    return num
+
+
+@jit
 def invert(matrices: FloatArray, columns: IntArray, out: FloatArray) -> bool:
     """Write the inverses of symmetric matrices (n, 3, 3) to `out`, likewise; return whether all are positive definite.
 

@@ -2,6 +2,8 @@
 
 import math
 
+import numpy as np
+
 from slam_backend._jit import jit, lanes
 from slam_backend.errors import FloatArray, IntArray
 from slam_backend.smoothing._kernels.equations import WEAK
@@ -55,13 +57,16 @@ def replay(
         log_likelihood: (num_blocks * LANES,), result.
     """
     log_likelihood[:] = 0.0
-    for landmark in range(len(landmarks)):
-        first, last = starts[landmark], starts[landmark + 1]
-        if first == last:
-            tiles[landmark * num_blocks * 9 * LANES : (landmark + 1) * num_blocks * 9 * LANES] = 0.0
-            continue
-        x, y, z = landmarks[landmark, 0], landmarks[landmark, 1], landmarks[landmark, 2]
-        for block in range(num_blocks):
+    for block in range(num_blocks):  # one after the other, for the poses of one are as many as a cache holds
+        out = log_likelihood[block * LANES : (block + 1) * LANES]
+        for landmark in range(len(landmarks)):
+            first, last = starts[landmark], starts[landmark + 1]
+            x, y, z = landmarks[landmark, 0], landmarks[landmark, 1], landmarks[landmark, 2]
+            base = (landmark * num_blocks + block) * 9 * LANES
+            tile = tiles[base : base + 9 * LANES]
+            if first == last:
+                tile[:] = 0.0
+                continue
             for i in range(WORK_ROWS * LANES):
                 work[i] = 0.0
             for i in range(LANES):
@@ -90,9 +95,6 @@ def replay(
                     work[A11 + i] += s * s * n0 + 2.0 * c * s * n1 + c * c * n3
                     work[A12 + i] += s * n2 + c * n4
                     work[A22 + i] += n5
-            base = (landmark * num_blocks + block) * 9 * LANES
-            tile = tiles[base : base + 9 * LANES]
-            out = log_likelihood[block * LANES : (block + 1) * LANES]
             for i in range(LANES):
                 a, b, d = work[A00 + i], work[A01 + i], work[A02 + i]
                 e, f, h = work[A11 + i], work[A12 + i], work[A22 + i]
@@ -133,6 +135,7 @@ def odometry_of_paths(
         spreads: (k,), result [m^2]: mean square of what the motion from the previous key differs from that of the mode.
     """
     log_density[:] = 0.0
+    squares = np.empty(LANES)
     for b in range(num_keys):
         a = previous[b]
         spreads[b] = 0.0
@@ -152,16 +155,14 @@ def odometry_of_paths(
                 c, s = first[COS + i], first[SIN + i]
                 dx, dy = second[PX + i] - first[PX + i], second[PY + i] - first[PY + i]
                 r0, r1 = c * dx + s * dy - u0, c * dy - s * dx - u1
-                r2 = second[HEADING + i] - first[HEADING + i] - u2
-                r2 = r2 - 2.0 * math.pi * math.floor((r2 + math.pi) / (2.0 * math.pi))
+                turn = second[HEADING + i] - first[HEADING + i] - u2
+                r2 = turn - 2.0 * math.pi * math.floor((turn + math.pi) / (2.0 * math.pi))
                 out[i] -= 0.5 * (w00 * r0 * r0 + w11 * r1 * r1 + w22 * r2 * r2) + (
                     w01 * r0 * r1 + w02 * r0 * r2 + w12 * r1 * r2
                 )
-            for i in range(min(LANES, num_paths - block * LANES)):
-                c, s = first[COS + i], first[SIN + i]
-                dx, dy = second[PX + i] - first[PX + i], second[PY + i] - first[PY + i]
-                r0, r1 = c * dx + s * dy - u0 - d0, c * dy - s * dx - u1 - d1
-                r2 = second[HEADING + i] - first[HEADING + i] - u2 - d2
+                r0, r1, r2 = r0 - d0, r1 - d1, turn - d2
                 r2 = r2 - 2.0 * math.pi * math.floor((r2 + math.pi) / (2.0 * math.pi))
-                total += r0 * r0 + r1 * r1 + lever * lever * r2 * r2
+                squares[i] = r0 * r0 + r1 * r1 + lever * lever * r2 * r2
+            for i in range(min(LANES, num_paths - block * LANES)):
+                total += squares[i]
         spreads[b] = total / num_paths

@@ -15,7 +15,7 @@ from small_problems import (
 from slam_backend.camera import StereoCamera
 from slam_backend.motion import OdometryModel
 from slam_backend.run_log import RobotLog
-from slam_backend.smoothing._kernels import FREE, advance, invert
+from slam_backend.smoothing._kernels import FREE, advance, invert, seek
 from slam_backend.smoothing.extending import extended
 from slam_backend.smoothing.graph import PathGraph
 from slam_backend.smoothing.options import SmoothingOptions
@@ -189,6 +189,13 @@ def test_small_matrices_are_inverted_as_by_lapack():
     for bad in (np.zeros((3, 3)), np.diag([1.0, -1.0, -1.0]), np.diag([-1.0, 1.0, 1.0])):
         matrices[7] = bad
         assert not invert(matrices, columns, found)
+
+
+def test_only_poses_with_odometry_from_another_are_sought():
+    """They get three rows each, in their order; poses that are given get none."""
+    columns = np.empty(5, dtype=np.int64)
+    assert seek(np.array([-1, 0, -1, 1, 2]), columns) == 3
+    assert columns.tolist() == [FREE, 0, FREE, 3, 6]
 
 
 def test_a_change_leads_where_it_says():
