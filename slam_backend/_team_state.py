@@ -30,7 +30,8 @@ class TeamState:
         _groups: By ascending first robot.
         _records: What they write down in common.
         _events: All attempts, merges and undos so far, in order.
-        _lineup: What the groups come to; None while they change. Ask `lineup` for it.
+        lineup: Who goes by which filter; the same object until that changes.
+        _is_stale: Whether the groups have changed since.
         _together: (K,) int64. Networks of robots that are all in contact.
         _numbers: Of all maps that are in use, as of the lineup `_numbered`.
         _step: Number of the next step.
@@ -75,9 +76,9 @@ class TeamState:
         ]
         self._groups, self._records, self._num_robots = groups, Records(count, of_forks), count
         self._events: list[MergeEvent] = []
-        self._lineup: Lineup | None = None
         self._together = reach(None, count)
         self._numbers = frozenset(range(count))
+        self._settle()
         self._numbered: Lineup | None = None
         self._step = 0
         self._epoch = 0
@@ -120,8 +121,15 @@ class TeamState:
         self._events = list(state["events"])
         at_hand = {group.robots: group.trunk.filter for group in self._groups}  # filling is faster than building
         self._groups = [Group.from_state(group, at_hand) for group in state["groups"]]
-        self._lineup, self._numbered, self._size = None, None, 0
+        self._settle()
+        self._numbered, self._size = None, 0
         self._numbers = frozenset(state["numbers"])
         self._alignment, self._merging = state["alignment"], state["merging"]
         self._schedule.set_state(state["schedule"])
         self._records.set_state(state["records"])
+
+    # ------------------------------------------------------------------ within
+
+    def _settle(self) -> None:
+        """Find out who goes by which filter now."""
+        self.lineup, self._is_stale = Lineup.of(self._groups), False

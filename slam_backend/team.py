@@ -90,23 +90,16 @@ class TeamSlam(TeamKnowledge):
         if lineup.is_watched:
             self._doubt()
         renamings = self._attempt(networks) if self._schedule.is_due(self._step) else ()
-        lineup = self.lineup
+        if self._is_stale:
+            self._settle()
+            lineup = self.lineup
         oldest = self._step + 1 if lineup.oldest is None else lineup.oldest
         records.log.forget_before(oldest)
         if lineup is not self._numbered:
             self._note_dropped(lineup)
-        report = TeamReport(
-            step=self._step,
-            associations=tuple(associations),
-            created=tuple(created),
-            groups=lineup.groups,
-            events=tuple(self._events[before:]),
-            renamings=renamings,
-            maps=lineup.maps,
-            entries=tuple(records.entries),
-            oldest_step=oldest,
-            rejuvenations=tuple(rejuvenations),
-        )
+        events, entries = tuple(self._events[before:]), tuple(records.entries)
+        told = tuple(associations), tuple(created), lineup.groups, events, renamings, lineup.maps, entries
+        report = TeamReport(self._step, *told, oldest, tuple(rejuvenations))
         records.entries.clear()
         self._step += 1
         return report
@@ -117,7 +110,7 @@ class TeamSlam(TeamKnowledge):
         for group in self._groups:
             group.regroup(networks, self._records)
         if was_split or any(len(group.branches) > 1 for group in self._groups):
-            self._lineup = None
+            self._settle()
         return self.lineup
 
     def _advance(
@@ -176,7 +169,9 @@ class TeamSlam(TeamKnowledge):
             raise bad_argument("alignment", "a successful Alignment", got, "Align the two maps first.")
         if groups[1].robots < groups[0].robots:
             groups, alignment = groups[::-1], inverse_alignment(alignment)
-        return self._merge(MergePlan.of(*groups, alignment), known)
+        renaming = self._merge(MergePlan.of(*groups, alignment), known)
+        self._settle()
+        return renaming
 
     def _merge(self, plan: MergePlan, known: bool = False) -> Renaming:
         """Merge two groups as planned, and write it down."""
@@ -191,7 +186,7 @@ class TeamSlam(TeamKnowledge):
         """Put some groups in the place of others."""
         self._groups = [group for group in self._groups if all(group is not other for other in old)] + list(new)
         self._groups.sort(key=lambda group: group.robots)
-        self._lineup = None
+        self._is_stale = True
 
     def _doubt(self) -> None:
         """Weigh the evidence about the merges that can still be undone, and undo what contradicts itself."""
@@ -206,13 +201,13 @@ class TeamSlam(TeamKnowledge):
             for branch in group.branches:
                 while branch.watches and branch.watches[0].steps >= self._merging.watch_steps:
                     branch.watches.pop(0)
-                    self._lineup = None
+                    self._is_stale = True
 
     def _undo(self, group: Group, undoing: Undoing) -> None:
         """Go on with taking back a merge; it is done when all sides have caught up and are in contact."""
         merges = undoing.merges(group.trunk)
         if not merges:  # the joint filter is another one now, whose window is over
-            group.undoing, self._lineup = None, None
+            group.undoing, self._is_stale = None, True
             return
         caught_up = undoing.catch_up(group.trunk, self._records.log)
         if not caught_up or not all(watch.together(group.trunk.live) for watch in merges):

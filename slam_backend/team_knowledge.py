@@ -11,7 +11,6 @@ from slam_backend.errors import FloatArray, IntArray, bad_argument
 from slam_backend.geometry import inverse
 from slam_backend.groups import Group
 from slam_backend.landmark_map import LandmarkMap, TeamOutlines
-from slam_backend.lineup import Lineup
 from slam_backend.reports import MergeEvent, PoseEstimate
 from slam_backend.standpoints import Standpoints
 
@@ -23,13 +22,6 @@ class TeamKnowledge(TeamState):
     def num_robots(self) -> int:
         """K."""
         return self._num_robots
-
-    @property
-    def lineup(self) -> Lineup:
-        """Who goes by which filter; the same object until that changes."""
-        if self._lineup is None:
-            self._lineup = Lineup.of(self._groups)
-        return self._lineup
 
     @property
     def groups(self) -> tuple[tuple[int, ...], ...]:

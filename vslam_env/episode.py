@@ -126,14 +126,8 @@ class Episode:
         belief, poses = self.belief, self._simulator.poses
         self.ledger.score(belief.outlines, belief.points, self.true_starts, poses, self._figures)
         coverage = self._coverage.update(belief.grids, poses, self._found)
-        return Standing(
-            figures=self._figures.tolist(),
-            collisions=self._collisions,
-            bytes_sent=belief.bytes_sent,
-            coverage=coverage,
-            merges=len(self.merge_ticks),
-            time=self.tick * TICK,
-        )
+        counts = self._collisions, belief.bytes_sent
+        return Standing(self._figures.tolist(), *counts, coverage, len(self.merge_ticks), self.tick * TICK)
 
     # ------------------------------------------------------------------ snapshots
 

@@ -26,6 +26,7 @@ def infos_of(
     """
     errors, rmses, recalls, precisions, _, pose_errors, heading_errors, _, _, distances = standing.figures
     collisions, bytes_sent = standing.collisions.tolist(), standing.bytes_sent.tolist()
+    rewards = [(f"reward/{name}", paid) for name, paid in terms.items()]
     infos: dict[str, dict[str, Any]] = {}
     for robot, agent in enumerate(agents):
         group = groups[robot]
@@ -45,6 +46,6 @@ def infos_of(
             "bytes_sent": bytes_sent[robot],
             "invalid_action": invalid[robot],
         }
-        for name, paid in terms.items():
-            info[f"reward/{name}"] = paid[robot]
+        for name, paid in rewards:
+            info[name] = paid[robot]
     return infos

@@ -67,20 +67,21 @@ def observed(view: View, scans: FloatArray, goal_actions: bool) -> list[Observat
         Per robot what `observe` returns, in memory that nothing else uses.
     """
     count, candidates = len(view.robots), view.features
-    numbers, ranges = np.empty((count, 12), np.float32), np.empty(scans.shape, np.float32)
+    poses, deviations = np.empty((count, 3), np.float32), np.empty((count, 3), np.float32)
+    stats, ranges = np.empty((count, 6), np.float32), np.empty(scans.shape, np.float32)
     teammates, present = np.empty((count, MOST_TEAMMATES, 5), np.float32), np.empty((count, MOST_TEAMMATES), np.int8)
     pictures = np.empty((count, len(CHANNELS), SIZE, SIZE), np.uint8)
     (means, variances, counts, _), parts = view.outlines
     observe_team(
         view.robots, *view.points, means, variances, counts, parts, view.cells, scans,
-        numbers, ranges, candidates, teammates, present, pictures,
+        poses, deviations, stats, ranges, candidates, teammates, present, pictures,
     )  # fmt: skip
     observations: list[Observation] = []
     for i in range(count):  # by index: an array that is looped through ends with an error, and that costs microseconds
         observation: Observation = {
-            "pose": numbers[i, :3],
-            "pose_std": numbers[i, 3:6],
-            "map_stats": numbers[i, 6:],
+            "pose": poses[i],
+            "pose_std": deviations[i],
+            "map_stats": stats[i],
             "local_grid": pictures[i],
             "scan": ranges[i],
             "candidates": candidates[i],

@@ -3,6 +3,8 @@
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import repeat
+from operator import add, mul, sub
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -46,20 +48,12 @@ class _NamedTerm:
 
 def _rise_of(row: int) -> Gain:
     """Return the gain that pays how much a row of the figures has risen."""
-
-    def gain(before: Standing, after: Standing) -> list[float]:
-        return [now - then for then, now in zip(before.figures[row], after.figures[row], strict=True)]
-
-    return gain
+    return lambda before, after: list(map(sub, after.figures[row], before.figures[row]))
 
 
 def _fall_of(row: int) -> Gain:
     """Return the gain that pays how much a row of the figures has fallen."""
-
-    def gain(before: Standing, after: Standing) -> list[float]:
-        return [then - now for then, now in zip(before.figures[row], after.figures[row], strict=True)]
-
-    return gain
+    return lambda before, after: list(map(sub, before.figures[row], after.figures[row]))
 
 
 def _map_error_squared(before: Standing, after: Standing) -> list[float]:
@@ -151,17 +145,21 @@ def evaluate(
     robots = len(after.collisions)
     rewards = {}
     for term in terms:
-        given: Any = term(before, after)
-        paid: list[float] = given if isinstance(term, _NamedTerm) else _floats(given)
-        if len(paid) != robots or not all(map(math.isfinite, paid)):
-            raise bad_argument(
-                f"reward term {term.name!r}", f"{robots} finite numbers", given, "Return one number for each robot."
-            )
-        weight = float(term.weight)
+        paid = TERMS[term.name](before, after) if type(term) is _NamedTerm else _own(term, before, after, robots)
         if shared:
             paid = [float(np.mean(paid))] * robots
-        rewards[term.name] = [weight * each for each in paid]
+        rewards[term.name] = list(map(mul, repeat(float(term.weight)), paid))
     return rewards
+
+
+def _own(term: RewardTerm, before: Standing, after: Standing, robots: int) -> list[float]:
+    """Return what a term of one's own pays for a step, or raise unless that is a finite number for each robot."""
+    given = term(before, after)
+    paid = _floats(given)
+    if len(paid) != robots or not all(map(math.isfinite, paid)):
+        cure = "Return one number for each robot."
+        raise bad_argument(f"reward term {term.name!r}", f"{robots} finite numbers", given, cure)
+    return paid
 
 
 def _floats(given: Any) -> list[float]:
@@ -177,5 +175,5 @@ def totals(rewards: Mapping[str, Sequence[float]]) -> list[float]:
     """Return the sum of all terms of `evaluate`, one at least, for each robot."""
     total, *others = rewards.values()
     for paid in others:
-        total = [so_far + more for so_far, more in zip(total, paid, strict=True)]
+        total = list(map(add, total, paid))
     return list(total)

@@ -20,22 +20,24 @@ def _clip(value: float, low: float, high: float) -> Any:
 
 
 @jit
-def write_numbers(
-    pose: Any, covariance: Any, variances: Any, counts: Any, ess: float, group_size: int, row: Any
-) -> None:
-    """Write `pose`, `pose_std` and `map_stats` of a robot.
+def write_pose(mean: Any, covariance: Any, pose: Any, sigmas: Any) -> None:
+    """Write `pose` and `pose_std`, each (3,) float32, of a robot that is at `mean` (3,) [m, m, rad], +- (3, 3)."""
+    for i in range(3):
+        pose[i] = _clip(mean[i], -POSE_LIMIT[i], POSE_LIMIT[i])
+        sigmas[i] = _clip(math.sqrt(covariance[i, i]), 0.0, POSE_LIMIT[i])
+
+
+@jit
+def write_map_stats(variances: Any, counts: Any, ess: float, group_size: int, stats: Any) -> None:
+    """Write `map_stats` of a robot.
 
     Args:
-        pose, covariance: (3,) [m, m, rad], (3, 3). Where it is.
         variances, counts: (m,) float64 [m^2], (m,) int64. Of its landmarks: the traces of their covariances, and how
             often each was measured.
         ess: Of its filter, as a share of the particles.
         group_size: Robots that share its map.
-        row: (12,) float32. Written to.
+        stats: (6,) float32. Written to.
     """
-    for i in range(3):
-        row[i] = _clip(pose[i], -POSE_LIMIT[i], POSE_LIMIT[i])
-        row[3 + i] = _clip(math.sqrt(covariance[i, i]), 0.0, POSE_LIMIT[i])
     total = largest = 0.0
     times = 0
     for landmark in range(len(variances)):
@@ -44,12 +46,12 @@ def write_numbers(
         largest = max(largest, sigma)
         times += counts[landmark]
     held = max(len(variances), 1)
-    row[6] = _clip(len(variances), 0.0, MAP_STATS_LIMIT[0])
-    row[7] = _clip(total / held, 0.0, MAP_STATS_LIMIT[1])
-    row[8] = _clip(largest, 0.0, MAP_STATS_LIMIT[2])
-    row[9] = _clip(times / held, 0.0, MAP_STATS_LIMIT[3])
-    row[10] = _clip(ess, 0.0, MAP_STATS_LIMIT[4])
-    row[11] = _clip(group_size, 0.0, MAP_STATS_LIMIT[5])
+    stats[0] = _clip(len(variances), 0.0, MAP_STATS_LIMIT[0])
+    stats[1] = _clip(total / held, 0.0, MAP_STATS_LIMIT[1])
+    stats[2] = _clip(largest, 0.0, MAP_STATS_LIMIT[2])
+    stats[3] = _clip(times / held, 0.0, MAP_STATS_LIMIT[3])
+    stats[4] = _clip(ess, 0.0, MAP_STATS_LIMIT[4])
+    stats[5] = _clip(group_size, 0.0, MAP_STATS_LIMIT[5])
 
 
 @jit

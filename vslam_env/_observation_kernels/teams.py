@@ -3,7 +3,7 @@
 from typing import Any
 
 from slam_backend._jit import jit
-from vslam_env._observation_kernels.numbers import clip_candidates, write_numbers, write_teammates
+from vslam_env._observation_kernels.numbers import clip_candidates, write_map_stats, write_pose, write_teammates
 from vslam_env._observation_kernels.pictures import paint
 
 
@@ -11,7 +11,8 @@ from vslam_env._observation_kernels.pictures import paint
 def observe_team(
     robots: Any, poses: Any, sigmas: Any, own: Any, covariances: Any, starts: Any, ess: Any,
     means: Any, variances: Any, counts: Any, parts: Any, cells: Any, scans: Any,
-    numbers: Any, ranges: Any, candidates: Any, teammates: Any, present: Any, pictures: Any,
+    clipped: Any, deviations: Any, stats: Any, ranges: Any, candidates: Any, teammates: Any, present: Any,
+    pictures: Any,
 ) -> None:  # fmt: skip
     """Write what robots observe.
 
@@ -21,7 +22,8 @@ def observe_team(
         means, variances, counts, parts: (N, 3) [m], (N,) float64 [m^2], (N,) int64, (n, 2) int64. Of its outlines.
         cells: Of the view.
         scans: (n, R) float64 [m].
-        numbers: (n, 12) float32: `pose`, `pose_std`, `map_stats`. Written to, as all that follow.
+        clipped, deviations, stats: (n, 3), (n, 3), (n, 6) float32: `pose`, `pose_std`, `map_stats`. Written to, as all
+            that follow.
         ranges: (n, R) float32: `scan`.
         candidates: (n, 16, 5) float32, as they are without bounds.
         teammates: (n, 7, 5) float32.
@@ -32,6 +34,7 @@ def observe_team(
     for k in range(len(robots)):
         held = slice(parts[k, 0], parts[k, 1])
         known = write_teammates(robots[k], own[k], poses[k], sigmas[k], teammates[k], present[k])
-        write_numbers(own[k], covariances[k], variances[held], counts[held], ess[k], 1 + known, numbers[k])
+        write_pose(own[k], covariances[k], clipped[k], deviations[k])
+        write_map_stats(variances[held], counts[held], ess[k], 1 + known, stats[k])
         clip_candidates(candidates[k])
         paint(cells[k], own[k], starts[k], means[held], pictures[k])
