@@ -20,11 +20,14 @@ def places(
     """Return where the landmarks of slots (n,) begin in the chosen particles (M,), and their counts: both (n, M)."""
     where, times = np.empty((len(slots), len(chosen)), np.int64), np.empty((len(slots), len(chosen)), np.int64)
     padded = counts.shape[1]
+    offsets = np.empty(padded, np.int64)  # of each particle in a row: a table, as divisions are dear
+    for m in range(padded):
+        offsets[m] = m // lanes * 9 * lanes + m % lanes
     for i in range(len(slots)):
         row, ancestors = row_of[slots[i]], map_of[slots[i]]
         for p in range(len(chosen)):
             m = maps[ancestors, chosen[p]] if ancestors > 0 else chosen[p]
-            where[i, p] = row * 9 * padded + m // lanes * 9 * lanes + m % lanes
+            where[i, p] = row * 9 * padded + offsets[m]
             times[i, p] = counts[row, m]
     return where, times
 
@@ -127,17 +130,19 @@ def join(
     cos, sin = np.cos(motion[:, 2]), np.sin(motion[:, 2])
     for i in range(len(rows_a)):
         j, k = rows_a[i], rows_b[i]
-        for p in range(len(motion)):
-            in_a, in_b = j >= 0 and times_a[j, p] > 0, k >= 0 and times_b[k, p] > 0
-            times[i, p] = (times_a[j, p] if j >= 0 else 0) + (times_b[k, p] if k >= 0 else 0)
-            if in_b:
-                _widened(values_b, where_b[k, p], lanes, extra, scale, two)
-                _move(two, motion[p, 0], motion[p, 1], cos[p], sin[p])
-            if in_a:
-                _widened(values_a, where_a[j, p], lanes, extra, scale, one)
-                if in_b and not _fuse(one, two, work):
-                    return False
-            tile = tiles[i, p // lanes]
-            for c in range(9):
-                tile[c, p % lanes] = one[c] if in_a else two[c] if in_b else 0.0
+        for block in range(tiles.shape[1]):
+            tile, first = tiles[i, block], block * lanes
+            for lane in range(min(lanes, len(motion) - first)):
+                p = first + lane
+                in_a, in_b = j >= 0 and times_a[j, p] > 0, k >= 0 and times_b[k, p] > 0
+                times[i, p] = (times_a[j, p] if j >= 0 else 0) + (times_b[k, p] if k >= 0 else 0)
+                if in_b:
+                    _widened(values_b, where_b[k, p], lanes, extra, scale, two)
+                    _move(two, motion[p, 0], motion[p, 1], cos[p], sin[p])
+                if in_a:
+                    _widened(values_a, where_a[j, p], lanes, extra, scale, one)
+                    if in_b and not _fuse(one, two, work):
+                        return False
+                for c in range(9):
+                    tile[c, lane] = one[c] if in_a else two[c] if in_b else 0.0
     return True
