@@ -68,31 +68,40 @@ class Landmarks(NamedTuple):
         return np.asarray(self.maps.odds[self.slots[:, None], particles])
 
 
-def joined_tiles(
-    a: Landmarks, b: Landmarks, rows_a: IntArray, rows_b: IntArray, motion: FloatArray, extra: float, scale: float
-) -> tuple[FloatArray, IntArray]:
+def joint_counts(a: Landmarks, b: Landmarks, rows_a: IntArray, rows_b: IntArray) -> IntArray:
+    """Return how often each of M particles measured joint landmarks (n, M): on both sides together.
+
+    Args:
+        a, b: Of either filter, in M particles each.
+        rows_a: (n,) row in a of each joint landmark, -1 if only b has it; `rows_b` likewise.
+    """
+    counts = np.zeros((len(rows_a), a.counts.shape[1]), np.int64)
+    for side, rows in ((a, rows_a), (b, rows_b)):
+        there = rows >= 0
+        counts[there] += side.counts[rows[there]]
+    return counts
+
+
+def write_joint(
+    a: Landmarks, b: Landmarks, rows_a: IntArray, rows_b: IntArray, motion: FloatArray, extra: float, scale: float,
+    blocks: FloatArray,
+) -> None:  # fmt: skip
     """Bring the landmarks of two filters into the map frame of the first, and fuse those that both have.
 
     Args:
-        a, b: Of either, in M particles each.
-        rows_a: (n,) row in a of each joint landmark, -1 if only b has it; `rows_b` likewise.
+        a, b, rows_a, rows_b: As of `joint_counts`.
         motion: (M, 3) by which each particle moves those of b.
         extra: Added to all variances of either side before [m^2].
         scale: Factor on all covariances then [-].
-
-    Returns:
-        The landmarks (n, blocks, 9, lanes) as `ParticleMaps.load_tiles` takes them, and their counts (n, M).
+        blocks: (>= n, P / lanes, 9, lanes) of the joint map, see `MapStore`, of which the first n are written.
 
     Raises:
         ValueError: If two estimates of a landmark are exact along one direction.
     """
-    tiles = np.zeros((len(rows_a), -(-len(motion) // LANES), 9, LANES))
-    counts = np.empty((len(rows_a), len(motion)), np.int64)
     sides = a.maps.values, a.where, a.counts, b.maps.values, b.where, b.counts
-    if not join(*sides, rows_a, rows_b, motion, extra, scale, LANES, tiles, counts):
+    if not join(*sides, rows_a, rows_b, motion, extra, scale, LANES, blocks):
         cure = "Give each landmark some uncertainty in every direction."
         raise bad_argument("landmarks in common", "positive definite covariances", "singular ones", cure)
-    return tiles, counts
 
 
 def fuse_odds(

@@ -110,7 +110,7 @@ def _fuse(one: FloatArray, two: FloatArray, work: FloatArray) -> bool:
 @jit
 def join(
     values_a: Any, where_a: Any, times_a: Any, values_b: Any, where_b: Any, times_b: Any, rows_a: Any, rows_b: Any,
-    motion: Any, extra: float, scale: float, lanes: int, tiles: Any, times: Any,
+    motion: Any, extra: float, scale: float, lanes: int, tiles: Any,
 ) -> bool:  # fmt: skip
     """Write the landmarks of a joint map, those of b moved, those of both fused where a particle holds both.
 
@@ -121,7 +121,7 @@ def join(
         extra: Added to all variances of either side first [m^2].
         scale: Factor on all covariances then [-].
         lanes: Particles in a block.
-        tiles: (n, blocks, 9, lanes) to be written, times: (n, M) likewise, counts of both sides added.
+        tiles: (>= n, blocks, 9, lanes), of which the first n are written.
 
     Returns:
         Whether all went well: not if two estimates are exact along one direction.
@@ -135,7 +135,6 @@ def join(
             for lane in range(min(lanes, len(motion) - first)):
                 p = first + lane
                 in_a, in_b = j >= 0 and times_a[j, p] > 0, k >= 0 and times_b[k, p] > 0
-                times[i, p] = (times_a[j, p] if j >= 0 else 0) + (times_b[k, p] if k >= 0 else 0)
                 if in_b:
                     _widened(values_b, where_b[k, p], lanes, extra, scale, two)
                     _move(two, motion[p, 0], motion[p, 1], cos[p], sin[p])

@@ -139,31 +139,17 @@ class ParticleMaps(MapStore):
         tiles = padded.reshape(len(padded), 9, -1, LANES).transpose(0, 2, 1, 3)
         odds = None if odds is None else odds[keep]
         last_seen = None if last_seen is None else last_seen[keep]
-        self.load_tiles(
-            tiles, counts[keep], descriptors[keep], ids[keep], identities[keep], next_id, odds, last_seen=last_seen
-        )  # fmt: skip
-
-    def load_tiles(
-        self, tiles: FloatArray, counts: NDArray[np.integer[Any]], descriptors: NDArray[np.float32], ids: IntArray,
-        identities: IntArray, next_id: int, odds: FloatArray | None = None, last_seen: IntArray | None = None,
-    ) -> None:  # fmt: skip
-        """Replace all landmarks by these, each held by a particle: `load` with values as `blocks` holds them.
-
-        Args:
-            tiles: (n, P / lanes, 9, lanes) float64.
-            counts, descriptors, ids, identities, next_id, odds, last_seen: As of `load`.
-        """
-        self.load_names(counts, descriptors, ids, identities, next_id, odds, last_seen)
-        self.blocks[: len(ids)] = tiles
+        self.load_names(counts[keep], descriptors[keep], ids[keep], identities[keep], next_id, odds, last_seen)
+        self.blocks[: len(tiles)] = tiles
 
     def load_names(
         self, counts: NDArray[np.integer[Any]], descriptors: NDArray[np.float32], ids: IntArray, identities: IntArray,
         next_id: int, odds: FloatArray | None = None, last_seen: IntArray | None = None,
     ) -> None:  # fmt: skip
-        """Do what `load_tiles` does but for the values: the first n of `blocks` are then to be written.
+        """Replace all landmarks by these but for the values: the first n of `blocks` are then to be written.
 
         Args:
-            counts: (n, M), or (n, 1) where all particles have the same.
+            counts: (n, M), or (n, 1) where all particles have the same; each landmark is held by a particle.
             descriptors, ids, identities, next_id, odds, last_seen: As of `load`.
         """
         n, m = len(ids), self.num_particles

@@ -23,7 +23,7 @@ import math
 
 import numpy as np
 
-from slam_backend._joint_landmarks import Landmarks, fuse_odds, joined_tiles, stack_descriptors
+from slam_backend._joint_landmarks import Landmarks, fuse_odds, joint_counts, stack_descriptors, write_joint
 from slam_backend._joint_robots import finish, joined_robots
 from slam_backend._pairing import Pairing, pair_up
 from slam_backend.alignment import Alignment
@@ -95,13 +95,11 @@ def merge_filters(
     own = np.setdiff1d(np.arange(len(ids_b)), shared_b)  # b's landmarks that a does not have
     rows_a, rows_b = np.arange(len(ids_a) + len(own)), np.full(len(ids_a) + len(own), -1)
     rows_a[len(ids_a) :], rows_b[len(ids_a) :], rows_b[shared_a] = -1, own, shared_b
-    # Either map bears half of what they do not explain.
-    tiles, counts = joined_tiles(of_a, of_b, rows_a, rows_b, motion, 0.5 * extra, scale)
+    counts = joint_counts(of_a, of_b, rows_a, rows_b)
     next_id = a._maps.next_id
     new_ids = next_id + np.arange(len(own))
     held = np.flatnonzero((counts > 0).any(axis=1))
-    joint._maps.load_tiles(
-        tiles[held],
+    joint._maps.load_names(
         counts[held],
         stack_descriptors(descriptors, looks_b[own])[held],
         np.concatenate([ids_a, new_ids])[held],
@@ -109,6 +107,8 @@ def merge_filters(
         next_id + len(own),
         np.concatenate([odds_a, odds_b[own]])[held],
     )
+    # Either map bears half of what they do not explain.
+    write_joint(of_a, of_b, rows_a[held], rows_b[held], motion, 0.5 * extra, scale, joint._maps.blocks)
     renamed = np.concatenate([pairs[:, ::-1], np.column_stack([ids_b[own], new_ids])]).astype(np.int64)
     finish(joint, a, b, renamed)
     return joint, renamed

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from gappy_filter import filter_with_gaps
 
-from slam_backend._joint_landmarks import Landmarks, joined_tiles
+from slam_backend._joint_landmarks import Landmarks, joint_counts, write_joint
+from slam_backend._kernels import LANES
 from slam_backend._particle_maps import ParticleMaps
 from slam_backend.errors import FloatArray, IntArray
 from slam_backend.fusion import fuse_landmarks
@@ -52,12 +53,14 @@ def test_the_join_agrees_with_matrices(sizes: tuple[int, int]) -> None:
     rows_b[[1, 2, 3, 4, -2, -1]] = [5, 0, 1, 4, 2, 3]
     motion = rng.uniform(-2.0, 2.0, (40, 3))
     before = [side.get_state() for side in maps]
-    tiles, counts = joined_tiles(a, b, rows_a, rows_b, motion, EXTRA, SCALE)
+    tiles = np.zeros((len(rows_a) + 1, 1, 9, LANES))
+    write_joint(a, b, rows_a, rows_b, motion, EXTRA, SCALE, tiles)
     plain, plain_counts = plain_join(a, b, rows_a, rows_b, motion)
-    found = tiles.transpose(0, 1, 3, 2).reshape(len(rows_a), -1, 9)
-    np.testing.assert_array_equal(counts, plain_counts)
+    found = tiles[:-1].transpose(0, 1, 3, 2).reshape(len(rows_a), -1, 9)
+    np.testing.assert_array_equal(joint_counts(a, b, rows_a, rows_b), plain_counts)
     np.testing.assert_allclose(found[:, :40], plain, rtol=1e-9, atol=1e-12)
     assert not found[:, 40:].any()
+    assert not tiles[-1].any()
     both = (a.counts[[1, 2, 3, 4]] > 0) & (b.counts[[5, 0, 1, 4]] > 0)
     assert both.any()
     for side, state in zip(maps, before, strict=True):
@@ -83,4 +86,4 @@ def test_two_exact_estimates_cannot_be_fused() -> None:
     maps.load(exact, np.ones((1, 2), np.int64), np.eye(1, 4, dtype=np.float32), np.arange(1), np.full(1, -1), 1)
     side, row = Landmarks.of(maps), np.zeros(1, np.int64)
     with pytest.raises(ValueError, match="landmarks in common: expected positive definite covariances, got 'singular"):
-        joined_tiles(side, side, row, row, np.zeros((2, 3)), 0.0, 1.0)
+        write_joint(side, side, row, row, np.zeros((2, 3)), 0.0, 1.0, maps.blocks)
