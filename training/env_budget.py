@@ -46,7 +46,7 @@ PHASES = (
     Phase("filters", 135, ((FastSlam, "_step_checked"),)),
     Phase("team, alignment", 40, ((TeamSlam, "step"),)),
     Phase("errors", 15, ((Episode, "standing"),)),
-    Phase("local grids", 20, ((observation, "observe_team"),)),
+    Phase("observations", 20, ((observation, "observe_team"),)),
     Phase("candidates", 40, ((CandidateSlots, "update"),)),
     Phase(
         "beliefs, dictionaries",
