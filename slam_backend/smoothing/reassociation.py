@@ -115,25 +115,24 @@ def _located(
     """Return where what was refused lies in the map, seen from the guessed poses; None if there is nothing."""
     found = []
     for robot, (log, of_steps, guessed) in enumerate(zip(logs, refused, guesses, strict=True)):
+        row_of = {step: t for t, step in enumerate(log.steps.tolist()) if step in of_steps}
         poses = guessed.at(log.steps)
-        for step, what in of_steps.items():
-            t = int(np.searchsorted(log.steps, step))
-            if t == len(log) or log.steps[t] != step or np.isnan(poses[t, 0]):
-                continue
-            places, pose = log.starts[t] + what.rows, poses[t]
-            turn = np.eye(3)
-            turn[:2, :2] = rotation(pose[2])
-            own = log.points[places]
-            if log.given[t] and log.covariances is not None:
-                spread = log.covariances[places][:, UNPACK]
-            else:
-                seen = options.camera.covariance(own @ ROBOT_FROM_CAMERA)
-                spread = ROBOT_FROM_CAMERA @ seen @ ROBOT_FROM_CAMERA.T
-            means = (own + np.asarray(options.camera.mount)) @ turn.T
-            means[:, :2] += pose[:2]
-            covariances = turn @ spread @ turn.T + ROUNDING * np.eye(3)
-            n = len(places)
-            found.append((np.full(n, robot), np.full(n, step), places, means, covariances, what.descriptors))
+        held = [(step, t) for step, t in row_of.items() if not np.isnan(poses[t, 0])]
+        if not held:
+            continue
+        steps, t = np.repeat(held, [len(of_steps[step].rows) for step, _ in held], axis=0).T
+        places = log.starts[t] + np.concatenate([of_steps[step].rows for step, _ in held])
+        own, turns = log.points[places], np.zeros((len(t), 3, 3))
+        turns[:, :2, :2], turns[:, 2, 2] = rotation(poses[t, 2]), 1.0
+        spread = ROBOT_FROM_CAMERA @ options.camera.covariance(own @ ROBOT_FROM_CAMERA) @ ROBOT_FROM_CAMERA.T
+        if log.covariances is not None:
+            given = log.given[t]
+            spread[given] = log.covariances[places[given]][:, UNPACK]
+        means = (turns @ (own + np.asarray(options.camera.mount))[:, :, None])[:, :, 0]
+        means[:, :2] += poses[t, :2]
+        covariances = turns @ spread @ turns.transpose(0, 2, 1) + ROUNDING * np.eye(3)
+        descriptors = np.concatenate([of_steps[step].descriptors for step, _ in held])
+        found.append((np.full(len(t), robot), steps, places, means, covariances, descriptors))
     return _Points(*(np.concatenate(column) for column in zip(*found, strict=True))) if found else None
 
 
