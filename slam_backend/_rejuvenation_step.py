@@ -50,6 +50,7 @@ class RejuvenationStep:
         self._share = max(LEAST_ROWS, (options.smoothing.slice_steps or 0) // num_robots)  # steps a slice takes in
         self._noiseless = options.motion.is_exact
         self._graph: PathGraph | None = None  # at its mode
+        self._oldest = -1  # of the robots' newest steps there
         self._draft: Draft | None = None  # the same and a little more, on its way there
         self._asked = False  # for new particles now, whatever has been read since
         self._waited = 0  # steps since the last time
@@ -120,9 +121,9 @@ class RejuvenationStep:
 
     def waits(self, step: int) -> bool:
         """Return whether there is nothing to do after a step, whatever the logs hold up to it; else see `rests`."""
-        if self._graph is None or self._draft is not None or self.due:
+        if self._graph is None or self._draft is not None or step - self._oldest >= self._share:
             return False
-        return step - int(min(self._graph.latest.tolist())) < self._share
+        return not self.due
 
     def rests(self, logs: Sequence[RobotLog]) -> bool:
         """Return whether there is nothing to do now: the rule. Else it is due, or a slice of the work can be done."""
@@ -163,7 +164,7 @@ class RejuvenationStep:
         smoother = Smoother(options.motion, camera, options.smoothing, rng)
         if options.smoothing.slice_steps is None:
             return self._whole(graph, self._new(logs, graph, maps, best), smoother, maps, best)
-        self._graph = graph
+        self._hold(graph)
         if (draft := self._draft) is not None:
             outcome = smoother.descend(draft)
             return self._after(draft.graph, outcome, lambda: since(logs, graph, draft.graph), smoother)
@@ -212,8 +213,9 @@ class RejuvenationStep:
             for step, where in zip((a, b), starts[:2], strict=True)
         )
         options = self._options.smoothing
-        self._graph, motion = joint_graph(own, other, starts, frames, renamed, camera, options)
-        self._draft = None if options.slice_steps is None else Draft(graph=self._graph)
+        graph, motion = joint_graph(own, other, starts, frames, renamed, camera, options)
+        self._hold(graph)
+        self._draft = None if options.slice_steps is None else Draft(graph=graph)
         self._guesses = a._guesses + [Guesses(steps, compose(motion, poses)) for steps, poses in b._guesses]
         self._refused = [dict(refused) for refused in (*a._refused, *b._refused)]
         self._read, self._exact = a._read + b._read, a._exact or b._exact
@@ -263,9 +265,14 @@ class RejuvenationStep:
         self._graph = None
         return _told(tried, f"{reason}; it begins anew from the logs")
 
+    def _hold(self, graph: PathGraph) -> None:
+        """Take note of a graph and of how old it is."""
+        self._graph, self._oldest = graph, min(graph.latest.tolist())
+
     def _keep(self, graph: PathGraph) -> None:
         """Go on from a graph at its mode."""
-        self._graph, self._failures = graph, 0
+        self._hold(graph)
+        self._failures = 0
         for robot, latest in enumerate(graph.latest.tolist()):
             self._guesses[robot] = self._guesses[robot].after(latest)
             for step in [step for step in self._refused[robot] if step <= latest]:
@@ -298,7 +305,9 @@ class RejuvenationStep:
 
     def set_state(self, state: Mapping[str, Any]) -> None:
         """Go on exactly as the one that gave `state`."""
-        self._graph = None if state["graph"] is None else PathGraph(**state["graph"])
+        self._graph = None
+        if state["graph"] is not None:
+            self._hold(PathGraph(**state["graph"]))
         self._draft = None
         if state["draft"] is not None:
             graph, damping, steps = state["draft"]

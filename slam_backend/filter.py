@@ -183,9 +183,10 @@ class FastSlam(FilterKnowledge):
             maps.release(slots)
         if report.resampled:
             self._resample()
-        if self._rejuvenation is not None:
-            self._rejuvenation.count(report.num_new + report.num_matched, summary[LONG_UNSEEN])
-            if self.may_smooth and (news := self._rejuvenate(self._rejuvenation)) is not None:
+        if (smoother := self._rejuvenation) is not None:
+            smoother.count(report.num_new + report.num_matched, summary[LONG_UNSEEN])
+            is_busy = self.may_smooth and not smoother.waits(self._steps - 1)
+            if is_busy and (news := self._rejuvenate(smoother)) is not None:
                 return report._replace(rejuvenation=news)
         return report
 
@@ -222,7 +223,7 @@ class FastSlam(FilterKnowledge):
 
     def _rejuvenate(self, smoother: RejuvenationStep) -> RejuvenationReport | None:
         """Draw the particles anew from the posterior of whole paths, if it is time and that can be found."""
-        if smoother.waits(self._steps - 1) or smoother.rests(self._logs):
+        if smoother.rests(self._logs):
             return None
         starts = self._starts[:, :, : self.num_particles]
         result = smoother.run(

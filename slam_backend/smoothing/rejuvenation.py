@@ -229,7 +229,7 @@ def _particles(graph: PathGraph, mode: Mode, draws: Draws, weights: FloatArray) 
     poses, starts = draws.poses[graph.tips], draws.poses[graph.heads]
     means = mode.poses[graph.tips]
     covariances = np.zeros((len(means), 3, 3))
-    sought = np.flatnonzero(mode.columns[graph.tips] >= 0)
+    (sought,) = (mode.columns[graph.tips] >= 0).nonzero()
     joint = mode.covariance(graph.tips[sought])
     off = (poses - means[:, :, None])[sought].reshape(-1, poses.shape[2])
     for place, robot in enumerate(sought):
@@ -238,11 +238,11 @@ def _particles(graph: PathGraph, mode: Mode, draws: Draws, weights: FloatArray) 
     frame = np.zeros((3, 3))
     in_view = np.zeros(len(seen), dtype=np.bool_)
     in_view[graph.point_landmarks] = True
-    rows = np.flatnonzero(in_view[seen])
+    (rows,) = in_view[seen].nonzero()
     if (held := holding(tiles, rows, mode.landmarks[seen], poses, means, weights)) is not None:
         move_tiles(tiles, held.motions)
         poses, frame = held.poses, held.scatter
-        for head in np.flatnonzero(mode.columns[graph.heads] >= 0).tolist():
+        for head in (mode.columns[graph.heads] >= 0).nonzero()[0].tolist():
             own = starts[head : head + 1]
             move(own, held.motions, own)
     for array in (poses, starts):
