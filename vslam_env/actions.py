@@ -37,7 +37,7 @@ def checked_actions(actions: Any, agents: Sequence[str], action_type: str) -> li
     """
     if type(actions) is not dict and not isinstance(actions, Mapping):  # asking a dict of its kin takes 1 us
         raise bad_argument("actions", "a dict from agent to action", actions, "Pass {agent: action}.")
-    if actions.keys() != set(agents):
+    if list(actions) != agents and actions.keys() != set(agents):  # nearly all come in order
         unknown = [agent for agent in actions if agent not in agents]
         if unknown:
             raise bad_argument("actions", f"actions of {list(agents)}", unknown[0], "Drop agents that are not there.")
