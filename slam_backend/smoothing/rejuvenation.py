@@ -11,7 +11,7 @@ from slam_backend.errors import FloatArray, IntArray
 from slam_backend.geometry import wrap_angle
 from slam_backend.log_arrays import EXACT, LogArrays
 from slam_backend.motion import OdometryModel
-from slam_backend.resampling import effective_sample_size, systematic
+from slam_backend.resampling import systematic
 from slam_backend.smoothing.coarsening import at_mode, coarsened, compacted
 from slam_backend.smoothing.duplicates import find_duplicates, without_duplicates
 from slam_backend.smoothing.extending import Places, extended, first_rows
@@ -189,28 +189,19 @@ def drawn(
     """
     draws = draw_paths(grown, mode, num_particles, rng)
     graph = coarsened(at_mode(grown, mode, draws.spreads), camera, options, mode.sightings)
-    weights, ess = _weighed(draws)
-    chosen = draws
+    chosen, ess = draws, draws.sample_size
     needed = options.least_ess * num_particles
     if needed > ess >= needed / options.more_draws:
         many = draw_paths(grown, mode, options.more_draws * num_particles, rng)
-        weights, ess = _weighed(many)
-        chosen = many.taken(systematic(weights, rng, num_particles))
-        weights, ess = np.full(num_particles, 1.0 / num_particles), min(ess, float(num_particles))
+        chosen = many.taken(systematic(many.weights, rng, num_particles))
+        ess = min(many.sample_size, float(num_particles))
     if not ess >= needed:
         return Rejuvenation(graph, f"an effective sample size of {ess:.1f}", ess, mode.iterations, None)
     if looks is not None and len(looks.ids):
         duplicates = find_duplicates(grown, mode, draws, _descriptors(grown, looks), looks.gate)
         if len(duplicates):
             graph = compacted(without_duplicates(graph, duplicates))
-    return Rejuvenation(graph, "", ess, mode.iterations, _particles(grown, mode, chosen, weights))
-
-
-def _weighed(draws: Draws) -> tuple[FloatArray, float]:
-    """Return normalised weights and their effective sample size."""
-    weights = np.exp(draws.log_weights - draws.log_weights.max())
-    weights /= weights.sum()
-    return weights, effective_sample_size(weights)
+    return Rejuvenation(graph, "", ess, mode.iterations, _particles(grown, mode, chosen))
 
 
 def _descriptors(graph: PathGraph, looks: Looks) -> NDArray[np.float32]:
@@ -221,8 +212,9 @@ def _descriptors(graph: PathGraph, looks: Looks) -> NDArray[np.float32]:
     return result
 
 
-def _particles(graph: PathGraph, mode: Mode, draws: Draws, weights: FloatArray) -> Particles:
+def _particles(graph: PathGraph, mode: Mode, draws: Draws) -> Particles:
     """Gather what particles hold."""
+    weights = draws.weights
     counts = np.bincount(mode.sightings.landmarks, weights=mode.sightings.counts, minlength=len(graph.landmark_ids))
     seen = counts > 0
     tiles = draws.tiles if seen.all() else draws.tiles[seen]

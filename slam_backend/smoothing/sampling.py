@@ -1,6 +1,7 @@
 """Whole paths drawn from the posterior of a smoother, their landmarks, and their importance weights."""
 
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
@@ -24,13 +25,24 @@ class Draws:
         poses: (k, 3, M) float64 [m, m, rad], map frame.
         tiles: (l, P / LANES, 9, LANES) float64. Means (3) and covariances (6) of the landmarks, map frame, by lanes.
         log_weights: (M,) float64. Importance weights, not normalised.
+        weights: (M,) float64. The same, summing to 1; NaN where one is not finite.
+        sample_size: Effective sample size of the weights, likewise.
         spreads: (k,) float64 [m^2]. How far the motions from the keys before scatter, headings felt at `LEVER`.
     """
 
     poses: FloatArray
     tiles: FloatArray
     log_weights: FloatArray
+    weights: FloatArray
+    sample_size: float
     spreads: FloatArray
+
+    @classmethod
+    def weighed(cls, poses: FloatArray, tiles: FloatArray, log_weights: FloatArray, spreads: FloatArray) -> Self:
+        """Return paths with their weights normalised; arguments as the attributes."""
+        weights = np.exp(log_weights - log_weights.max())
+        weights /= weights.sum()
+        return cls(poses, tiles, log_weights, weights, effective_sample_size(weights), spreads)
 
     @property
     def landmarks(self) -> FloatArray:
@@ -38,18 +50,12 @@ class Draws:
         rows = self.tiles.transpose(0, 2, 1, 3).reshape(len(self.tiles), 9, -1)
         return np.ascontiguousarray(rows[:, :, : self.poses.shape[2]])
 
-    @property
-    def sample_size(self) -> float:
-        """Effective sample size of the weights, 0 if there are none."""
-        weights = np.exp(self.log_weights - self.log_weights.max())
-        return effective_sample_size(weights / weights.sum()) if np.isfinite(weights).all() else 0.0
-
     def taken(self, ancestors: IntArray) -> "Draws":
         """Return as many paths as there are ancestors (M',), each a copy of its ancestor, weighed alike."""
         m = len(ancestors)
         padded = np.concatenate([ancestors, np.repeat(ancestors[:1], -m % LANES)])  # surplus lanes are copies
         tiles = self.landmarks[:, :, padded].reshape(len(self.tiles), 9, -1, LANES).transpose(0, 2, 1, 3)
-        return Draws(self.poses[:, :, ancestors], np.ascontiguousarray(tiles), np.zeros(m), self.spreads)
+        return Draws.weighed(self.poses[:, :, ancestors], np.ascontiguousarray(tiles), np.zeros(m), self.spreads)
 
 
 def draw_paths(graph: PathGraph, mode: Mode, num_particles: int, rng: np.random.Generator) -> Draws:
@@ -70,7 +76,7 @@ def draw_paths(graph: PathGraph, mode: Mode, num_particles: int, rng: np.random.
     if straight.sample_size >= BENT_BELOW * num_particles:
         return straight
     bent = _weighed(graph, mode, bend(mode.poses, graph.previous, poses - mode.poses[:, :, None]), log_proposals)
-    return bent if bent.sample_size > straight.sample_size else straight
+    return max(straight, bent, key=lambda draws: np.nan_to_num(draws.sample_size))
 
 
 def drawn_spreads(graph: PathGraph, mode: Mode, rng: np.random.Generator) -> FloatArray:
@@ -91,7 +97,7 @@ def _weighed(graph: PathGraph, mode: Mode, poses: FloatArray, log_proposals: Flo
     rows = lane_rows(poses)
     tiles, log_likelihood = replay(mode, rows, num_paths)
     log_odometry, spreads = weigh_odometry(graph, mode, rows, num_paths)
-    return Draws(poses, tiles, log_likelihood + log_odometry - log_proposals, spreads)  # (2)
+    return Draws.weighed(poses, tiles, log_likelihood + log_odometry - log_proposals, spreads)  # (2)
 
 
 def lane_rows(poses: FloatArray) -> FloatArray:
