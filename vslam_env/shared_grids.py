@@ -9,7 +9,7 @@ import numpy as np
 from slam_backend.errors import BoolArray, FloatArray, IntArray
 from slam_backend.geometry import compose, inverse
 from slam_backend.reports import MapDropped, MapEntry, MergeUndone, Renaming
-from vslam_env.navigation import SeenGrid, TeamGrids
+from vslam_env.navigation import SeenGrid, TeamGrids, ray_directions
 from vslam_env.robot_belief import Body
 
 
@@ -18,24 +18,22 @@ class Strokes(NamedTuple):
 
     Attributes:
         tick: Of the readings.
-        owners: (n,) int64. Whose grids.
-        robots: (n,) int64. Who scanned.
+        shared: (K, K) int64. 1 where i's grid took what robot j read.
         poses: (K, K, 3) [m, m, rad]. Where robot j was believed to be in i's start frame.
         scans: (K, R) [m].
         bumps: (K,) bool. Who bumped into something.
     """
 
     tick: int
-    owners: IntArray
-    robots: IntArray
+    shared: IntArray
     poses: FloatArray
     scans: FloatArray
     bumps: BoolArray
 
     def within(self, side: Sequence[int]) -> "Strokes":
         """Return those of some robots' readings that went into these robots' grids."""
-        own = np.isin(self.owners, side) & np.isin(self.robots, side)
-        return self._replace(owners=self.owners[own], robots=self.robots[own])
+        own = np.isin(np.arange(len(self.shared)), side)
+        return self._replace(shared=self.shared * own * own[:, None])
 
 
 class Kept(NamedTuple):
@@ -73,7 +71,7 @@ class SharedGrids:
     def __init__(self, num_robots: int, body: Body) -> None:
         self.team = TeamGrids(num_robots)
         self._grids = self.team.grids
-        self._body = body
+        self._hardware = ray_directions(body.ray_angles), float(body.scan_range), float(body.radius)
         self._settle([(robot,) for robot in range(num_robots)])
         self._kept: list[Kept] = []
         self._strokes: deque[Strokes] = deque()
@@ -123,7 +121,7 @@ class SharedGrids:
                 self._grids[robot].set_state(kept.grids[robot])
             for strokes in self._strokes:
                 if strokes.tick >= kept.tick:
-                    self._draw(*strokes.within(side)[1:])
+                    self.team.paint_readings(*strokes.within(side)[1:], *self._hardware)
         side_of = {robot: side for side in kept.sides for robot in side}
         self._settle(
             [
@@ -157,8 +155,7 @@ class SharedGrids:
     def _settle(self, mates: Sequence[tuple[int, ...]]) -> None:
         """Take note of who goes by the same filter as whom."""
         self._mates = tuple(mates)
-        pairs = [(owner, robot) for owner, group in enumerate(mates) for robot in group]
-        self._owners, self._robots = np.array(pairs).T.copy()
+        self._shared = np.array([[robot in group for robot in range(len(mates))] for group in mates], np.int64)
 
     def paint(self, tick: int, poses: FloatArray, scans: FloatArray, bumps: BoolArray) -> None:
         """Paint what each robot scans into the grids of all that go by its filter.
@@ -173,14 +170,9 @@ class SharedGrids:
         Raises:
             ValueError: If a range is out of its limits.
         """
-        self._draw(self._owners, self._robots, poses, scans, bumps)
+        self.team.paint_readings(self._shared, poses, scans, bumps, *self._hardware)
         if self._kept:
-            self._strokes.append(Strokes(tick, self._owners, self._robots, poses.copy(), scans.copy(), bumps.copy()))
-
-    def _draw(self, owners: IntArray, robots: IntArray, poses: FloatArray, scans: FloatArray, bumps: BoolArray) -> None:
-        """Paint readings into the grids, as `Strokes` has them."""
-        body = self._body
-        self.team.paint_readings(owners, robots, poses, scans, bumps, body.ray_angles, body.scan_range, body.radius)
+            self._strokes.append(Strokes(tick, self._shared, poses.copy(), scans.copy(), bumps.copy()))
 
     def get_state(self) -> dict[str, Any]:
         """Return all that decides how the grids go on; what is never written to is shared."""

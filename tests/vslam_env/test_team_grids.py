@@ -4,25 +4,25 @@ import numpy as np
 import pytest
 from navigation_rooms import ANGLES, MAX_RANGE
 
-from vslam_env.navigation import UNKNOWN, TeamGrids
+from vslam_env.navigation import UNKNOWN, TeamGrids, ray_directions
 
 RADIUS = 0.2
+HARDWARE = ray_directions(ANGLES), MAX_RANGE, RADIUS
 
 
 def test_readings_are_painted_as_their_parts() -> None:
-    """Each grid holds, and tells as changed, what scan, disc and bump leave one after the other, in the order given."""
+    """Each grid holds, and tells as changed, what scan, disc and bump leave one after the other, in ascending order."""
     rng = np.random.default_rng(4)
     team, apart = TeamGrids(3), [TeamGrids(1) for _ in range(3)]
     parts = [single.grids[0] for single in apart]
     for one in (team, *apart):
         one.changes[:, 0] = 0
     for _ in range(30):
-        count = int(rng.integers(0, 7))
-        owners, robots = rng.integers(0, 3, count), rng.integers(0, 3, count)
+        shared = rng.integers(0, 2, (3, 3))
         poses = rng.uniform(-1.0, 1.0, (3, 3, 3)) * [9.0, 9.0, 3.0]
         scans, bumps = rng.uniform(0.3, 9.0, (3, 32)), rng.random(3) < 0.4
-        team.paint_readings(owners, robots, poses, scans, bumps, ANGLES, MAX_RANGE, RADIUS)
-        for owner, robot in zip(owners, robots, strict=True):
+        team.paint_readings(shared, poses, scans, bumps, *HARDWARE)
+        for owner, robot in np.argwhere(shared):
             pose = poses[owner, robot]
             parts[owner].paint_scan(pose, scans[robot], ANGLES)
             parts[owner].clear_disc(pose, RADIUS)
@@ -39,18 +39,24 @@ def test_readings_are_painted_as_their_parts() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "pose", "ranges", "angles"),
+    ("name", "pose", "ranges"),
     [
-        ("pose", [0.0, np.nan, 0.0], np.ones(3), np.array([-0.1, 0.0, 0.1])),
-        ("ranges", [0.0, 0.0, 0.0], np.array([1.0, -1.0, 1.0]), np.array([-0.1, 0.0, 0.1])),
-        ("angles", [0.0, 0.0, 0.0], np.ones(3), np.array([0.1, 0.0, -0.1])),
+        ("pose", [0.0, np.nan, 0.0], np.ones(3)),
+        ("ranges", [0.0, 0.0, 0.0], np.array([1.0, -1.0, 1.0])),
+        ("ranges", [0.0, 0.0, 0.0], np.array([1.0, np.nan, 1.0])),
     ],
 )
-def test_a_bad_reading_is_refused(name: str, pose: list[float], ranges: np.ndarray, angles: np.ndarray) -> None:
-    """Nothing is painted, not even what is good, beside a reading at no place, of negative ranges or a wrong fan."""
-    team, pairs = TeamGrids(2), np.arange(2)
+def test_a_bad_reading_is_refused(name: str, pose: list[float], ranges: np.ndarray) -> None:
+    """Nothing is painted, not even what is good, beside a reading at no place or of negative ranges."""
+    team, rays = TeamGrids(2), ray_directions(np.array([-0.1, 0.0, 0.1]))
     poses, scans = np.full((2, 2, 3), np.nan), np.array([np.ones(3), ranges])
     poses[0, 0], poses[1, 1] = 0.0, pose
     with pytest.raises(ValueError, match=rf"^{name}: expected"):
-        team.paint_readings(pairs, pairs, poses, scans, np.zeros(2, np.bool_), angles, MAX_RANGE, RADIUS)
+        team.paint_readings(np.eye(2, dtype=np.int64), poses, scans, np.zeros(2, np.bool_), rays, MAX_RANGE, RADIUS)
     assert all((grid.cells == UNKNOWN).all() for grid in team.grids)
+
+
+def test_rays_in_another_order_are_refused() -> None:
+    """A fan from left to right has no directions."""
+    with pytest.raises(ValueError, match=r"^angles: expected"):
+        ray_directions(ANGLES[::-1])

@@ -1,5 +1,6 @@
 """What a robot does with the floor it has seen: grid, frontiers, paths. It knows no simulator, no sensor, no reward."""
 
+from vslam_env.navigation._arguments import ray_directions
 from vslam_env.navigation.candidate_slots import CandidateSlots, TeamSlots
 from vslam_env.navigation.frontiers import Frontiers, find_frontiers
 from vslam_env.navigation.planning import DistanceMap, distance_map, follow_path, plan_path
@@ -33,4 +34,5 @@ __all__ = [
     "find_frontiers",
     "follow_path",
     "plan_path",
+    "ray_directions",
 ]

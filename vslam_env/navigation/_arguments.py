@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from slam_backend.errors import FloatArray, bad_argument
-from vslam_env.navigation._painting_kernels import BAD_POSE, BAD_RANGES, GRID_SIZE
+from vslam_env.navigation._painting_kernels import GRID_SIZE, directions_of, good_angles, good_ranges
 
 
 def pose_floats(pose: ArrayLike, name: str = "pose") -> tuple[float, float, float]:
@@ -42,21 +42,19 @@ def positions_array(positions: ArrayLike, name: str) -> FloatArray:
     return values
 
 
-def bad_reading(fault: int, pose: ArrayLike, ranges: ArrayLike, angles: ArrayLike) -> ValueError:
-    """Return the error that says what is wrong with a reading.
+def check_ranges(ranges: FloatArray) -> None:
+    """Raise if ranges (n,) [m] are not at least 0."""
+    if not good_ranges(ranges):
+        raise bad_argument("ranges", "distances >= 0 [m]", ranges, "Use max_range where a ray saw nothing.")
 
-    Args:
-        fault: `BAD_POSE`, `BAD_RANGES` or `BAD_ANGLES`.
-        pose: (3,) [m, m, rad]. Where it was taken.
-        ranges: (n,) [m].
-        angles: (n,) [rad].
-    """
-    if fault == BAD_POSE:
-        return bad_argument("pose", "finite numbers", pose, "Give (x, y, theta) in metres and radians.")
-    if fault == BAD_RANGES:
-        return bad_argument("ranges", "distances >= 0 [m]", ranges, "Use max_range where a ray saw nothing.")
-    expected = "ascending angles spanning less than pi [rad]"
-    return bad_argument("angles", expected, angles, "Order the rays from right to left.")
+
+def ray_directions(angles: FloatArray) -> FloatArray:
+    """Return the unit vectors (2, n) of rays at angles (n,) [rad], ascending over less than pi, or raise."""
+    if not good_angles(angles):
+        expected = "ascending angles spanning less than pi [rad]"
+        raise bad_argument("angles", expected, angles, "Order the rays from right to left.")
+    directions: FloatArray = directions_of(angles)
+    return directions
 
 
 def check_cells(cells: NDArray[np.uint8]) -> None:

@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from slam_backend.errors import FloatArray, IntArray, bad_argument, check_array, check_float
 from vslam_env.navigation import _painting_kernels as _painting
-from vslam_env.navigation._arguments import bad_reading, pose_floats
+from vslam_env.navigation._arguments import check_ranges, pose_floats, ray_directions
 from vslam_env.navigation._painting_kernels import CELL, FREE, GRID_SIZE, HALF_WIDTH, OCCUPIED, UNKNOWN
 
 # What each evidence, as an unsigned byte, says of a cell.
@@ -107,11 +107,10 @@ class SeenGrid:
                 f"shape {ranges.shape} with angles {angles.shape}",
                 "Give one range per ray.",
             )
+        check_ranges(ranges)
+        directions = ray_directions(angles)
         grid = self._evidence, self._cells, self._changes
-        fault = _painting.fault_of_scan(ranges, angles)
-        if fault != _painting.READINGS_FINE:
-            raise bad_reading(fault, pose, ranges, angles)
-        _painting.paint_scan(*grid, x, y, theta, ranges, angles, float(max_range))
+        _painting.paint_scan(*grid, x, y, theta, ranges, directions, float(max_range))
 
     def clear_disc(self, pose: ArrayLike, radius: float = 0.2) -> None:
         """Mark as free what the body of a robot covers.

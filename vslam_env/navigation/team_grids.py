@@ -4,7 +4,7 @@ import numpy as np
 
 from slam_backend.errors import BoolArray, FloatArray, IntArray
 from vslam_env.navigation import _painting_kernels as _painting
-from vslam_env.navigation._arguments import bad_reading
+from vslam_env.navigation._arguments import check_ranges, pose_floats
 from vslam_env.navigation.seen_grid import GRID_SIZE, UNKNOWN, SeenGrid
 
 
@@ -32,32 +32,30 @@ class TeamGrids:
 
     def paint_readings(
         self,
-        owners: IntArray,
-        robots: IntArray,
+        shared: IntArray,
         poses: FloatArray,
         scans: FloatArray,
         bumps: BoolArray,
-        angles: FloatArray,
+        directions: FloatArray,
         max_range: float,
         radius: float,
     ) -> None:
         """Paint what robots read in a tick: what `paint_scan`, `clear_disc` and, after a bump, `bump` paint in turn.
 
         Args:
-            owners: (n,) int64. Into whose grid is painted; in this order.
-            robots: (n,) int64. Whose readings.
+            shared: (K, K) int64. 1 where what robot j reads is painted into i's grid; of the robots in ascending order.
             poses: (K, K, 3) float64 [m, m, rad]. Where robot j was, in the start frame of i's grid.
             scans: (K, R) float64 [m]. As `SeenGrid.paint_scan` expects each.
             bumps: (K,) bool. Which robots bumped into something.
-            angles: (R,) float64 [rad]. Likewise.
+            directions: (2, R) float64. Of the rays, as `ray_directions` returns them.
             max_range: [m].
             radius: Of the robots [m].
 
         Raises:
-            ValueError: If one of these poses is not finite, or ranges or angles are not as described; then nothing is
-                painted.
+            ValueError: If one of these poses is not finite, or ranges are less than 0; then nothing is painted.
         """
         grids = self._evidence, self._cells, self.changes
-        fault, pair = _painting.paint_readings(*grids, owners, robots, poses, scans, bumps, angles, max_range, radius)
-        if fault != _painting.READINGS_FINE:
-            raise bad_reading(fault, poses[owners[pair], robots[pair]], scans[robots[pair]], angles)
+        owner, robot = _painting.paint_readings(*grids, shared, poses, scans, bumps, directions, max_range, radius)
+        if owner >= 0:
+            pose_floats(poses[owner, robot])
+            check_ranges(scans[robot])

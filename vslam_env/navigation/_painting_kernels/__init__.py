@@ -15,11 +15,12 @@ from vslam_env.navigation._painting_kernels.evidence import (
     OCCUPIED,
     UNKNOWN,
 )
-from vslam_env.navigation._painting_kernels.rays import BAD_RANGES, READINGS_FINE, fault_of_scan
-from vslam_env.navigation._painting_kernels.readings import BAD_POSE, paint_bump, paint_disc, paint_readings
+from vslam_env.navigation._painting_kernels.rays import good_angles, good_ranges
+from vslam_env.navigation._painting_kernels.readings import paint_bump, paint_disc, paint_readings
 from vslam_env.navigation._painting_kernels.scans import paint_scan
+from vslam_env.navigation._painting_kernels.surveys import directions_of
 
 __all__ = [
-    "BAD_POSE", "BAD_RANGES", "CELL", "FREE", "GRID_SIZE", "HALF_WIDTH", "MOST_CHANGES", "OCCUPIED", "READINGS_FINE",
-    "UNKNOWN", "fault_of_scan", "paint_bump", "paint_disc", "paint_grid", "paint_readings", "paint_scan",
+    "CELL", "FREE", "GRID_SIZE", "HALF_WIDTH", "MOST_CHANGES", "OCCUPIED", "UNKNOWN", "directions_of", "good_angles",
+    "good_ranges", "paint_bump", "paint_disc", "paint_grid", "paint_readings", "paint_scan",
 ]  # fmt: skip

@@ -10,20 +10,25 @@ from slam_backend.errors import FloatArray
 from vslam_env.navigation._painting_kernels.evidence import CELL
 from vslam_env.navigation._painting_kernels.surveys import ALONG_X, ALONG_Y, TELLING
 
-READINGS_FINE, BAD_RANGES, BAD_ANGLES = 0, 1, 2
 ASIDE = 1e12  # [cells] per row: how far off a ray crosses rows that it leads away from
 
 
 @jit
-def fault_of_scan(ranges: FloatArray, angles: FloatArray) -> int:
-    """Return what is wrong with the ranges (n,) [m] or the angles (n,) [rad] of a scan, or `READINGS_FINE`."""
-    count = len(ranges)
-    for i in range(count):
-        if not ranges[i] >= 0.0:  # also catches NaN
-            return BAD_RANGES
+def good_ranges(ranges: FloatArray) -> bool:
+    """Tell whether ranges (n,) [m] are at least 0."""
+    good = True
+    for i in range(len(ranges)):
+        good &= ranges[i] >= 0.0  # no NaN is
+    return good
+
+
+@jit
+def good_angles(angles: FloatArray) -> bool:
+    """Tell whether the angles (n,) [rad] of rays ascend and span less than pi."""
+    for i in range(len(angles)):
         if not abs(angles[i]) <= 2.0 * math.pi or (i > 0 and not angles[i] > angles[i - 1]):
-            return BAD_ANGLES
-    return READINGS_FINE if angles[count - 1] - angles[0] < math.pi else BAD_ANGLES
+            return False
+    return bool(angles[-1] - angles[0] < math.pi)
 
 
 @jit

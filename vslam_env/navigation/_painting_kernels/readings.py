@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from slam_backend._jit import jit
-from slam_backend.errors import BoolArray, FloatArray, IntArray
+from slam_backend.errors import BoolArray, FloatArray
 from vslam_env.navigation._painting_kernels.evidence import (
     CELL,
     FREE,
@@ -17,11 +17,9 @@ from vslam_env.navigation._painting_kernels.evidence import (
     cell_range,
     judge,
 )
-from vslam_env.navigation._painting_kernels.rays import READINGS_FINE, fault_of_scan
+from vslam_env.navigation._painting_kernels.rays import good_ranges
 from vslam_env.navigation._painting_kernels.scans import paint_survey
-from vslam_env.navigation._painting_kernels.surveys import NUM_ROWS, directions_of, survey
-
-BAD_POSE = 3  # beside what `fault_of_scan` finds
+from vslam_env.navigation._painting_kernels.surveys import NUM_ROWS, survey
 
 
 @jit
@@ -54,16 +52,28 @@ def paint_bump(evidence: Any, cells: Any, changes: Any, x: float, y: float, thet
 
 
 @jit
+def _find_bad(shared: Any, poses: FloatArray, scans: FloatArray) -> tuple[int, int]:
+    """Return what `paint_readings` returns."""
+    for robot in range(len(scans)):
+        if not good_ranges(scans[robot]):
+            return robot, robot
+        for owner in range(len(shared)):
+            x, y, theta = poses[owner, robot]
+            if shared[owner, robot] and not math.isfinite(x + y + theta):
+                return owner, robot
+    return -1, -1
+
+
+@jit
 def paint_readings(
     evidence: Any,
     cells: Any,
     changes: Any,
-    owners: IntArray,
-    robots: IntArray,
+    shared: Any,
     poses: FloatArray,
     scans: FloatArray,
     bumps: BoolArray,
-    angles: FloatArray,
+    directions: FloatArray,
     max_range: float,
     radius: float,
 ) -> tuple[int, int]:
@@ -73,36 +83,29 @@ def paint_readings(
         evidence: (K, 300, 300) int8, as what follows: the grids, one after the other.
         cells: (K, 300, 300) uint8.
         changes: (K, 1 + n) int32.
-        owners: See `TeamGrids.paint_readings`, also for the rest.
-        robots: (n,) int64.
+        shared: See `TeamGrids.paint_readings`, also for the rest.
         poses: (K, K, 3) float64 [m, m, rad].
         scans: (K, R) float64 [m].
         bumps: (K,) bool.
-        angles: (R,) float64 [rad].
+        directions: (2, R) float64.
         max_range: [m].
         radius: [m].
 
     Returns:
-        `READINGS_FINE`, or what is wrong, and with which of the n; nothing was written then.
+        Whose grid and whose reading do not go together, as its pose or its ranges are bad; nothing was written then.
+        -1 if all are good.
     """
-    surveys, surveyed = np.empty((len(scans), NUM_ROWS, len(angles) + 1)), np.zeros(len(scans), np.bool_)
-    directions = directions_of(angles)
-    for i in range(len(owners)):
-        robot = robots[i]
-        x, y, theta = poses[owners[i], robot]
-        if not math.isfinite(x + y + theta):
-            return BAD_POSE, i
-        if not surveyed[robot]:
-            fault = fault_of_scan(scans[robot], angles)
-            if fault != READINGS_FINE:
-                return fault, i
-            survey(scans[robot], directions, max_range, surveys[robot])
-            surveyed[robot] = True
-    for i in range(len(owners)):
-        owner, robot = owners[i], robots[i]
-        x, y, theta = poses[owner, robot]
-        paint_survey(evidence[owner], cells[owner], changes[owner], x, y, theta, surveys[robot])
-        paint_disc(evidence[owner], cells[owner], changes[owner], x, y, radius)
-        if bumps[robot]:
-            paint_bump(evidence[owner], cells[owner], changes[owner], x, y, theta, radius)
-    return READINGS_FINE, -1
+    bad = _find_bad(shared, poses, scans)
+    if bad[0] >= 0:
+        return bad
+    told = np.empty((NUM_ROWS, scans.shape[1] + 1))
+    for robot in range(len(scans)):
+        survey(scans[robot], directions, max_range, told)
+        for owner in range(len(shared)):
+            if shared[owner, robot]:
+                x, y, theta = poses[owner, robot]
+                paint_survey(evidence[owner], cells[owner], changes[owner], x, y, theta, told)
+                paint_disc(evidence[owner], cells[owner], changes[owner], x, y, radius)
+                if bumps[robot]:
+                    paint_bump(evidence[owner], cells[owner], changes[owner], x, y, theta, radius)
+    return bad

@@ -30,7 +30,6 @@ from vslam_env.navigation._painting_kernels.surveys import (
     REACH,
     WALL_ABOVE,
     WALL_HALF_THICKNESS,
-    directions_of,
     survey,
     turn,
 )
@@ -140,10 +139,10 @@ def paint_scan(
     y: float,
     theta: float,
     ranges: FloatArray,
-    angles: FloatArray,
+    directions: FloatArray,
     max_range: float,
 ) -> None:
-    """Write one scan in which `fault_of_scan` finds nothing into a grid: `survey` and `paint_survey`."""
-    told = np.empty((NUM_ROWS, len(angles) + 1))
-    survey(ranges, directions_of(angles), max_range, told)
+    """Write one scan of `good_ranges` into a grid: `survey` and `paint_survey`."""
+    told = np.empty((NUM_ROWS, len(ranges) + 1))
+    survey(ranges, directions, max_range, told)
     paint_survey(evidence, cells, changes, x, y, theta, told)

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend._jit import jit
+from slam_backend._jit import inlined, jit
 
 SAME_SURFACE_GAP = 0.4  # [m] no robot fits between two hits this near: they are joined unseen
 STRAIGHT_GAP = 0.8  # [m] joined if a third hit lies on their line; doors are 1.1 m and wider
@@ -23,37 +23,28 @@ def _on_one_line(hits: Any, is_hit: Any, i: int) -> bool:
     return bool(abs(cross) <= STRAIGHT_TOLERANCE * math.hypot(along_x, along_y))
 
 
-@jit
-def find_surfaces(hits: Any, is_hit: Any) -> tuple[Any, Any]:
-    """Find out what neighbouring rays see.
+@inlined
+def surface_between(hits: Any, is_hit: Any, i: int) -> tuple[int, float, float, float]:
+    """Find out what two neighbouring rays see.
 
     Args:
         hits: (n, 2) float64 [m]. Where the rays end, seen from the robot.
         is_hit: (n,) bool. Whether they met something there.
+        i: The first of the two rays.
 
     Returns:
-        For each pair of rays, (n - 1,) int8: `SOLID`, one surface without a gap to drive through; `SPARSE`, hits that
-        line up with a third one but leave room for a gap; `JUMP`, a jump in range; `NOTHING`, no hit. And of the line
-        through the two hits the unit normal towards the robot and the robot's distance, (n - 1, 3) float64; an
-        infinitely distant line where they see no surface.
+        `SOLID`, one surface without a gap to drive through; `SPARSE`, hits that line up with a third one but leave room
+        for a gap; `JUMP`, a jump in range; `NOTHING`, no hit. And of the line through the two hits the unit normal
+        towards the robot, x and y, and the robot's distance [m]; an infinitely distant line if they see no surface.
     """
-    count = len(is_hit)
-    kinds = np.full(count - 1, NOTHING, np.int8)
-    lines = np.zeros((count - 1, 3))
-    lines[:, 2] = np.inf
-    for i in range(count - 1):
-        if not (is_hit[i] and is_hit[i + 1]):
-            kinds[i] = JUMP if is_hit[i] or is_hit[i + 1] else NOTHING
-            continue
-        along_x, along_y = hits[i + 1, 0] - hits[i, 0], hits[i + 1, 1] - hits[i, 1]
-        gap = max(math.hypot(along_x, along_y), 1e-9)
-        if gap <= SAME_SURFACE_GAP:
-            kinds[i] = SOLID
-        elif _on_one_line(hits, is_hit, i) or _on_one_line(hits, is_hit, i + 1):
-            kinds[i] = SOLID if gap <= STRAIGHT_GAP else SPARSE
-        else:
-            kinds[i] = JUMP
-            continue
-        lines[i, 0], lines[i, 1] = -along_y / gap, along_x / gap
-        lines[i, 2] = (along_y * hits[i, 0] - along_x * hits[i, 1]) / gap
-    return kinds, lines
+    if not (is_hit[i] and is_hit[i + 1]):
+        return JUMP if is_hit[i] or is_hit[i + 1] else NOTHING, 0.0, 0.0, np.inf
+    along_x, along_y = hits[i + 1, 0] - hits[i, 0], hits[i + 1, 1] - hits[i, 1]
+    gap = max(math.hypot(along_x, along_y), 1e-9)
+    if gap <= SAME_SURFACE_GAP:
+        kind = SOLID
+    elif _on_one_line(hits, is_hit, i) or _on_one_line(hits, is_hit, i + 1):
+        kind = SOLID if gap <= STRAIGHT_GAP else SPARSE
+    else:
+        return JUMP, 0.0, 0.0, np.inf
+    return kind, -along_y / gap, along_x / gap, (along_y * hits[i, 0] - along_x * hits[i, 1]) / gap
