@@ -15,7 +15,7 @@ from slam_backend.team import TeamSlam
 from vslam_env import environment, observation
 from vslam_env.belief import TeamBelief
 from vslam_env.episode import Episode
-from vslam_env.navigation import CandidateSlots
+from vslam_env.navigation import TeamSlots
 from vslam_env.sensors import LandmarkSensor, Scan
 from vslam_env.shared_grids import SharedGrids
 from vslam_env.world import Simulator
@@ -47,7 +47,7 @@ PHASES = (
     Phase("team, alignment", 40, ((TeamSlam, "step"),)),
     Phase("errors", 15, ((Episode, "standing"),)),
     Phase("observations", 20, ((observation, "observe_team"),)),
-    Phase("candidates", 40, ((CandidateSlots, "update"),)),
+    Phase("candidates", 40, ((TeamSlots, "update"),)),
     Phase(
         "beliefs, dictionaries",
         70,

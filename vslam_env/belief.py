@@ -130,7 +130,7 @@ class TeamBelief:
         self._grids.meet(self._lineup.mates, points.starts)
         self._grids.paint(self._tick, points.poses, readings.scans, readings.bumps)
         for robot in self._turns[self._tick % len(self._turns)] if self._tick else range(len(self._robots)):
-            self._slots[robot].update(self._grids[robot].cells, points.own[robot], self._mates_around(robot))
+            self._candidates.update(robot, self.grids, points.poses)
         return report
 
     def merge(self, robot_a: int, robot_b: int, alignment: Alignment, known: bool = False) -> Renaming:

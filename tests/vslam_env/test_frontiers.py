@@ -17,7 +17,8 @@ from vslam_env.navigation import (
     follow_path,
     plan_path,
 )
-from vslam_env.navigation._search_kernels.boxes import OUTSIDE, PAD, known_bounds, known_box
+from vslam_env.navigation._painting_kernels import known_bounds
+from vslam_env.navigation._search_kernels.boxes import OUTSIDE, PAD, known_box
 from vslam_env.navigation._search_kernels.frontiers import _unseen_edges
 
 
@@ -264,6 +265,6 @@ def test_frontiers_are_made_of_unknown_cells_beside_free_ones(corner: tuple[int,
     padded = np.pad(cells, 1, constant_values=OUTSIDE) == FREE
     beside = padded[:-2, 1:-1] | padded[2:, 1:-1] | padded[1:-1, :-2] | padded[1:-1, 2:]
     bounds = known_bounds(cells)
-    edges = _unseen_edges(known_box(cells, *bounds), ignored, bounds[0] - PAD, bounds[1] - PAD)
+    edges = _unseen_edges(known_box(cells, bounds), ignored, bounds[0] - PAD, bounds[1] - PAD)
     found = np.argwhere(edges) + bounds[:2] - PAD
     assert found.tolist() == np.argwhere((cells == UNKNOWN) & beside & ~ignored).tolist()

@@ -22,7 +22,8 @@ from vslam_env.navigation import (
     follow_path,
     plan_path,
 )
-from vslam_env.navigation._search_kernels.boxes import OUTSIDE, PAD, known_bounds, known_box
+from vslam_env.navigation._painting_kernels import known_bounds
+from vslam_env.navigation._search_kernels.boxes import OUTSIDE, PAD, known_box
 from vslam_env.navigation._search_kernels.ways import UNREACHED, wavefront
 from vslam_env.navigation._search_kernels.weights import CLOSE, NEAR, OPEN, weigh
 
@@ -277,10 +278,9 @@ def test_the_known_box_holds_all_known_cells_and_no_more(places: list[tuple[int,
     cells = np.full((GRID_SIZE, GRID_SIZE), UNKNOWN, np.uint8)
     for row, col in places:
         cells[row, col] = OCCUPIED
-    row, col, height, width = known_bounds(cells)
+    bounds = known_bounds(cells)
     rows, cols = np.nonzero(cells)
-    expected = (rows.min(), cols.min(), np.ptp(rows) + 1, np.ptp(cols) + 1) if places else (0, 0, 0, 0)
-    assert (row, col, height, width) == expected
+    assert bounds.tolist() == ([rows.min(), cols.min(), rows.max() + 1, cols.max() + 1] if places else [0, 0, 0, 0])
     padded = np.pad(cells, PAD, constant_values=OUTSIDE)
-    box = known_box(cells, row, col, height, width)
-    np.testing.assert_array_equal(box, padded[row : row + height + 2 * PAD, col : col + width + 2 * PAD])
+    box = known_box(cells, bounds)
+    np.testing.assert_array_equal(box, padded[bounds[0] : bounds[2] + 2 * PAD, bounds[1] : bounds[3] + 2 * PAD])

@@ -112,6 +112,29 @@ def test_a_grid_tells_which_verdicts_changed() -> None:
     assert changes[0] == -1
 
 
+def test_a_grid_keeps_the_bounds_of_what_it_knows() -> None:
+    """However it is painted, joined and restored, they are the least and largest row and column of it."""
+    rng = np.random.default_rng(5)
+    team, other = TeamGrids(1), SeenGrid()
+    (grid,), (bounds,) = team.grids, team.bounds
+    assert bounds.tolist() == [0, 0, 0, 0]
+    other.paint_scan((3.0, -2.0, 1.0), wall_ranges(4.0), ANGLES)
+    for k in range(30):
+        before = grid.get_state()
+        pose = np.append(rng.uniform(-31.0, 31.0, 2) if k % 3 == 0 else rng.uniform(-3.0, 3.0, 2), rng.uniform(-3, 3))
+        grid.paint_scan(pose, rng.uniform(0.3, 9.0, 32), ANGLES)
+        grid.clear_disc(pose)
+        grid.bump(pose)
+        if k % 5 == 0:
+            grid.absorb(other, pose)
+        if k % 7 == 0:
+            grid.set_state(before)
+        rows, columns = np.nonzero(grid.cells)
+        if len(rows) > 0:
+            assert bounds.tolist() == [rows.min(), columns.min(), rows.max() + 1, columns.max() + 1]
+    assert len(rows) > 0
+
+
 def test_a_doorway_between_two_rays_is_not_walled_up() -> None:
     """Two hits beside an opening that a robot fits through leave it open."""
     grid = SeenGrid()

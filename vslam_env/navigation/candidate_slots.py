@@ -10,10 +10,10 @@ from scipy.optimize import linear_sum_assignment
 from slam_backend._jit import jit
 from slam_backend.errors import BoolArray, FloatArray
 from vslam_env.navigation._arguments import check_cells, pose_floats, positions_array
-from vslam_env.navigation._painting_kernels import CELL, GRID_SIZE, HALF_WIDTH
-from vslam_env.navigation._search_kernels import HEADING, LENGTH, NUM_COLUMNS, SIZE, XY
-from vslam_env.navigation.frontiers import rows_of
-from vslam_env.navigation.planning import ways_from
+from vslam_env.navigation._painting_kernels import CELL, GRID_SIZE, HALF_WIDTH, known_bounds
+from vslam_env.navigation._search_kernels import HEADING, LENGTH, NUM_COLUMNS, SIZE, XY, frontiers_over
+from vslam_env.navigation.planning import start_of
+from vslam_env.navigation.team_grids import TeamGrids
 
 NUM_SLOTS, NUM_FEATURES = 16, 5
 FRONTIER_SIZE = 3  # the feature that is above 0 where there is a candidate
@@ -41,14 +41,18 @@ def _weigh_pairs(goals: Any, places: Any, costs: Any) -> None:
 
 
 @jit
-def _visit(slots: Any, x: float, y: float, theta: float, teammates: Any, visits: Any) -> bool:
-    """Add to the visits (16,) of the slots what the robot and its teammates (k, 2) count; tell if patience ran out."""
+def _visit(slots: Any, poses: Any, robot: int, visits: Any) -> bool:
+    """Add to the visits (16,) of the slots what a robot and its teammates count; tell if patience ran out.
+
+    Poses (n, 3), of the robot and of teammates, are as in `TeamSlots.features`.
+    """
     ran_out = False
+    x, y, theta = poses[robot]
     for i in range(NUM_SLOTS):
         at_goal = np.hypot(slots[i, 0] - x, slots[i, 1] - y) <= AT_GOAL
         looked = at_goal and math.cos(slots[i, HEADING] - theta) > math.cos(LOOKING)
-        for k in range(len(teammates)):
-            at_goal |= np.hypot(slots[i, 0] - teammates[k, 0], slots[i, 1] - teammates[k, 1]) <= AT_GOAL
+        for k in range(len(poses)):  # those that are unknown are nowhere near
+            at_goal |= np.hypot(slots[i, 0] - poses[k, 0], slots[i, 1] - poses[k, 1]) <= AT_GOAL
         visits[i] += (1 if at_goal else 0) + (LOOK_COUNTS - 1 if looked else 0)
         ran_out |= visits[i] >= PATIENCE
     return ran_out
@@ -172,20 +176,30 @@ class CandidateSlots:
         Raises:
             ValueError: If an array has the wrong shape or is not finite.
         """
-        x, y, theta = pose_floats(pose)
-        self._count_visits(x, y, theta, positions_array(teammates, "teammates"))
+        poses = _together(pose, teammates)
         check_cells(cells)
-        found = rows_of(ways_from(cells, x, y, ROBOT_RADIUS), self._given_up)
+        self._renew(cells, known_bounds(cells), poses, 0)
 
+    def _renew(self, cells: NDArray[np.uint8], bounds: NDArray[np.int32], poses: FloatArray, robot: int) -> None:
+        """Bring the candidates of a robot up to date.
+
+        Args:
+            cells: (300, 300) uint8. Of its grid.
+            bounds: (4,) int32. Likewise, see `TeamGrids`.
+            poses: (n, 3) float64 [m, m, rad], start frame. Its own and those of teammates; NaN: it does not know.
+            robot: Its row of them.
+        """
+        if _visit(self._rows, poses, robot, self._visits):
+            self._give_up()
+        x, y, _ = poses[robot].tolist()
+        found = frontiers_over(cells, bounds, *start_of(x, y, ROBOT_RADIUS), self._given_up)
         costs = np.empty((NUM_SLOTS, len(found)))
         _weigh_pairs(self._rows, found, costs)
         slots, sources = linear_sum_assignment(costs)
         _refill(costs, slots, sources, found, self._rows, self._visits)
 
-    def _count_visits(self, x: float, y: float, theta: float, teammates: FloatArray) -> None:
-        """Count who is at a goal, and give up what is unknown around goals where patience has run out."""
-        if not _visit(self._rows, x, y, theta, teammates, self._visits):
-            return
+    def _give_up(self) -> None:
+        """Give up what is unknown around goals where patience has run out."""
         for slot in np.flatnonzero(self._visits >= PATIENCE):
             along = (np.arange(GRID_SIZE) + 0.5) * CELL - HALF_WIDTH
             goal_x, goal_y = self._rows[slot, XY]
@@ -204,11 +218,8 @@ class CandidateSlots:
             size of the frontier, and distance from the goal to the nearest teammate, 60 if there is none. Zeros in
             empty slots.
         """
-        places = positions_array(teammates, "teammates")
-        poses = np.zeros((1, 1 + len(places), 3))
-        poses[0, 0], poses[0, 1:, :2] = pose_floats(pose), places
         features = np.empty((1, NUM_SLOTS, NUM_FEATURES), np.float32)
-        _describe(self._rows[None], poses, features)
+        _describe(self._rows[None], _together(pose, teammates)[None], features)
         return np.asarray(features[0])
 
     def get_state(self) -> dict[str, Any]:
@@ -236,6 +247,16 @@ class TeamSlots:
         self._rows = np.empty((num_robots, NUM_SLOTS, NUM_COLUMNS))
         self.slots = list(map(CandidateSlots._of, self._rows))
 
+    def update(self, robot: int, grids: TeamGrids, poses: FloatArray) -> None:
+        """Bring a robot's candidates up to date, as `CandidateSlots.update` does; nothing is checked.
+
+        Args:
+            robot: Its index.
+            grids: What the robots have seen.
+            poses: As in `features`.
+        """
+        self.slots[robot]._renew(grids.grids[robot].cells, grids.bounds[robot], poses[robot], robot)
+
     def features(self, poses: FloatArray) -> NDArray[np.float32]:
         """Describe all robots' candidates to policies; nothing is checked.
 
@@ -249,3 +270,11 @@ class TeamSlots:
         features = np.empty((len(self._rows), NUM_SLOTS, NUM_FEATURES), np.float32)
         _describe(self._rows, poses, features)
         return features
+
+
+def _together(pose: ArrayLike, teammates: ArrayLike) -> FloatArray:
+    """Return a robot's pose (3,) and the positions (k, 2) of its teammates as poses (1 + k, 3), or raise."""
+    own, places = pose_floats(pose), positions_array(teammates, "teammates")
+    poses = np.zeros((1 + len(places), 3))
+    poses[0], poses[1:, :2] = own, places
+    return poses

@@ -6,9 +6,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from slam_backend.errors import BoolArray, FloatArray, check_array
-from vslam_env.navigation._painting_kernels import GRID_SIZE
-from vslam_env.navigation._search_kernels import HEADING, LENGTH, SIZE, XY, frontier_rows
-from vslam_env.navigation.planning import DistanceMap, distance_map
+from vslam_env.navigation._arguments import check_cells
+from vslam_env.navigation._painting_kernels import GRID_SIZE, known_bounds
+from vslam_env.navigation._search_kernels import HEADING, LENGTH, SIZE, XY, frontiers_over
+from vslam_env.navigation.planning import checked_start
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -26,12 +27,6 @@ class Frontiers:
     headings: FloatArray
     sizes: FloatArray
     lengths: FloatArray
-
-
-def rows_of(ways: DistanceMap, ignored: BoolArray) -> FloatArray:
-    """Return the frontiers of a map of ways as rows (x, y, heading, size, length), nearest first."""
-    rows: FloatArray = frontier_rows(ways.box, ways.cost, ways.parent, ignored, *ways.corner)
-    return rows
 
 
 def find_frontiers(
@@ -57,7 +52,8 @@ def find_frontiers(
     if ignored is None:
         ignored = np.zeros((GRID_SIZE, GRID_SIZE), np.bool_)
     mask = check_array("ignored", ignored, (GRID_SIZE, GRID_SIZE), "Mark cells of the grid.", dtype=np.bool_)
-    rows = rows_of(distance_map(cells, start_xy, radius), mask)
+    check_cells(cells)
+    rows = frontiers_over(cells, known_bounds(cells), *checked_start(start_xy, radius), mask)
     return Frontiers(
         goals=rows[:, XY].copy(),
         headings=rows[:, HEADING].copy(),

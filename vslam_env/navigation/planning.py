@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from slam_backend._jit import jit
 from slam_backend.errors import FloatArray, bad_argument, check_float
 from vslam_env.navigation._arguments import check_cells, point_floats, pose_floats
-from vslam_env.navigation._painting_kernels import CELL, HALF_WIDTH
+from vslam_env.navigation._painting_kernels import CELL, HALF_WIDTH, known_bounds
 from vslam_env.navigation._search_kernels import UNREACHED, nearest_open, straight_path, ways_over
 from vslam_env.navigation.seen_grid import centre_of
 
@@ -84,16 +84,21 @@ def distance_map(cells: NDArray[np.uint8], start_xy: ArrayLike, radius: float = 
         ValueError: If the cells are not a grid's, or a number is not finite.
     """
     check_cells(cells)
-    start = point_floats(start_xy, "start_xy")
+    start = checked_start(start_xy, radius)
+    box, weights, cost, parent, row, col = ways_over(cells, known_bounds(cells), *start)
+    return DistanceMap(corner=(row, col), box=box, weights=weights, cost=cost, parent=parent)
+
+
+def checked_start(start_xy: ArrayLike, radius: float) -> tuple[int, int, float, int]:
+    """Return `start_of` a place (2,) [m] for a radius [m], or raise."""
+    x, y = point_floats(start_xy, "start_xy")
     radius = check_float("radius", radius, "Give the robot's radius in metres.", at_least=MIN_RADIUS, at_most=1.0)
-    return ways_from(cells, *start, radius)
+    return start_of(x, y, radius)
 
 
-def ways_from(cells: NDArray[np.uint8], x: float, y: float, radius: float) -> DistanceMap:
-    """Return what `distance_map` returns, for arguments that need no checks."""
-    row, col = _cell_in_box((0, 0), x, y)
-    box, weights, cost, parent, *corner = ways_over(cells, row, col, radius / CELL + 0.5, ESCAPE_CELLS)
-    return DistanceMap(corner=(corner[0], corner[1]), box=box, weights=weights, cost=cost, parent=parent)
+def start_of(x: float, y: float, radius: float) -> tuple[int, int, float, int]:
+    """Return how `ways_over` looks for ways of a robot [m] from a place [m]: row and column, reach and escape."""
+    return *_cell_in_box((0, 0), x, y), radius / CELL + 0.5, ESCAPE_CELLS
 
 
 def plan_path(

@@ -59,29 +59,42 @@ class SeenGrid:
             `FREE` or `OCCUPIED`. It shares memory with the grid and follows its changes.
     """
 
-    __slots__ = ("_cells", "_changes", "_evidence", "_read_only", "cells")
+    __slots__ = ("_bounds", "_cells", "_changes", "_evidence", "_read_only", "cells")
 
     def __init__(self) -> None:
         shape = (GRID_SIZE, GRID_SIZE)
-        self._adopt(np.zeros(shape, np.int8), np.full(shape, UNKNOWN, np.uint8), _no_changes())
+        self._adopt(np.zeros(shape, np.int8), np.full(shape, UNKNOWN, np.uint8), _no_changes(), np.zeros(4, np.int32))
 
     def _adopt(
         self,
         evidence: NDArray[np.int8],
         cells: NDArray[np.uint8],
         changes: NDArray[np.int32],
+        bounds: NDArray[np.int32],
         read_only: bool = False,
     ) -> "SeenGrid":
         """Make arrays, as the kernels expect them, this grid's own."""
-        self._evidence, self._cells, self._changes, self._read_only = evidence, cells, changes, read_only
+        self._evidence, self._cells, self._changes, self._bounds = evidence, cells, changes, bounds
+        self._read_only = read_only
         self.cells = cells.view()
         self.cells.flags.writeable = False
         return self
 
     @classmethod
-    def _of(cls, evidence: NDArray[np.int8], cells: NDArray[np.uint8], changes: NDArray[np.int32]) -> "SeenGrid":
+    def _of(
+        cls,
+        evidence: NDArray[np.int8],
+        cells: NDArray[np.uint8],
+        changes: NDArray[np.int32],
+        bounds: NDArray[np.int32],
+    ) -> "SeenGrid":
         """Return the grid that lies in some arrays."""
-        return cls.__new__(cls)._adopt(evidence, cells, changes)
+        return cls.__new__(cls)._adopt(evidence, cells, changes, bounds)
+
+    @property
+    def _arrays(self) -> tuple[NDArray[np.int8], NDArray[np.uint8], NDArray[np.int32], NDArray[np.int32]]:
+        """The grid as kernels paint it."""
+        return self._evidence, self._cells, self._changes, self._bounds
 
     def paint_scan(self, pose: ArrayLike, ranges: ArrayLike, angles: ArrayLike, max_range: float = 8.0) -> None:
         """Mark what a range scan saw: free before the first surface, occupied on it.
@@ -109,8 +122,7 @@ class SeenGrid:
             )
         check_ranges(ranges)
         directions = ray_directions(angles)
-        grid = self._evidence, self._cells, self._changes
-        _painting.paint_scan(*grid, x, y, theta, ranges, directions, float(max_range))
+        _painting.paint_scan(*self._arrays, x, y, theta, ranges, directions, float(max_range))
 
     def clear_disc(self, pose: ArrayLike, radius: float = 0.2) -> None:
         """Mark as free what the body of a robot covers.
@@ -122,7 +134,7 @@ class SeenGrid:
         self._refuse_if_read_only()
         x, y, _ = pose_floats(pose)
         radius = check_float("radius", radius, "Give the robot's radius in metres.", above=0.0)
-        _painting.paint_disc(self._evidence, self._cells, self._changes, x, y, radius)
+        _painting.paint_disc(*self._arrays, x, y, radius)
 
     def bump(self, pose: ArrayLike, radius: float = 0.2) -> None:
         """Mark the cell just ahead of a robot's rim as occupied: it bumped into something there.
@@ -135,7 +147,7 @@ class SeenGrid:
         """
         self._refuse_if_read_only()
         x, y, theta = pose_floats(pose)
-        _painting.paint_bump(self._evidence, self._cells, self._changes, x, y, theta, radius)
+        _painting.paint_bump(*self._arrays, x, y, theta, radius)
 
     def absorb(self, other: "SeenGrid", self_from_other: ArrayLike) -> None:
         """Add the evidence of another robot's grid.
@@ -146,15 +158,15 @@ class SeenGrid:
         """
         self._refuse_if_read_only()
         x, y, theta = pose_floats(self_from_other, "self_from_other")
-        _painting.paint_grid(self._evidence, self._cells, self._changes, other._evidence.copy(), x, y, theta)
+        _painting.paint_grid(*self._arrays, other._evidence.copy(), x, y, theta)
 
     def copy(self) -> "SeenGrid":
         """Return an independent grid, which can be written to, with the same content."""
-        return SeenGrid._of(self._evidence.copy(), self._cells.copy(), _no_changes())
+        return SeenGrid._of(self._evidence.copy(), self._cells.copy(), _no_changes(), self._bounds.copy())
 
     def frozen(self) -> "SeenGrid":
         """Return a view that refuses changes and shares memory with this grid: it follows changes made here."""
-        return SeenGrid.__new__(SeenGrid)._adopt(self._evidence, self._cells, self._changes, read_only=True)
+        return SeenGrid.__new__(SeenGrid)._adopt(*self._arrays, read_only=True)
 
     def get_state(self) -> dict[str, Any]:
         """Return a copy of all that `set_state` needs to continue bit by bit."""
@@ -170,6 +182,7 @@ class SeenGrid:
         self._evidence[:] = evidence
         np.take(_VERDICTS, evidence.view(np.uint8), out=self._cells, mode="wrap")
         self._changes[0] = -1
+        self._bounds[:] = _painting.known_bounds(self._cells)
 
     def _refuse_if_read_only(self) -> None:
         if self._read_only:

@@ -20,13 +20,16 @@ class TeamGrids:
         changes: (K, 1 + n) int32. Per grid how many verdicts have changed since whoever keeps count of the cells set
             this number to 0, then the places of that many cells in the flat grid (some may stand there twice). -1 if
             all may have changed, as in the beginning.
+        bounds: (K, 4) int32. First row and column of what is known of each grid, and one past the last ones; zeros if
+            nothing is. To be looked at.
     """
 
     def __init__(self, num_robots: int) -> None:
         shape = (num_robots, GRID_SIZE, GRID_SIZE)
         self._evidence, self._cells = np.zeros(shape, np.int8), np.full(shape, UNKNOWN, np.uint8)
         self.changes = np.full((num_robots, 1 + _painting.MOST_CHANGES), -1, np.int32)
-        self.grids = list(map(SeenGrid._of, self._evidence, self._cells, self.changes))
+        self.bounds = np.zeros((num_robots, 4), np.int32)
+        self.grids = list(map(SeenGrid._of, self._evidence, self._cells, self.changes, self.bounds))
         self.cells = self._cells.view()
         self.cells.flags.writeable = False
 
@@ -54,7 +57,7 @@ class TeamGrids:
         Raises:
             ValueError: If one of these poses is not finite, or ranges are less than 0; then nothing is painted.
         """
-        grids = self._evidence, self._cells, self.changes
+        grids = self._evidence, self._cells, self.changes, self.bounds
         owner, robot = _painting.paint_readings(*grids, shared, poses, scans, bumps, directions, max_range, radius)
         if owner >= 0:
             pose_floats(poses[owner, robot])

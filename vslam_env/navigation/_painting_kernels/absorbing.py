@@ -36,7 +36,9 @@ def _bounds_in_frame(other: Any, x: float, y: float, c: float, s: float) -> tupl
 
 
 @jit
-def paint_grid(evidence: Any, cells: Any, changes: Any, other: Any, x: float, y: float, theta: float) -> None:
+def paint_grid(
+    evidence: Any, cells: Any, changes: Any, bounds: Any, other: Any, x: float, y: float, theta: float
+) -> None:
     """Add another grid's evidence, seen from pose (x, y, theta) of its frame in this one.
 
     Each cell takes the other's value at its centre, or the firmest wall among four points around it: without these,
@@ -62,4 +64,4 @@ def paint_grid(evidence: Any, cells: Any, changes: Any, other: Any, x: float, y:
                         found = value
             if found != 0:
                 evidence[row, col] = bounded(evidence[row, col] + found)
-                judge(cells, changes, row, col, OCCUPIED if evidence[row, col] > 0 else FREE)
+                judge(cells, changes, bounds, row, col, OCCUPIED if evidence[row, col] > 0 else FREE)

@@ -3,6 +3,7 @@
 from typing import Any
 
 from slam_backend._jit import inlined, jit
+from vslam_env.navigation._painting_kernels.bounds import widen
 
 GRID_SIZE = 300
 CELL = 0.2
@@ -26,18 +27,21 @@ def bounded(evidence: int) -> int:
 
 
 @jit
-def judge(cells: Any, changes: Any, row: int, col: int, verdict: int) -> None:
-    """Set a cell's verdict, and note it if it changed.
+def judge(cells: Any, changes: Any, bounds: Any, row: int, col: int, verdict: int) -> None:
+    """Set a cell's verdict, and note it if it changed or was not known before.
 
     Args:
         cells: (300, 300) uint8.
         changes: (1 + n,) int32. How many changed, -1 if that is not known any more; then which, as places in the flat
             grid.
+        bounds: (4,) int32. Of what is known.
         row: Of the cell.
         col: Of the cell.
         verdict: The new one.
     """
     if cells[row, col] != verdict:
+        if cells[row, col] == UNKNOWN:
+            widen(bounds, row, col)
         cells[row, col] = verdict
         if 0 <= changes[0] < len(changes) - 1:
             changes[0] += 1

@@ -23,7 +23,7 @@ from vslam_env.navigation._painting_kernels.surveys import NUM_ROWS, survey
 
 
 @jit
-def paint_disc(evidence: Any, cells: Any, changes: Any, x: float, y: float, radius: float) -> None:
+def paint_disc(evidence: Any, cells: Any, changes: Any, bounds: Any, x: float, y: float, radius: float) -> None:
     """Free what a robot covers: unknown cells centred in its disc, and occupied ones that lie wholly inside."""
     first_row, last_row = cell_range(y - radius, y + radius)
     first_col, last_col = cell_range(x - radius, x + radius)
@@ -37,18 +37,20 @@ def paint_disc(evidence: Any, cells: Any, changes: Any, x: float, y: float, radi
             inside = distance <= max(radius - 0.5 * CELL, 0.0)
             if inside or (evidence[row, col] == 0 and distance <= radius):
                 evidence[row, col] = min(evidence[row, col], -1)
-                judge(cells, changes, row, col, FREE)
+                judge(cells, changes, bounds, row, col, FREE)
 
 
 @jit
-def paint_bump(evidence: Any, cells: Any, changes: Any, x: float, y: float, theta: float, radius: float) -> None:
+def paint_bump(
+    evidence: Any, cells: Any, changes: Any, bounds: Any, x: float, y: float, theta: float, radius: float
+) -> None:
     """Mark the cell just ahead of a robot's rim as occupied, no firmer than two hits."""
     ahead = radius + 0.5 * CELL
     row = math.floor((y + ahead * math.sin(theta) + HALF_WIDTH) / CELL)
     col = math.floor((x + ahead * math.cos(theta) + HALF_WIDTH) / CELL)
     if 0 <= row < GRID_SIZE and 0 <= col < GRID_SIZE:
         evidence[row, col] = max(evidence[row, col], 2 * HIT)
-        judge(cells, changes, row, col, OCCUPIED)
+        judge(cells, changes, bounds, row, col, OCCUPIED)
 
 
 @jit
@@ -69,6 +71,7 @@ def paint_readings(
     evidence: Any,
     cells: Any,
     changes: Any,
+    bounds: Any,
     shared: Any,
     poses: FloatArray,
     scans: FloatArray,
@@ -83,6 +86,7 @@ def paint_readings(
         evidence: (K, 300, 300) int8, as what follows: the grids, one after the other.
         cells: (K, 300, 300) uint8.
         changes: (K, 1 + n) int32.
+        bounds: (K, 4) int32.
         shared: See `TeamGrids.paint_readings`, also for the rest.
         poses: (K, K, 3) float64 [m, m, rad].
         scans: (K, R) float64 [m].
@@ -104,8 +108,8 @@ def paint_readings(
         for owner in range(len(shared)):
             if shared[owner, robot]:
                 x, y, theta = poses[owner, robot]
-                paint_survey(evidence[owner], cells[owner], changes[owner], x, y, theta, told)
-                paint_disc(evidence[owner], cells[owner], changes[owner], x, y, radius)
+                paint_survey(evidence[owner], cells[owner], changes[owner], bounds[owner], x, y, theta, told)
+                paint_disc(evidence[owner], cells[owner], changes[owner], bounds[owner], x, y, radius)
                 if bumps[robot]:
-                    paint_bump(evidence[owner], cells[owner], changes[owner], x, y, theta, radius)
+                    paint_bump(evidence[owner], cells[owner], changes[owner], bounds[owner], x, y, theta, radius)
     return bad

@@ -63,7 +63,9 @@ def _told_at_jump(seen: Any, k: Any, u: float, v: float, change: int) -> int:
 
 
 @jit
-def paint_survey(evidence: Any, cells: Any, changes: Any, x: float, y: float, theta: float, told: Any) -> None:
+def paint_survey(
+    evidence: Any, cells: Any, changes: Any, bounds: Any, x: float, y: float, theta: float, told: Any
+) -> None:
     """Write what a scan tells into a grid, visiting each cell between rays that reach its row once.
 
     Two neighbouring rays that see one surface span a triangle: a cell of it is free before the surface, occupied on
@@ -77,7 +79,8 @@ def paint_survey(evidence: Any, cells: Any, changes: Any, x: float, y: float, th
     Args:
         evidence: (300, 300) int8.
         cells: (300, 300) uint8.
-        changes: See `judge`.
+        changes: See `judge`, also for the bounds.
+        bounds: (4,) int32.
         x: Where the robot was [m].
         y: Likewise.
         theta: Its heading [rad].
@@ -127,7 +130,7 @@ def paint_survey(evidence: Any, cells: Any, changes: Any, x: float, y: float, th
                 if new != old:
                     evidence_row[col] = new
                     if old == 0 or (new > 0) != (old > 0):
-                        judge(cells, changes, row, col, OCCUPIED if new > 0 else FREE)
+                        judge(cells, changes, bounds, row, col, OCCUPIED if new > 0 else FREE)
 
 
 @jit
@@ -135,6 +138,7 @@ def paint_scan(
     evidence: Any,
     cells: Any,
     changes: Any,
+    bounds: Any,
     x: float,
     y: float,
     theta: float,
@@ -145,4 +149,4 @@ def paint_scan(
     """Write one scan of `good_ranges` into a grid: `survey` and `paint_survey`."""
     told = np.empty((NUM_ROWS, len(ranges) + 1))
     survey(ranges, directions, max_range, told)
-    paint_survey(evidence, cells, changes, x, y, theta, told)
+    paint_survey(evidence, cells, changes, bounds, x, y, theta, told)

@@ -1,10 +1,10 @@
 """The compiled searches over the known part of a grid: where a disc fits, the cheapest ways, and frontiers."""
 
-from vslam_env.navigation._search_kernels.frontiers import HEADING, LENGTH, NUM_COLUMNS, SIZE, XY, frontier_rows
+from vslam_env.navigation._search_kernels.frontiers import HEADING, LENGTH, NUM_COLUMNS, SIZE, XY, frontiers_over
 from vslam_env.navigation._search_kernels.paths import straight_path
 from vslam_env.navigation._search_kernels.ways import UNREACHED, nearest_open, ways_over
 
 __all__ = [
-    "HEADING", "LENGTH", "NUM_COLUMNS", "SIZE", "UNREACHED", "XY", "frontier_rows", "nearest_open", "straight_path",
+    "HEADING", "LENGTH", "NUM_COLUMNS", "SIZE", "UNREACHED", "XY", "frontiers_over", "nearest_open", "straight_path",
     "ways_over",
 ]  # fmt: skip

@@ -8,7 +8,7 @@ import numpy as np
 from slam_backend._jit import jit
 from vslam_env.navigation._painting_kernels import CELL, FREE, GRID_SIZE, HALF_WIDTH, UNKNOWN
 from vslam_env.navigation._search_kernels.boxes import any_above_zero
-from vslam_env.navigation._search_kernels.ways import UNREACHED
+from vslam_env.navigation._search_kernels.ways import UNREACHED, ways_over
 
 MIN_CELLS = 3  # a robot needs 0.4 m; what is smaller is a speck or the corner of a wall
 MAX_CELLS = 20  # longer frontiers are cut, as one goal cannot stand for them
@@ -101,7 +101,7 @@ def _heading_to_unknown(box: Any, row: int, col: int) -> float:
 
 @jit
 def _unseen_edges(box: Any, ignored: Any, row: int, col: int) -> Any:
-    """Return (h, w) int8, 1 for unknown cells beside free ones that are not to be ignored; see `frontier_rows`."""
+    """Return (h, w) int8, 1 for unknown cells beside free ones that are not to be ignored; see `_frontier_rows`."""
     height, width = box.shape
     edges = np.zeros((height, width), np.int8)
     for r in range(max(1, -row), min(height - 1, GRID_SIZE - row)):
@@ -117,7 +117,7 @@ def _unseen_edges(box: Any, ignored: Any, row: int, col: int) -> Any:
 
 
 @jit
-def frontier_rows(box: Any, cost: Any, parent: Any, ignored: Any, row: int, col: int) -> Any:
+def _frontier_rows(box: Any, cost: Any, parent: Any, ignored: Any, row: int, col: int) -> Any:
     """Collect the frontiers of a box.
 
     Args:
@@ -138,7 +138,7 @@ def frontier_rows(box: Any, cost: Any, parent: Any, ignored: Any, row: int, col:
     count = 0
     whole = np.empty((height * width, 2), np.int64)
     piece = np.empty((MAX_CELLS, 2), np.int64)
-    visited = np.zeros((height, width), np.int32)
+    visited = np.zeros((height, width), np.int16)  # there are fewer than 32,000 tries
     num_tried = 0
     for r in range(1, height - 1):
         if not any_above_zero(mark[r]):
@@ -170,3 +170,23 @@ def frontier_rows(box: Any, cost: Any, parent: Any, ignored: Any, row: int, col:
                 found[at, LENGTH] = length
                 count += 1
     return found[:count]
+
+
+@jit
+def frontiers_over(cells: Any, bounds: Any, row: int, col: int, reach: float, escape: int, ignored: Any) -> Any:
+    """Collect the frontiers to which a way is known.
+
+    Args:
+        cells: (300, 300) uint8. The grid, and how ways over it are looked for: see `ways_over`.
+        bounds: (4,) int32.
+        row: Where the ways begin.
+        col: Likewise.
+        reach: [cells].
+        escape: [cells].
+        ignored: (300, 300) bool. Unknown cells that do not count.
+
+    Returns:
+        (n, 5) float64 rows (x, y, heading, size, length), by increasing length.
+    """
+    box, _, cost, parent, first_row, first_col = ways_over(cells, bounds, row, col, reach, escape)
+    return _frontier_rows(box, cost, parent, ignored, first_row, first_col)

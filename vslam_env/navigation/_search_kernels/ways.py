@@ -6,7 +6,7 @@ import numpy as np
 
 from slam_backend._jit import jit
 from vslam_env.navigation._painting_kernels import OCCUPIED
-from vslam_env.navigation._search_kernels.boxes import PAD, known_bounds, known_box
+from vslam_env.navigation._search_kernels.boxes import PAD, known_box
 from vslam_env.navigation._search_kernels.weights import weigh
 
 STRAIGHT, DIAGONAL = 5, 7  # length of a step in fifths of a cell; 7/5 is 1 % short of the diagonal
@@ -118,11 +118,14 @@ def wavefront(weights: Any, row: int, col: int) -> tuple[Any, Any]:
 
 
 @jit
-def ways_over(cells: Any, row: int, col: int, reach: float, escape: int) -> tuple[Any, Any, Any, Any, int, int]:
+def ways_over(
+    cells: Any, bounds: Any, row: int, col: int, reach: float, escape: int
+) -> tuple[Any, Any, Any, Any, int, int]:
     """Find the cheapest ways over the known floor of a grid.
 
     Args:
         cells: (300, 300) uint8. The grid.
+        bounds: (4,) int32, of `known_bounds`.
         row: Of the cell where they begin, or near which: the nearest open one is taken.
         col: Likewise.
         reach: See `weigh`.
@@ -132,9 +135,8 @@ def ways_over(cells: Any, row: int, col: int, reach: float, escape: int) -> tupl
         The known box, (h, w) uint8; its weights, of `weigh`; costs and parents, of `wavefront`; and the grid's row and
         column of its first cell.
     """
-    first_row, first_col, height, width = known_bounds(cells)
-    box = known_box(cells, first_row, first_col, height, width)
+    box, first_row, first_col = known_box(cells, bounds), bounds[0] - PAD, bounds[1] - PAD
     weights = weigh(box, reach)
-    start_row, start_col = nearest_open(box, weights, row - first_row + PAD, col - first_col + PAD, escape)
+    start_row, start_col = nearest_open(box, weights, row - first_row, col - first_col, escape)
     cost, parent = wavefront(weights, start_row, start_col)
-    return box, weights, cost, parent, first_row - PAD, first_col - PAD
+    return box, weights, cost, parent, first_row, first_col

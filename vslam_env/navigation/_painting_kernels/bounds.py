@@ -1,0 +1,32 @@
+"""The bounds of what is known of a grid: first row and column, and one past the last ones; zeros if nothing is."""
+
+from typing import Any
+
+import numpy as np
+
+from slam_backend._jit import jit
+
+
+@jit
+def widen(bounds: Any, row: int, col: int) -> None:
+    """Move bounds (4,) int32 so that a cell is within."""
+    if bounds[2] == 0:
+        bounds[0], bounds[1], bounds[2], bounds[3] = row, col, row + 1, col + 1
+    bounds[0], bounds[1] = min(bounds[0], row), min(bounds[1], col)
+    bounds[2], bounds[3] = max(bounds[2], row + 1), max(bounds[3], col + 1)
+
+
+@jit
+def known_bounds(cells: Any) -> Any:
+    """Return the bounds (4,) int32 of what is known of a grid's cells (300, 300) uint8."""
+    height, width = cells.shape
+    in_rows, in_columns = np.zeros(height, np.uint8), np.zeros(width, np.uint8)
+    for row in range(height):
+        for col in range(width):
+            in_rows[row] |= cells[row, col]
+            in_columns[col] |= cells[row, col]
+    bounds = np.zeros(4, np.int32)
+    rows, columns = np.flatnonzero(in_rows), np.flatnonzero(in_columns)
+    if len(rows) > 0:
+        bounds[0], bounds[1], bounds[2], bounds[3] = rows[0], columns[0], rows[-1] + 1, columns[-1] + 1
+    return bounds
