@@ -42,7 +42,7 @@ PHASES = (
     Phase("physics", 25, ((Simulator, "step"),)),
     Phase("landmark sensor", 40, ((LandmarkSensor, "measure"),)),
     Phase("scans", 20, ((Scan, "measure"),)),
-    Phase("grid painting", 20, ((SharedGrids, "paint"), (SharedGrids, "follow"), (SharedGrids, "meet"))),
+    Phase("grid painting", 20, ((SharedGrids, "step"),)),
     Phase("filters", 135, ((FastSlam, "_step_checked"),)),
     Phase("team, alignment", 40, ((TeamSlam, "step"),)),
     Phase("errors", 15, ((Episode, "standing"),)),

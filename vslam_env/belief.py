@@ -125,10 +125,8 @@ class TeamBelief:
         )
         self._tick += 1
         self._look_up_poses()
-        self._grids.follow(self._tick, report.entries, report.renamings)
         points = self.points
-        self._grids.meet(self._lineup.mates, points.starts)
-        self._grids.paint(self._tick, points.poses, readings.scans, readings.bumps)
+        self._grids.step(self._tick, report, self._lineup.mates, points, readings.scans, readings.bumps)
         for robot in self._turns[self._tick % len(self._turns)] if self._tick else range(len(self._robots)):
             self._candidates.update(robot, self.grids, points.poses)
         return report

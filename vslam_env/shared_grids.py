@@ -8,7 +8,8 @@ import numpy as np
 
 from slam_backend.errors import BoolArray, FloatArray, IntArray
 from slam_backend.geometry import compose, inverse
-from slam_backend.reports import MapDropped, MapEntry, MergeUndone, Renaming
+from slam_backend.reports import MapDropped, MergeUndone, Renaming, TeamReport
+from slam_backend.standpoints import Standpoints
 from vslam_env.navigation import SeenGrid, TeamGrids, ray_directions
 from vslam_env.robot_belief import Body
 
@@ -90,25 +91,50 @@ class SharedGrids:
         grids = {robot: self._grids[robot].get_state() for robot in sides[0] + sides[1]}
         self._kept.append(Kept(tick, sides, renaming.maps, grids))
 
-    def follow(self, tick: int, entries: Sequence[MapEntry], merged: Sequence[Renaming]) -> None:
-        """Keep grids for an undo, undo, and forget what can no longer be undone.
+    def step(
+        self,
+        tick: int,
+        report: TeamReport,
+        mates: Sequence[tuple[int, ...]],
+        points: Standpoints,
+        scans: FloatArray,
+        bumps: BoolArray,
+    ) -> None:
+        """Go along with what became of the maps in a tick, and paint what each robot scans where it belongs.
+
+        That is into the grids of all robots that go by its filter.
 
         Args:
-            tick: Whose readings are painted next.
-            entries: What happened to maps, in order.
-            merged: The merges of this tick.
+            tick: Of the readings.
+            report: Of the tick.
+            mates: As `meet` takes them.
+            points: Where the robots stand now.
+            scans: (K, R) float64 [m]. Of this tick.
+            bumps: (K,) bool. Who bumped into something.
+
+        Raises:
+            ValueError: If a range is out of its limits.
         """
-        for entry in entries:
-            if isinstance(entry, Renaming) and entry in merged:
+        if report.entries or self._strokes:
+            self._follow(tick, report)
+        if mates != self._mates:
+            self.meet(mates, points.starts)
+        self.team.paint_readings(self._shared, points.poses, scans, bumps, *self._hardware)
+        if self._kept:
+            self._strokes.append(Strokes(tick, self._shared, points.poses.copy(), scans.copy(), bumps.copy()))
+
+    def _follow(self, tick: int, report: TeamReport) -> None:
+        """Keep grids for an undo, undo, and forget what can no longer be undone."""
+        for entry in report.entries:
+            if isinstance(entry, Renaming) and entry in report.renamings:
                 self.keep(tick, entry)
             elif isinstance(entry, MergeUndone):
                 self._undo(entry)
             elif isinstance(entry, MapDropped):
                 self._kept = [kept for kept in self._kept if entry.number not in kept.maps[:2]]
-        if self._strokes:
-            oldest = self._kept[0].tick if self._kept else tick  # both stand in order of time
-            while self._strokes and self._strokes[0].tick < oldest:
-                self._strokes.popleft()
+        oldest = self._kept[0].tick if self._kept else tick  # both stand in order of time
+        while self._strokes and self._strokes[0].tick < oldest:
+            self._strokes.popleft()
 
     def _undo(self, undone: MergeUndone) -> None:
         """Restore the grids from before a merge and paint again what the robots of each side have scanned since."""
@@ -137,8 +163,6 @@ class SharedGrids:
             mates: Per robot those that go by the same filter now, itself included.
             starts: (K, 3) [m, m, rad]. The motion from the map frame to each robot's start frame.
         """
-        if self._mates == mates:
-            return
         for now in sorted(set(mates)):
             before = sorted({tuple(mate for mate in self._mates[robot] if mate in now) for robot in now})
             if len(before) > 1:
@@ -156,23 +180,6 @@ class SharedGrids:
         """Take note of who goes by the same filter as whom."""
         self._mates = tuple(mates)
         self._shared = np.array([[robot in group for robot in range(len(mates))] for group in mates], np.int64)
-
-    def paint(self, tick: int, poses: FloatArray, scans: FloatArray, bumps: BoolArray) -> None:
-        """Paint what each robot scans into the grids of all that go by its filter.
-
-        Args:
-            tick: Of the readings.
-            poses: (K, K, 3) [m, m, rad]. Where robot i believes robot j to be, in i's start frame; asked for those that
-                go by the same filter, as `meet` was told of them.
-            scans: (K, R) [m]. Of this tick.
-            bumps: (K,) bool. Who bumped into something.
-
-        Raises:
-            ValueError: If a range is out of its limits.
-        """
-        self.team.paint_readings(self._shared, poses, scans, bumps, *self._hardware)
-        if self._kept:
-            self._strokes.append(Strokes(tick, self._shared, poses.copy(), scans.copy(), bumps.copy()))
 
     def get_state(self) -> dict[str, Any]:
         """Return all that decides how the grids go on; what is never written to is shared."""
