@@ -11,7 +11,7 @@ from slam_backend.compilation import watch_compilation
 from slam_backend.existence import ExistenceModel
 from slam_backend.filter import FastSlam
 from slam_backend.frontend import StereoFrontEnd
-from slam_backend.measurements import Measurements
+from slam_backend.measurements import Measurements, TeamMeasurements
 from slam_backend.merge_options import MergeOptions
 from slam_backend.metrics.maps import map_error
 from slam_backend.smoothing.bending import bend
@@ -62,6 +62,8 @@ def warm_up() -> float:
         team = TeamSlam(2, num_particles=4, attempts=AttemptOptions(every=1), merging=MergeOptions(watch_every=1))
         for _ in range(STEPS):
             team.step([None, None], [plain, plain])
+        both = np.tile(points, (2, 1)), np.tile(descriptors, (2, 1))
+        team.step(np.zeros((2, 3)), TeamMeasurements.trusted(*both, [LANDMARKS, 2 * LANDMARKS]))
         team.standpoints(), team.outlines()
         own = team.map(0)
         map_error(own.means, names, points)
