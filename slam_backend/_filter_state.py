@@ -8,7 +8,6 @@ import numpy as np
 
 from slam_backend._existence_step import ExistenceStep
 from slam_backend._filter_arrays import FilterArrays
-from slam_backend._frame_buffers import FrameBuffers
 from slam_backend._journal import LONGEST, Entry, may_follow, write_down
 from slam_backend._kernels import add_share
 from slam_backend._kernels.layout import CAMERA, RECOVERY
@@ -62,7 +61,6 @@ class FilterState(FilterArrays):
         self._steps = 0
         self._robot_logs = [RobotLog() for _ in range(k)]
         self._journal: list[Entry] = []
-        self._buffers = FrameBuffers(k, self._maps.padded)
         self._estimates = self._mixtures()
 
     @property
@@ -98,7 +96,6 @@ class FilterState(FilterArrays):
         self._path_log_weights[:] = path_log_weights[ancestors]
         self._blind, self._frame = blind, frame
         self._look_at_weights()
-        self._buffers = FrameBuffers(self.num_robots, self._maps.padded)
 
     def _renew(self, new: Particles) -> None:
         """Go on with M particles from smoothed paths; the old ones' most probable says which landmarks there are."""

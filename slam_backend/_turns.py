@@ -7,10 +7,10 @@ from functools import lru_cache
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from slam_backend import _kernels
 from slam_backend._filter_arrays import FilterArrays
-from slam_backend._frame_buffers import FrameBuffers
 from slam_backend._kernels.layout import ASSOCIATED, CREATED, REJECTED
 from slam_backend._particle_maps import ParticleMaps
 from slam_backend.errors import BoolArray, FloatArray, IntArray
@@ -53,8 +53,9 @@ def place(arrays: FilterArrays, robot: int, exact: FloatArray) -> None:
 
 
 def take_turns(
-    low: int, high: int, now: int, numbers: FloatArray, arrays: FilterArrays, maps: ParticleMaps, buffers: FrameBuffers,
-    inputs: StepInput, rows: tuple[int, ...], normals: FloatArray, told: IntArray, estimates: PoseEstimates,
+    low: int, high: int, now: int, numbers: FloatArray, arrays: FilterArrays, maps: ParticleMaps,
+    inputs: StepInput, rows: tuple[int, ...], normals: FloatArray, found: NDArray[np.int32], distances: FloatArray,
+    told: IntArray, estimates: PoseEstimates,
 ) -> Summary:  # fmt: skip
     """Move robots `low` to `high` - 1 in all particles, match what they saw, weigh and update (Algorithm 1, l. 6-8).
 
@@ -64,10 +65,11 @@ def take_turns(
         numbers: What the filter assumes.
         arrays: Its poses and weights, changed; robots that were told their poses are `place`d already.
         maps: Of all particles, changed; there is room for all that may start.
-        buffers: With room for the n measurements of the inputs.
         inputs: What these robots, and perhaps others, read.
         rows: Of each robot there; -1: none.
         normals: (k, M, 3) standard normal draws, for the k robots that are not idle.
+        found: (n, P) int32, written: slot to which each particle gave each measurement, -1 = none.
+        distances: (n, P), written: squared Mahalanobis distances of matches, else NaN.
         told: (3, n) int64, written: what becomes of the measurements.
         estimates: Of the robots' poses, written with the last turn.
     """
@@ -77,7 +79,7 @@ def take_turns(
         maps.values, maps.counts, maps.odds, maps.table, maps.maps, maps.users,
         maps.free_rows, maps.tops, maps.descriptors, maps.heads,
         inputs.sightings, inputs.descriptors, inputs.names,
-        buffers.space, buffers.found, buffers.distances, told, *estimates,
+        found, distances, told, *estimates,
     )  # fmt: skip
 
 

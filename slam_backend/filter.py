@@ -244,7 +244,7 @@ class FastSlam(FilterKnowledge):
             What all of it came to; and slots of landmarks that turned out not to exist, to be released when nobody asks
             for their ids.
         """
-        maps, buffers = self._maps, self._buffers
+        maps = self._maps
         active = used = 0
         for robot, row in enumerate(rows):
             act, begin, end, _, _, _ = inputs.turns[row] if row >= 0 else UNHEARD
@@ -253,11 +253,11 @@ class FastSlam(FilterKnowledge):
                 place(self, robot, inputs.moves[row])
         if used:
             maps.make_room(used, inputs.descriptors.shape[1])
-        if (most := len(inputs.sightings)) > len(buffers.found):
-            buffers.make_room(2 * most)
         normals = self._rng.standard_normal((active, maps.num_particles, 3))
         now = 0 if self._rejuvenation is None else self._rejuvenation.steps + 1
-        step = (now, self._assumed, self, maps, buffers, inputs, rows, normals, told, self._estimates)
+        shape = len(inputs.sightings), maps.padded
+        found, distances = np.empty(shape, np.int32), np.empty(shape)
+        step = (now, self._assumed, self, maps, inputs, rows, normals, found, distances, told, self._estimates)
         if self._existence is None:
             return take_turns(0, len(rows), *step), []
         deserted, best = [], self._best
@@ -265,8 +265,8 @@ class FastSlam(FilterKnowledge):
             summary = take_turns(robot, robot + 1, *step)
             _, begin, end, _, _, count = inputs.turns[row] if row >= 0 else UNHEARD
             if count >= 0:
-                found, new_slots = buffers.found[begin:end], told[NEW_SLOTS, begin:end]
-                deserted.append(self._existence.weigh(maps, self._poses[robot], best, found, new_slots))
+                given, new_slots = found[begin:end], told[NEW_SLOTS, begin:end]
+                deserted.append(self._existence.weigh(maps, self._poses[robot], best, given, new_slots))
         return summary, deserted
 
     def _resample(self) -> None:

@@ -25,8 +25,7 @@ def update_fastslam1(
     stored: Float32Array, heads: Float32Array,
     points: FloatArray, noises: FloatArray, given: bool, camera: FloatArray, descriptors: Float32Array, names: IntArray,
     named: bool, descriptor_gate: float, position_gate: float, log_p0: float, walk: float, one_to_one: bool,
-    work: FloatArray, records: FloatArray,
-    found: Int32Array, distances: FloatArray, new_slots: IntArray, log_likelihood: FloatArray,
+    work: FloatArray, found: Int32Array, distances: FloatArray, new_slots: IntArray, log_likelihood: FloatArray,
 ) -> None:  # fmt: skip
     """Sample one robot's motion and integrate its frame as in Algorithm 1 (corrected).
 
@@ -48,7 +47,7 @@ def update_fastslam1(
         log_p0: Log-density of a measurement that starts a new landmark.
         walk: Variance [m^2] along each axis by which a landmark may have moved between two sightings.
         one_to_one: Whether a landmark is matched at most once in a frame.
-        work, records: Working space.
+        work: Working space.
         found: (B, P), written: the slot, new ones included.
         distances: (B, P), written: D of matches, NaN otherwise.
         new_slots: (B,), written: the slot of the landmark that a measurement started in some particle, else -1.
@@ -62,8 +61,7 @@ def update_fastslam1(
     if len(odds) > 0:
         carry_odds(unique, odds, map_of, maps)
     refresh(unique, values, counts, row_of, map_of, maps, users, free_rows, tops)
-    if len(slots) > len(records):
-        records = np.empty((len(slots), CANDIDATE_ROWS * LANES))
+    records = np.empty((len(slots), CANDIDATE_ROWS * LANES))
     new_rows = np.empty(num, dtype=np.int64)
     match = np.empty((num, LANES))
     mask, draws = np.empty(LANES), np.zeros(3 * LANES)

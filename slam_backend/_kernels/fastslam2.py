@@ -49,8 +49,7 @@ def update_fastslam2(
     named: bool, descriptor_gate: float, descriptor_variance: float, position_gate: float, dead_zone: float,
     dead_radius: float, ambiguity: float,
     recovery: FloatArray, log_p0: float, walk: float, one_to_one: bool,
-    work: FloatArray, records: FloatArray,
-    found: Int32Array, distances: FloatArray, new_slots: IntArray, log_likelihood: FloatArray,
+    work: FloatArray, found: Int32Array, distances: FloatArray, new_slots: IntArray, log_likelihood: FloatArray,
 ) -> None:  # fmt: skip
     """Integrate one robot's motion and frame, the measurements shaping the sampled pose (FastSLAM 2.0, Laplace form).
 
@@ -80,8 +79,7 @@ def update_fastslam2(
     if len(odds) > 0:
         carry_odds(unique, odds, map_of, maps)
     refresh(unique, values, counts, row_of, map_of, maps, users, free_rows, tops)
-    if len(slots) > len(records):
-        records = np.empty((len(slots), CANDIDATE_ROWS * LANES))
+    records = np.empty((len(slots), CANDIDATE_ROWS * LANES))
     new_rows = np.empty(num, dtype=np.int64)
     log_clutter = np.empty(num)
     match = np.empty((num, LANES))

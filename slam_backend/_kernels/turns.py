@@ -12,7 +12,6 @@ from slam_backend._kernels.layout import (
     AMBIGUITY,
     BEGIN,
     CAMERA,
-    CANDIDATE_ROWS,
     COVARIANCES,
     DEAD_RADIUS,
     DEAD_ZONE,
@@ -65,7 +64,7 @@ def take_turns(
     values: FloatArray, counts: Int32Array, odds: FloatArray, table: IntArray, maps: Int32Array, users: IntArray,
     free_rows: IntArray, tops: IntArray, stored: Float32Array, heads: Float32Array,
     sightings: FloatArray, descriptors: Float32Array, names: IntArray,
-    space: FloatArray, found: Int32Array, distances: FloatArray, told: IntArray,
+    found: Int32Array, distances: FloatArray, told: IntArray,
     mean: FloatArray, covariance: FloatArray,
 ) -> tuple[float, int, int, int, int, int, float, int]:  # fmt: skip
     """Move robots `low` to `high` - 1 in all particles, match, weigh and update landmarks (Algorithm 1, l. 6-8).
@@ -89,7 +88,6 @@ def take_turns(
         sightings: (n, 9) [m, m^2] points and, of the robots that have them, covariances, as in `to_robot_axes`.
         descriptors: (n, d).
         names: (n,) the caller's names, of the robots that have them; or (0,).
-        space: Of the kernels: `WORK_ROWS` and the records of some candidates, in rows of lanes.
         found, distances: (n, P), written as in `update_fastslam2`.
         told: (3, n), written: as in `summarise`, and the slots of the landmarks that were started.
         mean, covariance: (K, 3), (K, 3, 3), written in the end, as in `conclude`.
@@ -106,7 +104,7 @@ def take_turns(
     row_of, map_of, ids, identities = table[ROW_OF], table[MAP_OF], table[IDS], table[IDENTITIES]
     free_slots = table[FREE_SLOTS]
     points, noises = sightings[:, :3], sightings[:, 3:]
-    work, records = space[: WORK_ROWS * LANES], space[WORK_ROWS * LANES :].reshape((-1, CANDIDATE_ROWS * LANES))
+    work = np.empty(WORK_ROWS * LANES)
     still, move, sigmas, drawn = np.zeros(3), np.zeros(3), np.zeros(3), -1
     if low == 0:
         log_likelihood[:] = 0.0
@@ -133,7 +131,7 @@ def take_turns(
                 values, counts, odds, row_of, map_of, maps, users, free_rows, free_slots, tops, ids, identities, stored,
                 heads, points[a:b], noises[a:b], given, camera, descriptors[a:b], names[a:b], named,
                 assumed[DESCRIPTOR_GATE], assumed[POSITION_GATE], assumed[LOG_P0], assumed[WALK], is_one_to_one,
-                work, records, found[a:b], distances[a:b], new_slots[a:b], log_likelihood,
+                work, found[a:b], distances[a:b], new_slots[a:b], log_likelihood,
             )  # fmt: skip
         elif b > a:
             update_fastslam2(
@@ -143,7 +141,7 @@ def take_turns(
                 assumed[DESCRIPTOR_GATE], assumed[DESCRIPTOR_VARIANCE], assumed[POSITION_GATE], assumed[DEAD_ZONE],
                 assumed[DEAD_RADIUS], assumed[AMBIGUITY], lost, assumed[LOG_P0],
                 assumed[WALK], is_one_to_one,
-                work, records, found[a:b], distances[a:b], new_slots[a:b], log_likelihood,
+                work, found[a:b], distances[a:b], new_slots[a:b], log_likelihood,
             )  # fmt: skip
             was_blind = False
         elif placed:

@@ -39,7 +39,7 @@ def map_of(slam: FastSlam, particle: int) -> FloatArray:
 
 def arrays_of(slam: FastSlam) -> dict[str, Any]:
     """Return all arrays that a filter works with, by owner and name: not copies."""
-    owners = {"filter": slam, "maps": slam._maps, "buffers": slam._buffers}
+    owners = {"filter": slam, "maps": slam._maps}
     return {
         f"{owner}.{name}": value
         for owner, holder in owners.items()
