@@ -66,20 +66,16 @@ def _outline(
     Returns:
         The row after the last, and whether ids ascend.
     """
-    row_of, map_of, ids = table[ROW_OF], table[MAP_OF], table[IDS]
-    last, ascending, padded = -1, True, counts.shape[1]
-    for slot in range(len(ids)):
-        if ids[slot] >= 0:
-            row, place = row_of[slot], maps[map_of[slot], m] if map_of[slot] > 0 else m
-            if counts[row, place] >= min_count:
-                at = row * 9 * padded + place // lanes * 9 * lanes + place % lanes
-                for axis in range(3):
-                    means[n, axis] = values[at + axis * lanes]
-                variances[n] = values[at + 3 * lanes] + values[at + 6 * lanes] + values[at + 8 * lanes]
-                times[n], names[n] = counts[row, place], ids[slot]
-                ascending &= ids[slot] > last
-                last = ids[slot]
-                n += 1
+    row_of, map_of, ids, padded = table[ROW_OF], table[MAP_OF], table[IDS], counts.shape[1]
+    slots, ascending = _held(table, maps, counts, m, min_count)
+    for slot in slots:
+        row, place = row_of[slot], maps[map_of[slot], m] if map_of[slot] > 0 else m
+        at = row * 9 * padded + place // lanes * 9 * lanes + place % lanes
+        for axis in range(3):
+            means[n, axis] = values[at + axis * lanes]
+        variances[n] = values[at + 3 * lanes] + values[at + 6 * lanes] + values[at + 8 * lanes]
+        times[n], names[n] = counts[row, place], ids[slot]
+        n += 1
     return n, ascending
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from slam_backend._existence_step import ExistenceStep
 from slam_backend._filter_arrays import FilterArrays
-from slam_backend._journal import LONGEST, Entry, may_follow, write_down
+from slam_backend._journal import Entry, write_down
 from slam_backend._kernels import add_share
 from slam_backend._kernels.layout import CAMERA, RECOVERY
 from slam_backend._mixtures import pose_mixtures
@@ -130,13 +130,6 @@ class FilterState(FilterArrays):
         if self._journal:
             self._write_down()
         return self._robot_logs
-
-    def _note(self, entry: Entry) -> None:
-        """Take down in the journal what a step came to."""
-        journal = self._journal
-        if journal and (len(journal) == LONGEST or not may_follow(journal[-1], entry)):
-            self._write_down()
-        journal.append(entry)
 
     def _write_down(self) -> None:
         """Enter into the logs, and tell the smoother, what the steps in the journal came to."""

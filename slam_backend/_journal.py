@@ -1,6 +1,7 @@
 """What the last steps of a filter came to, as it waits to be written into the robots' logs, many steps at a time."""
 
 from collections.abc import Sequence
+from itertools import groupby
 from typing import NamedTuple
 
 import numpy as np
@@ -35,19 +36,25 @@ class Entry(NamedTuple):
     num_rejected: int
 
 
-def may_follow(last: Entry, entry: Entry) -> bool:
-    """Tell whether two steps can be written down together."""
-    return last.rows == entry.rows and len(last.inputs.turns) == len(entry.inputs.turns)
-
-
 def write_down(entries: Sequence[Entry], logs: Sequence[RobotLog], smoother: RejuvenationStep | None) -> None:
     """Enter into the logs of K robots, and tell the smoother, what some steps came to.
 
     Args:
-        entries: The steps in order, each of which `may_follow` the one before; at least one.
+        entries: The steps in order.
         logs: Of the robots; a step in which one did nothing and was given no measurement gets no row.
         smoother: Of the filter, if it has one.
     """
+    for _, alike in groupby(entries, _robots_of):
+        _write_together(list(alike), logs, smoother)
+
+
+def _robots_of(entry: Entry) -> tuple[int, tuple[int, ...]]:
+    """Return how many robots there are readings of, and whose were taken in: these make steps alike."""
+    return len(entry.inputs.turns), entry.rows
+
+
+def _write_together(entries: Sequence[Entry], logs: Sequence[RobotLog], smoother: RejuvenationStep | None) -> None:
+    """Do what `write_down` does for steps that are alike."""
     numbers, inputs, rows, found_then, means_then, _ = zip(*entries, strict=True)
     steps = np.array(numbers)
     table = np.concatenate([read.table for read in inputs])

@@ -4,20 +4,22 @@ import math
 from collections.abc import Sequence
 from dataclasses import astuple
 from functools import lru_cache
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam_backend import _kernels
 from slam_backend._filter_arrays import FilterArrays
-from slam_backend._kernels.layout import ASSOCIATED, CREATED, REJECTED
-from slam_backend._particle_maps import ParticleMaps
+from slam_backend._kernels import IDLE, PLACED
+from slam_backend._kernels.layout import ASSOCIATED, CREATED, NEW_SLOTS, REJECTED
 from slam_backend.errors import BoolArray, FloatArray, IntArray
 from slam_backend.filter_options import FilterOptions
 from slam_backend.geometry import compose
 from slam_backend.input_log import UNHEARD, StepInput
-from slam_backend.reports import PoseEstimates, StepReport
+from slam_backend.reports import StepReport
+
+if TYPE_CHECKING:
+    from slam_backend._filter_state import FilterState
 
 # What `_kernels.take_turns` returns; `report_of` takes it apart.
 Summary = tuple[float, int, int, int, int, int, float, int]
@@ -53,34 +55,52 @@ def place(arrays: FilterArrays, robot: int, exact: FloatArray) -> None:
 
 
 def take_turns(
-    low: int, high: int, now: int, numbers: FloatArray, arrays: FilterArrays, maps: ParticleMaps,
-    inputs: StepInput, rows: tuple[int, ...], normals: FloatArray, found: NDArray[np.int32], distances: FloatArray,
-    told: IntArray, estimates: PoseEstimates,
-) -> Summary:  # fmt: skip
-    """Move robots `low` to `high` - 1 in all particles, match what they saw, weigh and update (Algorithm 1, l. 6-8).
+    slam: "FilterState", inputs: StepInput, rows: tuple[int, ...], told: IntArray
+) -> tuple[Summary, list[IntArray]]:
+    """Move all robots of a filter, match what they saw, weigh and update (Algorithm 1, l. 6-8), and sum it up.
+
+    Where one did and saw nothing no random number is drawn.
 
     Args:
-        low, high: Whose turns are taken; with the last one the particles are weighed, and the step is summed up.
-        now: Number of the step for the smoother, 0 if there is none.
-        numbers: What the filter assumes.
-        arrays: Its poses and weights, changed; robots that were told their poses are `place`d already.
-        maps: Of all particles, changed; there is room for all that may start.
+        slam: Its particles and their maps are changed, its estimates written.
         inputs: What these robots, and perhaps others, read.
         rows: Of each robot there; -1: none.
-        normals: (k, M, 3) standard normal draws, for the k robots that are not idle.
-        found: (n, P) int32, written: slot to which each particle gave each measurement, -1 = none.
-        distances: (n, P), written: squared Mahalanobis distances of matches, else NaN.
         told: (3, n) int64, written: what becomes of the measurements.
-        estimates: Of the robots' poses, written with the last turn.
+
+    Returns:
+        What all of it came to; and slots of landmarks that turned out not to exist, to be released when nobody asks for
+        their ids.
     """
-    return _kernels.take_turns(
-        low, high, now, numbers, _as_array(rows), inputs.table, inputs.moves, normals,
-        arrays._of_robots, arrays._blind, arrays._of_particles, arrays._frame,
+    maps = slam._maps
+    active = used = 0
+    for robot, row in enumerate(rows):
+        act, begin, end, _, _, _ = inputs.turns[row] if row >= 0 else UNHEARD
+        active, used = active + (act != IDLE), used + end - begin
+        if act == PLACED:
+            place(slam, robot, inputs.moves[row])
+    if used:
+        maps.make_room(used, inputs.descriptors.shape[1])
+    shape = len(inputs.sightings), maps.padded
+    found, distances = np.empty(shape, np.int32), np.empty(shape)
+    step = (
+        0 if slam._rejuvenation is None else slam._rejuvenation.steps + 1, slam._assumed,
+        _as_array(rows), inputs.table, inputs.moves, slam._rng.standard_normal((active, maps.num_particles, 3)),
+        slam._of_robots, slam._blind, slam._of_particles, slam._frame,
         maps.values, maps.counts, maps.odds, maps.table, maps.maps, maps.users,
         maps.free_rows, maps.tops, maps.descriptors, maps.heads,
         inputs.sightings, inputs.descriptors, inputs.names,
-        found, distances, told, *estimates,
+        found, distances, told, *slam._estimates,
     )  # fmt: skip
+    if slam._existence is None:
+        return _kernels.take_turns(0, len(rows), *step), []
+    deserted, best = [], slam._best
+    for robot, row in enumerate(rows):
+        summary = _kernels.take_turns(robot, robot + 1, *step)
+        _, begin, end, _, _, count = inputs.turns[row] if row >= 0 else UNHEARD
+        if count >= 0:
+            given, new_slots = found[begin:end], told[NEW_SLOTS, begin:end]
+            deserted.append(slam._existence.weigh(maps, slam._poses[robot], best, given, new_slots))
+    return summary, deserted
 
 
 @lru_cache(maxsize=256)

@@ -12,20 +12,19 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from slam_backend._journal import Entry
-from slam_backend._kernels import IDLE, PLACED
-from slam_backend._kernels.layout import ASSOCIATED, NEW_SLOTS
+from slam_backend._journal import LONGEST, Entry
+from slam_backend._kernels.layout import ASSOCIATED
 from slam_backend._rejuvenation_step import RejuvenationStep
 from slam_backend._step_input import check_step
-from slam_backend._turns import BEST, LONG_UNSEEN, Summary, place, report_of, take_turns
+from slam_backend._turns import BEST, LONG_UNSEEN, report_of, take_turns
 from slam_backend.adaptation import AdaptiveParticles, next_num_particles
 from slam_backend.camera import StereoCamera
-from slam_backend.errors import IntArray, check_array
+from slam_backend.errors import check_array
 from slam_backend.existence import ExistenceModel
 from slam_backend.filter_knowledge import FilterKnowledge
 from slam_backend.filter_options import FilterOptions
 from slam_backend.geometry import wrap_angle
-from slam_backend.input_log import UNHEARD, StepInput
+from slam_backend.input_log import StepInput
 from slam_backend.measurements import Measurements
 from slam_backend.motion import OdometryModel
 from slam_backend.reports import PoseEstimates, RejuvenationReport, StepReport
@@ -172,12 +171,14 @@ class FastSlam(FilterKnowledge):
         maps, num_robots = self._maps, len(rows)
         told = np.empty((3, len(inputs.sightings)), np.int64)
         self._estimates = PoseEstimates(np.empty((num_robots, 3)), np.empty((num_robots, 3, 3)))
-        summary, deserted = self._take_turns(inputs, rows, told)
+        summary, deserted = take_turns(self, inputs, rows, told)
         self._best = summary[BEST]
         threshold = self.options.resample_threshold * maps.num_particles * (1.0 + 1e-9)
         report = report_of(inputs, rows, told, summary, threshold)
         found = told[ASSOCIATED].copy()  # the report's is the caller's
-        self._note(Entry(self._steps, inputs, rows, found, self._estimates.means, report.num_rejected))
+        if len(self._journal) == LONGEST:
+            self._write_down()
+        self._journal.append(Entry(self._steps, inputs, rows, found, self._estimates.means, report.num_rejected))
         self._steps += 1
         for slots in deserted:
             maps.release(slots)
@@ -234,40 +235,6 @@ class FastSlam(FilterKnowledge):
         if result.particles is not None:
             self._renew(result.particles)
         return RejuvenationReport(result.reason, result.ess, result.iterations, result.graph.num_keys)
-
-    def _take_turns(
-        self, inputs: StepInput, rows: tuple[int, ...], told: IntArray
-    ) -> tuple[Summary, list[IntArray]]:  # fmt: skip
-        """Take all robots' turns; where one did and saw nothing no random number is drawn.
-
-        Returns:
-            What all of it came to; and slots of landmarks that turned out not to exist, to be released when nobody asks
-            for their ids.
-        """
-        maps = self._maps
-        active = used = 0
-        for robot, row in enumerate(rows):
-            act, begin, end, _, _, _ = inputs.turns[row] if row >= 0 else UNHEARD
-            active, used = active + (act != IDLE), used + end - begin
-            if act == PLACED:
-                place(self, robot, inputs.moves[row])
-        if used:
-            maps.make_room(used, inputs.descriptors.shape[1])
-        normals = self._rng.standard_normal((active, maps.num_particles, 3))
-        now = 0 if self._rejuvenation is None else self._rejuvenation.steps + 1
-        shape = len(inputs.sightings), maps.padded
-        found, distances = np.empty(shape, np.int32), np.empty(shape)
-        step = (now, self._assumed, self, maps, inputs, rows, normals, found, distances, told, self._estimates)
-        if self._existence is None:
-            return take_turns(0, len(rows), *step), []
-        deserted, best = [], self._best
-        for robot, row in enumerate(rows):
-            summary = take_turns(robot, robot + 1, *step)
-            _, begin, end, _, _, count = inputs.turns[row] if row >= 0 else UNHEARD
-            if count >= 0:
-                given, new_slots = found[begin:end], told[NEW_SLOTS, begin:end]
-                deserted.append(self._existence.weigh(maps, self._poses[robot], best, given, new_slots))
-        return summary, deserted
 
     def _resample(self) -> None:
         """Draw the particles anew in proportion to their weights; all that a particle holds goes with it."""

@@ -33,11 +33,11 @@ def _head_distances(
 
 
 @any_order
-def _squared_distance(a: Float32Array, b: Float32Array) -> float:
+def _squared_distance(measured: Float32Array, b: int, stored: Float32Array, slot: int) -> float:
     """Return the squared distance of two descriptors, in double precision."""
     total = 0.0
-    for j in range(len(a)):
-        difference = np.float64(a[j]) - np.float64(b[j])
+    for j in range(measured.shape[1]):
+        difference = np.float64(measured[b, j]) - np.float64(stored[slot, j])
         total += difference * difference
     return total
 
@@ -87,9 +87,7 @@ def find_candidates(
     while n > 0 and ids[n - 1] < 0:
         n -= 1
     starts = np.zeros(num + 1, dtype=np.int64)
-    size = 4 * num + 16
-    slots = np.empty(size, dtype=np.int64)
-    squares = np.empty(size)
+    slots, squares = np.empty(num * n, dtype=np.int64), np.empty(num * n)  # as far as they are written to
     partial = np.empty(n, dtype=np.float32)
     hits = np.empty(n, dtype=np.int64)
     stride = measured.shape[1] // max(heads.shape[0], 1)
@@ -110,13 +108,9 @@ def find_candidates(
             slot = hits[k]
             if ids[slot] < 0:
                 continue
-            e = _squared_distance(measured[b], stored[slot])
+            e = _squared_distance(measured, b, stored, slot)
             if e > gate and not named:
                 continue
-            if total == size:
-                size *= 2
-                slots = np.append(slots, np.empty(size - total, dtype=np.int64))
-                squares = np.append(squares, np.empty(size - total))
             at = total
             while at > starts[b] and (squares[at - 1] > e or (squares[at - 1] == e and ids[slots[at - 1]] > ids[slot])):
                 squares[at] = squares[at - 1]

@@ -20,9 +20,9 @@ from slam_backend._kernels.choices import (
 from slam_backend._kernels.first_pass import keep_distance, match_first
 from slam_backend._kernels.innovations import evaluate, innovate
 from slam_backend._kernels.landmark_updates import count_matches, find_young, new_landmark, relinearise, update
-from slam_backend._kernels.layout import CANDIDATE_ROWS, FARTHEST, LANES, REJECTED, TILE
+from slam_backend._kernels.layout import CANDIDATE_ROWS, FARTHEST, LANES, REJECTED, SPREAD00, TILE, X0, X
 from slam_backend._kernels.likelihoods import add_likelihood, clear_likelihood
-from slam_backend._kernels.motion import predict, prior, take_draws
+from slam_backend._kernels.motion import predict, prior, store_rows, take_draws
 from slam_backend._kernels.places import carry_odds, name_new, open_slot, refresh, tile_of
 from slam_backend._kernels.pose_system import (
     any_wide,
@@ -83,20 +83,17 @@ def update_fastslam2(
     new_rows = np.empty(num, dtype=np.int64)
     log_clutter = np.empty(num)
     match = np.empty((num, LANES))
-    mask, young, before = np.empty(LANES), np.empty(LANES), np.empty(TILE)
+    mask, young, before, draws = np.empty(LANES), np.empty(LANES), np.empty(TILE), np.zeros(3 * LANES)
     reach, cap = (FARTHEST, position_gate) if named else (position_gate, FARTHEST)
-    mean, covariance, draws, out = np.empty(3 * LANES), np.empty(6 * LANES), np.zeros(3 * LANES), np.empty(12 * LANES)
     for b in range(num):
         new_slots[b] = REJECTED
         log_clutter[b] = log_p0 + (0.0 if given else 4.0 * math.log(points[b, 0]))
     for block in range(padded // LANES):
         first = block * LANES
         real = min(LANES, num_particles - first)
-        prior(poses, means, covariances, blind, first, mean, covariance)
-        take_draws(draws, normals, first, real)
-        predict(work, mean, covariance, odometry, sigmas)
+        prior(work, poses, means, covariances, blind, first)
+        predict(work, odometry, sigmas)
         begin_pose(work)
-        place(work)
         clear_likelihood(work)
 
         # Pass A: refine the pose with what is beyond doubt.
@@ -178,13 +175,11 @@ def update_fastslam2(
                 match[b, i] = -1.0
 
         # The pose: N(x^, P^) from all matches; weigh by the predictive likelihood; sample once.
-        posterior(work, draws, log_likelihood[first : first + LANES], out)
-        for i in range(LANES):
-            for c in range(3):
-                means[c, first + i] = out[c * LANES + i]
-                poses[c, first + i] = out[(9 + c) * LANES + i]
-            for c in range(6):
-                covariances[c, first + i] = out[(3 + c) * LANES + i]
+        take_draws(draws, normals, first, real)
+        posterior(work, draws, log_likelihood[first : first + LANES])
+        store_rows(work, X0, means, first)
+        store_rows(work, SPREAD00, covariances, first)
+        store_rows(work, X, poses, first)
 
         # The landmarks, at the sampled pose.
         for b in range(num):

@@ -38,28 +38,61 @@ ZERO_PIVOT = 1e-12  # relative to the variance: below it a direction is taken to
 
 
 @lanes
-def predict(work: FloatArray, mean: FloatArray, covariance: FloatArray, move: FloatArray, sigmas: FloatArray) -> None:
-    """Write the predicted pose x0 and a factor C of its covariance P0 (Eq. 4, propagated).
+def load_rows(work: FloatArray, low: int, rows: FloatArray, first: int) -> None:
+    """Copy a block of rows (c, P), from lane `first` on, into the rows of the workspace from `low` on."""
+    for c in range(len(rows)):
+        source, target = rows[c, first : first + LANES], work[low + c * LANES : low + (c + 1) * LANES]
+        for i in range(LANES):
+            target[i] = source[i]
+
+
+@lanes
+def store_rows(work: FloatArray, low: int, rows: FloatArray, first: int) -> None:
+    """Copy rows of the workspace from `low` on into a block of rows (c, P), from lane `first` on."""
+    for c in range(len(rows)):
+        source, target = work[low + c * LANES : low + (c + 1) * LANES], rows[c, first : first + LANES]
+        for i in range(LANES):
+            target[i] = source[i]
+
+
+@lanes
+def prior(
+    work: FloatArray, poses: FloatArray, means: FloatArray, covariances: FloatArray, blind: bool, first: int
+) -> None:
+    """Write a block's poses before the motion into rows X0 .. T0, their covariances into rows N00 .. N22.
+
+    They are N(x^, P^) where the robot is blind, else the samples, exact.
+    """
+    if blind:
+        load_rows(work, X0, means, first)
+        load_rows(work, N00, covariances, first)
+    else:
+        load_rows(work, X0, poses, first)
+        for j in range(N00, N22 + LANES):
+            work[j] = 0.0
+
+
+@lanes
+def predict(work: FloatArray, move: FloatArray, sigmas: FloatArray) -> None:
+    """Move the poses in rows X0 .. N22 to the predicted x0, and write a factor C of its covariance P0 (Eq. 4).
 
     C = T L with L the lower Cholesky factor of T^T P0 T, where T is the turn by the predicted heading. Rows N00 .. N22
     hold T^T P0 T afterwards, COS and SIN the turn.
 
     Args:
-        mean: (3 LANES,) the pose before the motion: rows x, y, theta.
-        covariance: (6 LANES,) its covariance, upper triangle by rows.
         move: (3,) u, previous robot frame.
         sigmas: (3,) standard deviations of u.
     """
     dx, dy, turn = move[0], move[1], move[2]
     v0, v1, v2 = sigmas[0] ** 2, sigmas[1] ** 2, sigmas[2] ** 2
     for i in range(LANES):
-        s, c = sine_cosine(mean[2 * LANES + i])
+        s, c = sine_cosine(work[T0 + i])
         ox, oy = c * dx - s * dy, s * dx + c * dy
-        work[X0 + i] = mean[i] + ox
-        work[Y0 + i] = mean[LANES + i] + oy
-        work[T0 + i] = mean[2 * LANES + i] + turn
-        p00, p01, p02 = covariance[i], covariance[LANES + i], covariance[2 * LANES + i]
-        p11, p12, p22 = covariance[3 * LANES + i], covariance[4 * LANES + i], covariance[5 * LANES + i]
+        work[X0 + i] += ox
+        work[Y0 + i] += oy
+        work[T0 + i] += turn
+        p00, p01, p02 = work[N00 + i], work[N01 + i], work[N02 + i]
+        p11, p12, p22 = work[N11 + i], work[N12 + i], work[N22 + i]
         # F = [[1, 0, -oy], [0, 1, ox], [0, 0, 1]]
         q00 = p00 - 2.0 * oy * p02 + oy * oy * p22 + c * c * v0 + s * s * v1
         q01 = p01 + ox * p02 - oy * p12 - ox * oy * p22 + c * s * (v0 - v1)
@@ -116,10 +149,7 @@ def _factorise(work: FloatArray, i: int) -> None:
 
 @lanes
 def enter_pose(work: FloatArray, poses: FloatArray, first: int) -> None:
-    for i in range(LANES):
-        work[X + i] = poses[0, first + i]
-        work[Y + i] = poses[1, first + i]
-        work[T + i] = poses[2, first + i]
+    load_rows(work, X, poses, first)
     for i in range(LANES):
         work[SIN + i], work[COS + i] = sine_cosine(work[T + i])
 
@@ -148,19 +178,6 @@ def sample_motion(
 
 
 @lanes
-def prior(
-    poses: FloatArray, means: FloatArray, covariances: FloatArray, blind: bool, first: int, mean: FloatArray,
-    covariance: FloatArray,
-) -> None:  # fmt: skip
-    """Fetch a block's poses before the motion: N(x^, P^) where the robot is blind, else the samples, exact."""
-    for i in range(LANES):
-        for c in range(3):
-            mean[c * LANES + i] = means[c, first + i] if blind else poses[c, first + i]
-        for c in range(6):
-            covariance[c * LANES + i] = covariances[c, first + i] if blind else 0.0
-
-
-@lanes
 def move_blind(
     poses: FloatArray, means: FloatArray, covariances: FloatArray, blind: bool, odometry: FloatArray,
     sigmas: FloatArray, normals: FloatArray, work: FloatArray,
@@ -174,17 +191,14 @@ def move_blind(
         work: Working space.
     """
     num_particles = normals.shape[0]
-    mean, covariance, draws = np.empty(3 * LANES), np.empty(6 * LANES), np.zeros(3 * LANES)
+    draws = np.zeros(3 * LANES)
     for block in range(poses.shape[1] // LANES):
         first = block * LANES
         real = min(LANES, num_particles - first)
-        prior(poses, means, covariances, blind, first, mean, covariance)
-        predict(work, mean, covariance, odometry, sigmas)
+        prior(work, poses, means, covariances, blind, first)
+        predict(work, odometry, sigmas)
         _to_map_axes(work)
-        for i in range(LANES):
-            means[0, first + i], means[1, first + i], means[2, first + i] = work[X0 + i], work[Y0 + i], work[T0 + i]
-            covariances[0, first + i], covariances[1, first + i] = work[N00 + i], work[N01 + i]
-            covariances[2, first + i], covariances[3, first + i] = work[N02 + i], work[N11 + i]
-            covariances[4, first + i], covariances[5, first + i] = work[N12 + i], work[N22 + i]
+        store_rows(work, X0, means, first)
+        store_rows(work, N00, covariances, first)
         take_draws(draws, normals, first, real)
         sample_motion(work, poses, first, odometry, sigmas, draws)

@@ -57,17 +57,14 @@ from slam_backend.errors import FloatArray
 
 @lanes
 def begin_pose(work: FloatArray) -> None:
-    """Start from xi = 0 with covariance I, at the predicted pose."""
+    """Start from xi = 0, at the predicted pose, whose turn is in rows COS and SIN already."""
     for i in range(LANES):
         work[XI0 + i] = 0.0
         work[XI1 + i] = 0.0
         work[XI2 + i] = 0.0
-        work[SPREAD00 + i] = 1.0
-        work[SPREAD01 + i] = 0.0
-        work[SPREAD02 + i] = 0.0
-        work[SPREAD11 + i] = 1.0
-        work[SPREAD12 + i] = 0.0
-        work[SPREAD22 + i] = 1.0
+        work[X + i] = work[X0 + i]
+        work[Y + i] = work[Y0 + i]
+        work[T + i] = work[T0 + i]
 
 
 @lanes
@@ -165,13 +162,14 @@ def step_pose(work: FloatArray, only_wide: bool) -> None:
 
 
 @lanes
-def posterior(work: FloatArray, normals: FloatArray, log_likelihood: FloatArray, out: FloatArray) -> None:
+def posterior(work: FloatArray, normals: FloatArray, log_likelihood: FloatArray) -> None:
     """Weigh by the predictive likelihood and sample the pose, from the sums of pass B (Laplace's formula).
+
+    Rows X0 .. T0 then hold the mean x^, SPREAD00 .. SPREAD22 the covariance P^, X .. SIN the sample, theta wrapped.
 
     Args:
         normals: (3 LANES,) standard normal draws.
         log_likelihood: (LANES,) is added to.
-        out: (12 LANES,), written: mean x^ (3), covariance P^ (6), sample (3), theta of the sample wrapped.
     """
     for i in range(LANES):
         i00, i01, i02, i11, i12, i22, det = inverted(
@@ -188,21 +186,22 @@ def posterior(work: FloatArray, normals: FloatArray, log_likelihood: FloatArray,
         xi2 -= i02 * g0 + i12 * g1 + i22 * g2
         c00, c01, c10, c11 = work[C00 + i], work[C01 + i], work[C10 + i], work[C11 + i]
         c20, c21, c22 = work[C20 + i], work[C21 + i], work[C22 + i]
-        out[i] = work[X0 + i] + c00 * xi0 + c01 * xi1
-        out[LANES + i] = work[Y0 + i] + c10 * xi0 + c11 * xi1
-        out[2 * LANES + i] = work[T0 + i] + c20 * xi0 + c21 * xi1 + c22 * xi2
+        x0, y0, t0 = work[X0 + i], work[Y0 + i], work[T0 + i]
+        work[X0 + i] = x0 + c00 * xi0 + c01 * xi1
+        work[Y0 + i] = y0 + c10 * xi0 + c11 * xi1
+        work[T0 + i] = t0 + c20 * xi0 + c21 * xi1 + c22 * xi2
         # P^ = C J^-1 C^T
         h00, h01 = c00 * i00 + c01 * i01, c00 * i01 + c01 * i11
         h10, h11 = c10 * i00 + c11 * i01, c10 * i01 + c11 * i11
         h20, h21, h22 = (
             c20 * i00 + c21 * i01 + c22 * i02, c20 * i01 + c21 * i11 + c22 * i12, c20 * i02 + c21 * i12 + c22 * i22
         )  # fmt: skip
-        out[3 * LANES + i] = h00 * c00 + h01 * c01
-        out[4 * LANES + i] = h10 * c00 + h11 * c01
-        out[5 * LANES + i] = h20 * c00 + h21 * c01
-        out[6 * LANES + i] = h10 * c10 + h11 * c11
-        out[7 * LANES + i] = h20 * c10 + h21 * c11
-        out[8 * LANES + i] = h20 * c20 + h21 * c21 + h22 * c22
+        work[SPREAD00 + i] = h00 * c00 + h01 * c01
+        work[SPREAD01 + i] = h10 * c00 + h11 * c01
+        work[SPREAD02 + i] = h20 * c00 + h21 * c01
+        work[SPREAD11 + i] = h10 * c10 + h11 * c11
+        work[SPREAD12 + i] = h20 * c10 + h21 * c11
+        work[SPREAD22 + i] = h20 * c20 + h21 * c21 + h22 * c22
         n0, n1, n2 = normals[i], normals[LANES + i], normals[2 * LANES + i]
         l00 = math.sqrt(i00)
         l10, l20 = i01 / l00, i02 / l00
@@ -212,10 +211,8 @@ def posterior(work: FloatArray, normals: FloatArray, log_likelihood: FloatArray,
         xi0 += l00 * n0
         xi1 += l10 * n0 + l11 * n1
         xi2 += l20 * n0 + l21 * n1 + l22 * n2
-        theta = work[T0 + i] + c20 * xi0 + c21 * xi1 + c22 * xi2
-        work[X + i] = work[X0 + i] + c00 * xi0 + c01 * xi1
-        work[Y + i] = work[Y0 + i] + c10 * xi0 + c11 * xi1
+        theta = t0 + c20 * xi0 + c21 * xi1 + c22 * xi2
+        work[X + i] = x0 + c00 * xi0 + c01 * xi1
+        work[Y + i] = y0 + c10 * xi0 + c11 * xi1
+        work[T + i] = wrapped(theta)
         work[SIN + i], work[COS + i] = sine_cosine(theta)
-        out[9 * LANES + i] = work[X + i]
-        out[10 * LANES + i] = work[Y + i]
-        out[11 * LANES + i] = wrapped(theta)
