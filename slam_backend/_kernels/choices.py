@@ -16,7 +16,6 @@ from slam_backend._kernels.layout import (
     Q_D,
     Q_DEPTH,
     Q_DET_POSE,
-    Q_FIRST_D,
     Q_HELD,
     Q_METRES2,
     REJECTED,
@@ -146,18 +145,15 @@ def bar_taken(earlier: FloatArray, p: float, mask: FloatArray) -> None:
 @lanes
 def write_found(
     found: Int32Array, distances: FloatArray, chosen: FloatArray, low: int, high: int, slots: IntArray,
-    records: FloatArray, first_pass: bool, new_slot: int,
+    records: FloatArray, row: int, new_slot: int,
 ) -> None:  # fmt: skip
-    """Write the slot (or -1) and the squared distance (or NaN) of one measurement, that of pass A if `first_pass`."""
-    if low == high:
-        for i in range(len(found)):
-            found[i] = new_slot if chosen[i] == -2.0 else REJECTED
-            distances[i] = np.nan
-        return
+    """Write the slot (or -1) and the squared distance (or NaN) of one measurement: it is in that row of the records."""
+    for i in range(len(found)):
+        found[i] = new_slot if chosen[i] == -2.0 else REJECTED
+        distances[i] = np.nan
     for q in range(low, high):
-        record, slot, code, begin = records[q], slots[q], float(q), q == low
+        of_candidate, slot, code = records[q, row : row + LANES], slots[q], float(q)
         for i in range(len(found)):
             on = chosen[i] == code
-            distance = record[Q_FIRST_D + i] if first_pass else record[Q_D + i]
-            found[i] = slot if on else ((new_slot if chosen[i] == -2.0 else REJECTED) if begin else found[i])
-            distances[i] = distance if on else (np.nan if begin else distances[i])
+            found[i] = slot if on else found[i]
+            distances[i] = of_candidate[i] if on else distances[i]

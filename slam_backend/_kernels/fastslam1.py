@@ -9,7 +9,7 @@ from slam_backend._kernels.candidates import find_candidates
 from slam_backend._kernels.choices import admit, bar_taken, mask_of, write_found
 from slam_backend._kernels.innovations import innovate
 from slam_backend._kernels.landmark_updates import gate_and_update, new_landmark
-from slam_backend._kernels.layout import CANDIDATE_ROWS, CLUTTER, LANES, REJECTED
+from slam_backend._kernels.layout import CANDIDATE_ROWS, CLUTTER, LANES, Q_D, REJECTED
 from slam_backend._kernels.likelihoods import clear_likelihood, total_log_likelihood
 from slam_backend._kernels.motion import enter_pose, sample_motion, take_draws
 from slam_backend._kernels.places import carry_odds, name_new, open_slot, refresh, tile_of
@@ -102,7 +102,7 @@ def update_fastslam1(
                     work[CLUTTER + i] += log_clutter if mask[i] > 0.0 else 0.0
             write_found(
                 found[b, first : first + LANES], distances[b, first : first + LANES], chosen, starts[b], starts[b + 1],
-                slots, records, False, new_slots[b],
+                slots, records, Q_D, new_slots[b],
             )  # fmt: skip
         for i in range(LANES):
             log_likelihood[first + i] += total_log_likelihood(work, i)

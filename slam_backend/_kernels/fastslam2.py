@@ -20,7 +20,17 @@ from slam_backend._kernels.choices import (
 from slam_backend._kernels.first_pass import keep_distance, match_first
 from slam_backend._kernels.innovations import evaluate, innovate
 from slam_backend._kernels.landmark_updates import count_matches, find_young, new_landmark, relinearise, update
-from slam_backend._kernels.layout import CANDIDATE_ROWS, FARTHEST, LANES, REJECTED, SPREAD00, TILE, X0, X
+from slam_backend._kernels.layout import (
+    CANDIDATE_ROWS,
+    FARTHEST,
+    LANES,
+    Q_FIRST_D,
+    REJECTED,
+    SPREAD00,
+    TILE,
+    X0,
+    X,
+)
 from slam_backend._kernels.likelihoods import add_likelihood, clear_likelihood
 from slam_backend._kernels.motion import predict, prior, store_rows, take_draws
 from slam_backend._kernels.places import carry_odds, name_new, open_slot, refresh, tile_of
@@ -206,6 +216,6 @@ def update_fastslam2(
                 )  # fmt: skip
             write_found(
                 found[b, first : first + LANES], distances[b, first : first + LANES], match[b], starts[b],
-                starts[b + 1], slots, records, True, new_slots[b],
+                starts[b + 1], slots, records, Q_FIRST_D, new_slots[b],
             )  # fmt: skip
     name_new(new_slots, descriptors, names, named, ids, identities, stored, heads, tops)

@@ -59,61 +59,45 @@ def innovate(
     """Write r (3), its sensor covariance in map axes (6) and the predicted depth, at the pose rows X .. SIN.
 
     `points[n]` is the measured point relative to the camera centre in robot axes (x ahead = depth); `noises[n]` its
-    covariance (6) in robot axes, used if `given`. `camera` = (focal, baseline, sigma_px, sigma_disparity, mount (3)).
+    covariance (6) in robot axes, used if `given`; the depth is then 1, for it plays no part. `camera` = (focal,
+    baseline, sigma_px, sigma_disparity, mount (3)).
     """
-    if given:
-        _innovate_given(work, tile, points, noises, n, camera)
-    else:
-        _innovate_seen(work, tile, points, n, camera)
-
-
-@lanes
-def _innovate_given(
-    work: FloatArray, tile: FloatArray, points: FloatArray, noises: FloatArray, n: int, camera: FloatArray
-) -> None:
-    """Do what `innovate` does for a point whose covariance is given; the depth is 1: it plays no part."""
-    v0, v1, v2 = points[n, 0] + camera[4], points[n, 1] + camera[5], points[n, 2] + camera[6]
-    a, b, d, e, f, g = noises[n, 0], noises[n, 1], noises[n, 2], noises[n, 3], noises[n, 4], noises[n, 5]
-    for i in range(LANES):
-        c, s = work[COS + i], work[SIN + i]
-        work[R0 + i] = c * v0 - s * v1 + work[X + i] - tile[i]
-        work[R1 + i] = s * v0 + c * v1 + work[Y + i] - tile[LANES + i]
-        work[R2 + i] = v2 - tile[2 * LANES + i]
-        work[N00 + i] = c * c * a - 2.0 * c * s * b + s * s * e
-        work[N01 + i] = c * s * (a - e) + (c * c - s * s) * b
-        work[N02 + i] = c * d - s * f
-        work[N11 + i] = s * s * a + 2.0 * c * s * b + c * c * e
-        work[N12 + i] = s * d + c * f
-        work[N22 + i] = g
-        work[DEPTH + i] = 1.0
-
-
-@lanes
-def _innovate_seen(work: FloatArray, tile: FloatArray, points: FloatArray, n: int, camera: FloatArray) -> None:
-    """Do what `innovate` does for a point whose covariance is the camera's, at the point predicted."""
     v0, v1, v2 = points[n, 0], points[n, 1], points[n, 2]
+    a, b, d, e, f, g = noises[n, 0], noises[n, 1], noises[n, 2], noises[n, 3], noises[n, 4], noises[n, 5]
     m0, m1, m2 = camera[4], camera[5], camera[6]
     pixel = (camera[2] / camera[0]) ** 2
     disparity = (camera[3] / (camera[0] * camera[1])) ** 2
     per_depth = 1.0 / v0
     for i in range(LANES):
         c, s = work[COS + i], work[SIN + i]
-        ex = tile[i] - work[X + i] - (c * m0 - s * m1)
-        ey = tile[LANES + i] - work[Y + i] - (s * m0 + c * m1)
-        ez = tile[2 * LANES + i] - m2
-        depth = c * ex + s * ey
-        k = depth * per_depth
-        work[R0 + i] = k * (c * v0 - s * v1 - ex)
-        work[R1 + i] = k * (s * v0 + c * v1 - ey)
-        work[R2 + i] = k * (v2 - ez)
-        across, along = pixel * depth * depth, disparity * depth * depth
-        work[N00 + i] = across * s * s + along * ex * ex
-        work[N01 + i] = along * ex * ey - across * c * s
-        work[N02 + i] = along * ex * ez
-        work[N11 + i] = across * c * c + along * ey * ey
-        work[N12 + i] = along * ey * ez
-        work[N22 + i] = across + along * ez * ez
-        work[DEPTH + i] = depth
+        if given:  # asked here, not around two loops, after which references to each array would be counted
+            work[R0 + i] = c * (v0 + m0) - s * (v1 + m1) + work[X + i] - tile[i]
+            work[R1 + i] = s * (v0 + m0) + c * (v1 + m1) + work[Y + i] - tile[LANES + i]
+            work[R2 + i] = v2 + m2 - tile[2 * LANES + i]
+            work[N00 + i] = c * c * a - 2.0 * c * s * b + s * s * e
+            work[N01 + i] = c * s * (a - e) + (c * c - s * s) * b
+            work[N02 + i] = c * d - s * f
+            work[N11 + i] = s * s * a + 2.0 * c * s * b + c * c * e
+            work[N12 + i] = s * d + c * f
+            work[N22 + i] = g
+            work[DEPTH + i] = 1.0
+        else:
+            ex = tile[i] - work[X + i] - (c * m0 - s * m1)
+            ey = tile[LANES + i] - work[Y + i] - (s * m0 + c * m1)
+            ez = tile[2 * LANES + i] - m2
+            depth = c * ex + s * ey
+            k = depth * per_depth
+            work[R0 + i] = k * (c * v0 - s * v1 - ex)
+            work[R1 + i] = k * (s * v0 + c * v1 - ey)
+            work[R2 + i] = k * (v2 - ez)
+            across, along = pixel * depth * depth, disparity * depth * depth
+            work[N00 + i] = across * s * s + along * ex * ex
+            work[N01 + i] = along * ex * ey - across * c * s
+            work[N02 + i] = along * ex * ez
+            work[N11 + i] = across * c * c + along * ey * ey
+            work[N12 + i] = along * ey * ez
+            work[N22 + i] = across + along * ez * ez
+            work[DEPTH + i] = depth
 
 
 @lanes_inlined
