@@ -56,7 +56,8 @@ def test_a_bad_reading_is_refused(name: str, pose: list[float], ranges: np.ndarr
     assert all((grid.cells == UNKNOWN).all() for grid in team.grids)
 
 
-def test_rays_in_another_order_are_refused() -> None:
-    """A fan from left to right has no directions."""
+@pytest.mark.parametrize("angles", [ANGLES[::-1], ANGLES[:0], np.array([-1.6, 1.6])])
+def test_other_rays_are_refused(angles: np.ndarray) -> None:
+    """A fan from left to right has no directions, nor has one of no rays, or one that looks behind."""
     with pytest.raises(ValueError, match=r"^angles: expected"):
-        ray_directions(ANGLES[::-1])
+        ray_directions(angles)

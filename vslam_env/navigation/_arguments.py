@@ -49,8 +49,8 @@ def check_ranges(ranges: FloatArray) -> None:
 
 
 def ray_directions(angles: FloatArray) -> FloatArray:
-    """Return the unit vectors (2, n) of rays at angles (n,) [rad], ascending over less than pi, or raise."""
-    if not good_angles(angles):
+    """Return the unit vectors (2, n) of rays at angles (n,) [rad], n >= 1, ascending over less than pi, or raise."""
+    if not (len(angles) and good_angles(angles)):
         expected = "ascending angles spanning less than pi [rad]"
         raise bad_argument("angles", expected, angles, "Order the rays from right to left.")
     directions: FloatArray = directions_of(angles)
