@@ -164,7 +164,7 @@ def test_a_frame_is_the_plain_definition() -> None:
     made_of = np.hstack([positions, looks]), np.hstack([false, false_looks[:2]])
     got_points, got_looks = np.empty((6, 3)), np.empty((6, 4), np.float32)
     measure(ids, counts, poses, *made_of, noise, optics, 0.3, got_points, got_looks)
-    assert counts.tolist() == [2, 0, 2]
+    assert counts.tolist() == [2, 2, 4]  # where those that are written end
     assert ids[:4].tolist() == [-1, 4, 0, 3]
     np.testing.assert_allclose(got_points[:4], camera.triangulate(pixels), rtol=1e-9)
     np.testing.assert_allclose(got_looks[:4], disturbed / np.linalg.norm(disturbed, axis=1, keepdims=True), rtol=1e-6)

@@ -28,7 +28,7 @@ def measure(
     Args:
         ids: (n,) int64. Landmarks that the robots report, one robot after the other; -1 - j for false point j. Changed
             to those behind what is written, -1 for a false point.
-        counts: (K,) int64. How many each robot reports; likewise.
+        counts: (K,) int64. How many each robot reports; changed to where those of each robot that are written end.
         poses: (K, 3) float64 [m, m, rad], world frame. Robots.
         landmarks: (N, 3 + d) float64. Their positions [m], world frame, and descriptors, unit vectors.
         false_points: (m, 3 + d) float64. Likewise, but in the camera frame.
@@ -46,7 +46,6 @@ def measure(
     i = kept = 0
     for k in range(len(poses)):
         cosine, sine = np.cos(poses[k, 2]), np.sin(poses[k, 2])
-        first = kept
         for _ in range(counts[k]):
             if ids[i] >= 0:
                 row = landmarks[ids[i]]
@@ -73,4 +72,4 @@ def measure(
                 ids[kept] = max(ids[i], -1)
                 kept += 1
             i += 1
-        counts[k] = kept - first
+        counts[k] = kept

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from itertools import accumulate
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -143,9 +143,11 @@ class LandmarkSensor:
         points, looks = np.empty((total, 3)), np.empty((total, size - 3), np.float32)
         truth = ids, counts, poses, self._points, false_points
         measure(*truth, noise, self._optics, config.descriptor_noise, points, looks)
-        ends = list(accumulate(counts.tolist()))
-        measured = TeamMeasurements.trusted(points[: ends[-1]], looks[: ends[-1]], ends)
-        return Frames(measured, list(map(ids.__getitem__, map(slice, [0, *ends], ends))))
+        ends = counts.tolist()  # they are added up now
+        if ends[-1] < total:
+            points, looks = points[: ends[-1]], looks[: ends[-1]]
+        true_ids = [ids[begin:end] for begin, end in pairwise((0, *ends))]
+        return Frames(TeamMeasurements.trusted(points, looks, counts), true_ids)
 
     def _false_points(self, count: int, rng: np.random.Generator) -> FloatArray:
         """Draw points (count, 3) [m], camera frame, in the view: uniform in the image and in depth."""
