@@ -182,7 +182,7 @@ class SeenGrid:
         self._evidence[:] = evidence
         np.take(_VERDICTS, evidence.view(np.uint8), out=self._cells, mode="wrap")
         self._changes[0] = -1
-        self._bounds[:] = _painting.known_bounds(self._cells)
+        self._bounds[:] = _painting.known_bounds(self.cells)  # read-only: as planners ask, so that it is compiled once
 
     def _refuse_if_read_only(self) -> None:
         if self._read_only:
