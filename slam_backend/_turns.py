@@ -99,6 +99,7 @@ def take_turns(
         _, begin, end, _, _, count = inputs.turns[row] if row >= 0 else UNHEARD
         if count >= 0:
             given, new_slots = found[begin:end], told[NEW_SLOTS, begin:end]
+            # This may take the row that `make_room` has left, and so never moves the arrays that later turns are given.
             deserted.append(slam._existence.weigh(maps, slam._poses[robot], best, given, new_slots))
     return summary, deserted
 
