@@ -99,7 +99,8 @@ def take_turns(
         _, begin, end, _, _, count = inputs.turns[row] if row >= 0 else UNHEARD
         if count >= 0:
             given, new_slots = found[begin:end], told[NEW_SLOTS, begin:end]
-            # This may take the row that `make_room` has left, and so never moves the arrays that later turns are given.
+            # Room for this was left by `make_room`; only where nobody saw anything may it grow, and then no later turn
+            # looks at a map: so the arrays that later turns are given stay as they are.
             deserted.append(slam._existence.weigh(maps, slam._poses[robot], best, given, new_slots))
     return summary, deserted
 
