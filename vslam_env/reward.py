@@ -140,12 +140,12 @@ def evaluate(
         shared: Each robot gets the mean over all robots, term by term.
 
     Raises:
-        ValueError: If a term returns anything but one finite number for each robot.
+        ValueError: If a term of one's own returns anything but one finite number for each robot.
     """
     robots = len(after.collisions)
     rewards = {}
     for term in terms:
-        paid = TERMS[term.name](before, after) if type(term) is _NamedTerm else _own(term, before, after, robots)
+        paid = term(before, after) if isinstance(term, _NamedTerm) else _own(term, before, after, robots)
         if shared:
             paid = [float(np.mean(paid))] * robots
         rewards[term.name] = list(map(mul, repeat(float(term.weight)), paid))

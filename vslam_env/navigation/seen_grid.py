@@ -71,6 +71,7 @@ class SeenGrid:
         cells: NDArray[np.uint8],
         changes: NDArray[np.int32],
         bounds: NDArray[np.int32],
+        *,
         read_only: bool = False,
     ) -> "SeenGrid":
         """Make arrays, as the kernels expect them, this grid's own."""
@@ -81,15 +82,9 @@ class SeenGrid:
         return self
 
     @classmethod
-    def _of(
-        cls,
-        evidence: NDArray[np.int8],
-        cells: NDArray[np.uint8],
-        changes: NDArray[np.int32],
-        bounds: NDArray[np.int32],
-    ) -> "SeenGrid":
-        """Return the grid that lies in some arrays."""
-        return cls.__new__(cls)._adopt(evidence, cells, changes, bounds)
+    def _of(cls, *arrays: NDArray[Any], read_only: bool = False) -> "SeenGrid":
+        """Return the grid that lies in some arrays, as `_arrays` has them."""
+        return cls.__new__(cls)._adopt(*arrays, read_only=read_only)
 
     @property
     def _arrays(self) -> tuple[NDArray[np.int8], NDArray[np.uint8], NDArray[np.int32], NDArray[np.int32]]:
@@ -166,7 +161,7 @@ class SeenGrid:
 
     def frozen(self) -> "SeenGrid":
         """Return a view that refuses changes and shares memory with this grid: it follows changes made here."""
-        return SeenGrid.__new__(SeenGrid)._adopt(*self._arrays, read_only=True)
+        return SeenGrid._of(*self._arrays, read_only=True)
 
     def get_state(self) -> dict[str, Any]:
         """Return a copy of all that `set_state` needs to continue bit by bit."""
