@@ -6,6 +6,7 @@ import slam_backend
 from slam_backend.compilation import watch_compilation
 from vslam_env.config import EnvConfig
 from vslam_env.environment import ExplorationEnv
+from vslam_env.sensors import LandmarkSensorConfig
 from vslam_env.world import World
 
 WALLS = np.array([[0.0, 0.0, 9.0, 0.0], [9.0, 0.0, 9.0, 9.0], [9.0, 9.0, 0.0, 9.0], [0.0, 9.0, 0.0, 0.0]])
@@ -23,7 +24,8 @@ def warm_up() -> float:
     """
     with watch_compilation(lambda name: None) as watch:
         slam_backend.warm_up()
-        config = EnvConfig(num_robots=2, action_type="goal", oracle_merge=True)
+        eyes = LandmarkSensorConfig(false_points=2.0)
+        config = EnvConfig(num_robots=2, action_type="goal", oracle_merge=True, landmark_sensor=eyes)
         env = ExplorationEnv(config, World("room", WALLS))
         env.reset(seed=0)  # starts are drawn, where they are given afterwards
         env.reset(seed=0, options={"start_poses": STARTS})

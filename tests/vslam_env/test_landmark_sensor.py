@@ -9,9 +9,10 @@ import pytest
 from slam_backend.camera import StereoCamera
 from slam_backend.geometry import compose
 from vslam_env.sensors import LandmarkSensor, LandmarkSensorConfig
-from vslam_env.sensors._landmark_kernels import measure
+from vslam_env.sensors._landmark_kernels import make_up, measure, mix_in
 from vslam_env.world import FreeSpace, Landmarks, World, make_world, place_landmarks
 from vslam_env.world.sight_kernels import choose
+from vslam_env.world.visibility import view_limits
 
 SHARP = StereoCamera(sigma_px=1e-9, sigma_disparity_px=1e-9)
 PERFECT = LandmarkSensorConfig(
@@ -163,11 +164,43 @@ def test_a_frame_is_the_plain_definition() -> None:
     optics = np.array([*camera.mount, camera.focal_px, camera.baseline, camera.sigma_px, camera.sigma_disparity_px])
     made_of = np.hstack([positions, looks]), np.hstack([false, false_looks[:2]])
     got_points, got_looks = np.empty((6, 3)), np.empty((6, 4), np.float32)
-    measure(ids, counts, poses, *made_of, noise, optics, 0.3, got_points, got_looks)
+    assert measure(ids, counts, poses, *made_of, noise, optics, 0.3, got_points, got_looks) == 4
     assert counts.tolist() == [2, 2, 4]  # where those that are written end
     assert ids[:4].tolist() == [-1, 4, 0, 3]
     np.testing.assert_allclose(got_points[:4], camera.triangulate(pixels), rtol=1e-9)
     np.testing.assert_allclose(got_looks[:4], disturbed / np.linalg.norm(disturbed, axis=1, keepdims=True), rtol=1e-6)
+
+
+def test_false_points_are_the_plain_definition() -> None:
+    """They are spread over the image and in depth, none nearer than 0.5 m; descriptors have a part in common."""
+    rng = np.random.default_rng(10)
+    camera = StereoCamera(max_range=6.0)
+    places, own = rng.random((3, 20)), rng.standard_normal((20, 8))
+    places[2, :3] = 0.0
+    common = 0.1 * rng.standard_normal(8)
+    right, down = np.array([[np.tan(camera.half_fov)], [np.tan(camera.half_vertical_fov)]]) * (2.0 * places[:2] - 1.0)
+    rays = np.stack([right, down, np.ones(20)], axis=1)
+    ahead = np.maximum(places[2] * 6.0 / np.linalg.norm(rays, axis=1), 0.5)
+    looks = common + 0.8 * own / np.linalg.norm(own, axis=1, keepdims=True)
+    points = np.empty((20, 11))
+    make_up(places, own, common, 0.8, view_limits(camera, 1.0), points)
+    np.testing.assert_allclose(points[:, :3], rays * ahead[:, None], rtol=1e-12)
+    np.testing.assert_allclose(points[:, 3:], looks / np.linalg.norm(looks, axis=1, keepdims=True), rtol=1e-12)
+
+
+def test_false_points_are_mixed_in_by_their_keys() -> None:
+    """Each robot's points, landmarks before false ones, are sorted by its share of the keys."""
+    rng = np.random.default_rng(11)
+    num_true, num_false = np.array([2, 0, 3, 0, 1]), np.array([1, 2, 0, 0, 4])
+    ids, keys = rng.permutation(40)[:6], rng.random(13)
+    own = np.split(ids, np.cumsum(num_true)[:-1])
+    false = np.split(-1 - np.arange(7), np.cumsum(num_false)[:-1])
+    shares = np.split(keys, np.cumsum(num_true + num_false)[:-1])
+    expected = [np.concatenate(pair)[np.argsort(share)] for *pair, share in zip(own, false, shares, strict=True)]
+    counts, mixed = num_true.copy(), np.empty(13, np.int64)
+    mix_in(num_false, ids, keys.copy(), counts, mixed)
+    assert mixed.tolist() == np.concatenate(expected).tolist()
+    assert counts.tolist() == [len(points) for points in expected]
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -1,10 +1,78 @@
-"""The compiled part of the landmark sensor: what is measured of the landmarks that are reported."""
+"""The compiled part of the landmark sensor: false points, and what is measured of all points that are reported."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend._jit import jit
 from slam_backend.errors import FloatArray, IntArray
+
+NEAREST_FALSE_POINT = 0.5  # [m]
+
+
+@jit
+def _bring_to(length: float, vector: FloatArray) -> None:
+    """Scale a vector (n,) that is not 0 to a length."""
+    square = 0.0
+    for i in range(len(vector)):
+        square += vector[i] ** 2
+    scale = length / np.sqrt(square)
+    for i in range(len(vector)):
+        vector[i] *= scale
+
+
+@jit
+def make_up(
+    places: FloatArray, looks: FloatArray, common: FloatArray, own_share: float, view: FloatArray, points: FloatArray
+) -> None:
+    """Make up points that are no landmarks: uniform in the image and in depth, unit descriptors like the others'.
+
+    Args:
+        places: (3, m) float64, uniform in [0, 1).
+        looks: (m, d) float64, standard normal.
+        common: (d,) float64. What all descriptors have in common.
+        own_share: Length of what each has of its own.
+        view: (7,) float64. See `view_limits`.
+        points: (m, 3 + d) float64. Written to: points [m], camera frame, and descriptors.
+    """
+    max_range, across, upright = view[3], view[4], view[5]
+    for j in range(len(points)):
+        right, down = (2.0 * places[0, j] - 1.0) * across, (2.0 * places[1, j] - 1.0) * upright
+        farthest = max_range / np.sqrt(right * right + down * down + 1.0)
+        ahead = max(min(NEAREST_FALSE_POINT, max_range), places[2, j] * farthest)
+        points[j, 0], points[j, 1], points[j, 2] = right * ahead, down * ahead, ahead
+        look = points[j, 3:]
+        look[:] = looks[j]
+        _bring_to(own_share, look)
+        look += common
+        _bring_to(1.0, look)
+
+
+@jit
+def mix_in(num_false: IntArray, ids: IntArray, keys: FloatArray, counts: IntArray, mixed: IntArray) -> None:
+    """Put the false points of each robot among its landmarks, in random order.
+
+    Args:
+        num_false: (K,) int64. How many false points each robot reports.
+        ids: (at least n - m,) int64. The landmarks that robots report, one robot after the other.
+        keys: (n,) float64, uniform. Of each robot's landmarks, then of its false points. Changed: put in order.
+        counts: (K,) int64. How many landmarks each robot reports; changed to how many points.
+        mixed: (n,) int64. Written to: landmarks, and -1 - j for false point j, of each robot by rising keys.
+    """
+    end = true = false = 0
+    for k in range(len(counts)):
+        begin, num_true = end, counts[k]
+        counts[k] += num_false[k]
+        for i in range(counts[k]):
+            if i < num_true:
+                name, true = ids[true], true + 1
+            else:
+                name, false = -1 - false, false + 1
+            key, at = keys[end], end
+            while at > begin and keys[at - 1] > key:
+                keys[at], mixed[at] = keys[at - 1], mixed[at - 1]
+                at -= 1
+            keys[at], mixed[at] = key, name
+            end += 1
 
 
 @jit
@@ -19,7 +87,7 @@ def measure(
     descriptor_noise: float,
     points: FloatArray,
     looks: NDArray[np.float32],
-) -> None:
+) -> int:
     """Measure points and descriptors.
 
     Points are projected, their image coordinates and disparities disturbed, and triangulated again. Where the disparity
@@ -38,6 +106,9 @@ def measure(
         descriptor_noise: Root mean square length of the noise of a descriptor.
         points: (n, 3) float64 [m], camera frame. Written to, as what follows.
         looks: (n, d) float32, unit vectors.
+
+    Returns:
+        How many are written.
     """
     forward, aside, height, focal, baseline, sigma, sigma_disparity = optics
     size = looks.shape[1]
@@ -73,3 +144,4 @@ def measure(
                 kept += 1
             i += 1
         counts[k] = kept
+    return kept

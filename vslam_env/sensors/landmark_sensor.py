@@ -2,20 +2,17 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from slam_backend.camera import StereoCamera
 from slam_backend.errors import BoolArray, FloatArray, IntArray, bad_argument, check_array, check_float, check_int
 from slam_backend.measurements import Measurements, TeamMeasurements
-from vslam_env.sensors._landmark_kernels import measure
+from vslam_env.sensors._landmark_kernels import make_up, measure, mix_in
 from vslam_env.world.sight_kernels import detect
 from vslam_env.world.spec import Landmarks
-from vslam_env.world.visibility import view_limits, visible_landmarks
-
-NEAREST_FALSE_POINT = 0.5  # [m]
+from vslam_env.world.visibility import marks_of, view_limits, visible_landmarks
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -62,6 +59,27 @@ class Frame(NamedTuple):
     true_ids: IntArray
 
 
+class TrueIds(Sequence[IntArray]):
+    """The landmarks behind all robots' points, in one piece; each robot's are cut out for who asks.
+
+    Args:
+        ids: (n,) int64. One robot's after the other's; -1 for a false point.
+        ends: (K,) int64. Per robot where its own end.
+    """
+
+    __slots__ = ("_ends", "_ids")
+
+    def __init__(self, ids: IntArray, ends: IntArray) -> None:
+        self._ids, self._ends = ids, ends
+
+    def __len__(self) -> int:
+        return len(self._ends)
+
+    def __getitem__(self, robot: Any) -> Any:
+        begin = self._ends[robot - 1] if robot else 0
+        return self._ids[begin : self._ends[robot]]
+
+
 class Frames(NamedTuple):
     """The frames of all robots in one tick.
 
@@ -93,7 +111,8 @@ class LandmarkSensor:
     ) -> None:
         self.config = config
         self._walls = check_array("walls", walls, (None, 4), "Give rows x1 y1 x2 y2 in metres.")
-        self._landmarks, self._places = landmarks, landmarks.positions.T.copy()
+        self._landmarks = landmarks
+        self._scenery = marks_of(landmarks), landmarks.walls.copy(), self._walls.T.copy()  # as kernels expect it
         descriptors = landmarks.descriptors.astype(np.float64)
         self._points = np.hstack([landmarks.positions, descriptors])
         self._robot_radius = check_float("robot_radius", robot_radius, "Give metres.", at_least=0.0)
@@ -101,6 +120,7 @@ class LandmarkSensor:
         lens = camera.focal_px, camera.baseline, camera.sigma_px, camera.sigma_disparity_px
         self._optics = np.array([*camera.mount, *lens])
         self._view = view_limits(camera, config.max_incidence)
+        self._frame_shape = config.max_measurements, self._points.shape[1]
         self._no_false_points = np.empty((0, self._points.shape[1]))
         # False points look like landmarks of this world: the common part of all descriptors and a part of their own.
         self._common = descriptors.mean(axis=0) if len(landmarks) else np.zeros(descriptors.shape[1])
@@ -123,66 +143,43 @@ class LandmarkSensor:
         Returns:
             One frame of each robot. Nothing in the order of its points tells anything about them.
         """
-        config, marks = self.config, self._landmarks
-        robots, most, size = len(poses), config.max_measurements, self._points.shape[1]
+        config, robots, (most, size) = self.config, len(poses), self._frame_shape
         num_false = rng.poisson(config.false_points, robots)
         keys = rng.random((robots, len(self._points)))
-        ids, counts = np.empty(robots * most, np.int64), np.empty(robots, np.int64)
+        ids, ends = np.empty(robots * most, np.int64), np.empty(robots, np.int64)
         total, extra = detect(
-            poses, self._places, marks.normals, marks.walls, self._walls, self._robot_radius, self._view,
-            keys, config.detection_probability, num_false, most, ids, counts,
+            poses, *self._scenery, self._robot_radius, self._view, keys, config.detection_probability, num_false, most,
+            ids, ends,
         )  # fmt: skip
         false_points = self._no_false_points
         if extra:
-            false_points = np.hstack([self._false_points(extra, rng), self._false_descriptors(extra, rng)])
-            ids = np.concatenate([ids[:total], -1 - np.arange(extra)])
             total += extra
-            ids = ids[_mixed(counts.tolist(), num_false.tolist(), rng.random(total).tolist())]
-            counts += num_false
+            ids, false_points = self._mixed(num_false, ids, ends, total, extra, rng)
         noise = rng.standard_normal((total, size))
         points, looks = np.empty((total, 3)), np.empty((total, size - 3), np.float32)
-        truth = ids, counts, poses, self._points, false_points
-        measure(*truth, noise, self._optics, config.descriptor_noise, points, looks)
-        ends = counts.tolist()  # they are added up now
-        if ends[-1] < total:
-            points, looks = points[: ends[-1]], looks[: ends[-1]]
-        true_ids = [ids[begin:end] for begin, end in pairwise((0, *ends))]
-        return Frames(TeamMeasurements.trusted(points, looks, counts), true_ids)
+        truth = ids, ends, poses, self._points, false_points
+        kept = measure(*truth, noise, self._optics, config.descriptor_noise, points, looks)
+        if kept < total:
+            points, looks = points[:kept], looks[:kept]
+        return Frames(TeamMeasurements.trusted(points, looks, ends), TrueIds(ids, ends))
 
-    def _false_points(self, count: int, rng: np.random.Generator) -> FloatArray:
-        """Draw points (count, 3) [m], camera frame, in the view: uniform in the image and in depth."""
-        camera = self.config.camera
-        right, down, depth = rng.uniform(-1.0, 1.0, count), rng.uniform(-1.0, 1.0, count), rng.random(count)
-        across, upright = self._view[4:6]
-        rays = np.stack([right * across, down * upright, np.ones(count)], axis=1)
-        farthest = camera.max_range / np.linalg.norm(rays, axis=1)
-        nearest = min(NEAREST_FALSE_POINT, camera.max_range)
-        return np.asarray(rays * np.maximum(nearest, depth * farthest)[:, None])
+    def _mixed(
+        self, num_false: IntArray, ids: IntArray, counts: IntArray, total: int, extra: int, rng: np.random.Generator
+    ) -> tuple[IntArray, FloatArray]:
+        """Mix false points into frames.
 
-    def _false_descriptors(self, count: int, rng: np.random.Generator) -> FloatArray:
-        """Draw unit descriptors (count, d) of things never seen before that look like this world's landmarks."""
-        own = rng.standard_normal((count, len(self._common)))
-        own *= self._own_share / np.linalg.norm(own, axis=1, keepdims=True)
-        descriptors = self._common + own
-        return np.asarray(descriptors / np.linalg.norm(descriptors, axis=1, keepdims=True))
+        Args:
+            num_false, ids, counts: As of `mix_in`.
+            total: How many points there are then.
+            extra: How many of these are false.
+            rng: Source of the draws.
 
-
-def _mixed(num_true: list[int], num_false: list[int], keys: list[float]) -> list[int]:
-    """Return the rows of each robot's points in random order, when false ones stand behind all true ones.
-
-    Args:
-        num_true: Per robot.
-        num_false: Per robot.
-        keys: Random numbers, as many as points: each robot's points are ordered by its share of them.
-
-    >>> _mixed([2, 1], [0, 2], [0.9, 0.1, 0.5, 0.3, 0.4])
-    [1, 0, 3, 4, 2]
-    """
-    order: list[int] = []
-    true, false = 0, sum(num_true)
-    for real, made_up in zip(num_true, num_false, strict=True):
-        rows = [*range(true, true + real), *range(false, false + made_up)]
-        own = keys[len(order) : len(order) + len(rows)]
-        order += [row for _, row in sorted(zip(own, rows, strict=True))]
-        true, false = true + real, false + made_up
-    return order
+        Returns:
+            The names of all points (total,), as `measure` takes them, and the false points (extra, 3 + d).
+        """
+        size = len(self._common)
+        mixed, points = np.empty(total, np.int64), np.empty((extra, 3 + size))
+        places, looks = rng.random((3, extra)), rng.standard_normal((extra, size))
+        make_up(places, looks, self._common, self._own_share, self._view, points)
+        mix_in(num_false, ids, rng.random(total), counts, mixed)
+        return mixed, points

@@ -49,7 +49,7 @@ class Scan:
         self.config = config
         self.ray_angles = config.ray_angles
         self._rays, self._tan_half = rays_at(self.ray_angles)
-        self._walls = check_array("walls", walls, (None, 4), "Give rows x1 y1 x2 y2 in metres.")
+        self._walls = check_array("walls", walls, (None, 4), "Give rows x1 y1 x2 y2 in metres.").T.copy()
         self._robot_radius = check_float("robot_radius", robot_radius, "Give metres.", at_least=0.0)
 
     def measure(self, poses: FloatArray, rng: np.random.Generator) -> FloatArray:

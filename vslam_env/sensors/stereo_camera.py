@@ -79,7 +79,7 @@ class StereoEye:
         robot_radius: float = 0.2,
     ) -> None:
         self.camera, self.imaging, self.textures = camera, imaging, textures
-        self._walls, self._radius = walls, robot_radius
+        self._walls, self._radius = walls.T.copy(), robot_radius
         self._optics = np.array([camera.focal_px, 0.5 * (camera.width - 1), 0.5 * (camera.height - 1)])
         paint = textures.config
         self._span = np.array([paint.ceiling, (paint.ceiling - paint.floor) / textures.rows])
@@ -111,7 +111,7 @@ class StereoEye:
     def radiance(self, poses: FloatArray, robot: int, shift: float = 0.0) -> Float32Array:
         """Return the grey levels (W, H) float32, without noise, of an eye `shift` [m] to the right of the left one."""
         place = self._place(poses[robot], shift)
-        local, indices = walls_in_wedge(place, self._walls, self._tan_half, VIEW)
+        local, indices = self._walls_ahead(place)
         textures = self.textures
         radiance = np.empty((self.camera.width, self.camera.height), dtype=np.float32)
         render(
@@ -131,10 +131,17 @@ class StereoEye:
         blur = self.imaging.blur_px
         return radiance if blur == 0.0 else np.asarray(cv2.GaussianBlur(radiance, (0, 0), blur), dtype=np.float32)
 
+    def _walls_ahead(self, place: FloatArray) -> tuple[FloatArray, IntArray]:
+        """Return the walls (n, 4) [m] that an eye at `place` may see, in its frame, and their indices (n,)."""
+        local, indices = np.empty(self._walls.T.shape), np.empty(self._walls.shape[1], np.int64)
+        x, y, theta = place.tolist()
+        count = walls_in_wedge(x, y, theta, self._walls, self._tan_half, VIEW, local, indices)
+        return local[:count], indices[:count]
+
     def trace(self, poses: FloatArray, robot: int, columns: FloatArray) -> Traced:
         """Return what the left eye's rays through columns (n,) [px] meet; pixel centres are at integers."""
         place = self._place(poses[robot], 0.0)
-        local, indices = walls_in_wedge(place, self._walls, self._tan_half, VIEW)
+        local, indices = self._walls_ahead(place)
         others = self._others(poses, robot, place)
         rows, depths, along = trace(columns, local, others, self._radius, self._optics[0], self._optics[1])
         on_wall = rows >= 0

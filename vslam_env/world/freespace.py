@@ -171,7 +171,7 @@ class FreeSpace:
         headings = rng.uniform(-np.pi, np.pi, 8)
         poses = np.column_stack([np.broadcast_to(position, (len(headings), 2)), headings])
         free = np.zeros((len(headings), 1))
-        cast_scans(poses, *rays_at(np.zeros(1)), self.world.walls, 0.0, VIEW_AHEAD, 0.0, free)
+        cast_scans(poses, *rays_at(np.zeros(1)), self.world.walls.T.copy(), 0.0, VIEW_AHEAD, 0.0, free)
         return float(headings[int(np.argmax(free[:, 0] >= VIEW_AHEAD))])
 
     def check_starts(self, start_poses: Any, num_robots: int | None = None) -> FloatArray:

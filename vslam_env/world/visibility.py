@@ -30,6 +30,11 @@ def view_limits(camera: StereoCamera, max_incidence: float) -> FloatArray:
     )
 
 
+def marks_of(landmarks: Landmarks) -> FloatArray:
+    """Return positions [m] and normals of landmarks (5, N), world frame, by rows as kernels expect them."""
+    return np.vstack([landmarks.positions.T, landmarks.normals.T])
+
+
 def visible_landmarks(
     poses: FloatArray, landmarks: Landmarks, walls: FloatArray, robot_radius: float, view: FloatArray
 ) -> BoolArray:
@@ -43,5 +48,5 @@ def visible_landmarks(
         view: From `view_limits`.
     """
     seen = np.empty((len(poses), len(landmarks)), dtype=np.bool_)
-    see(poses, landmarks.positions.T.copy(), landmarks.normals, landmarks.walls, walls, robot_radius, view, seen)
+    see(poses, marks_of(landmarks), landmarks.walls.copy(), walls.T.copy(), robot_radius, view, seen)
     return seen

@@ -7,7 +7,7 @@ import numpy as np
 
 from slam_backend._jit import jit
 from slam_backend.errors import BoolArray, FloatArray, IntArray
-from vslam_env.world.sight_kernels.rays import EPSILON, ray_to_disc, ray_to_wall, walls_in_wedge
+from vslam_env.world.sight_kernels.rays import EPSILON, ray_to_disc, ray_to_wall, those, walls_in_wedge
 
 TOUCH = 1e-6  # [m] what a ray meets this close to its target does not hide the target
 
@@ -25,20 +25,9 @@ def _hidden(x: float, y: float, dx: float, dy: float, own_wall: int, walls: Floa
 
 
 @jit
-def _those(flags: BoolArray, rows: IntArray) -> IntArray:
-    """Return which flags (N,) are up, at the beginning of `rows` (N,); no branches, for none could be foreseen."""
-    count = 0
-    for n in range(len(flags)):
-        rows[count] = n
-        count += flags[n]
-    return rows[:count]
-
-
-@jit
 def see(
     poses: FloatArray,
-    places: FloatArray,
-    normals: FloatArray,
+    marks: FloatArray,
     own_walls: IntArray,
     walls: FloatArray,
     robot_radius: float,
@@ -52,41 +41,40 @@ def see(
 
     Args:
         poses: (K, 3) float64 [m, m, rad], world frame. Robots.
-        places: (3, N) float64 [m], world frame. Where the landmarks are; by rows, for vector instructions.
-        normals: (N, 2) float64 [-], world frame.
+        marks: (5, N) float64, world frame. Positions [m] and normals [-] of the landmarks; by rows, for vector
+            instructions.
         own_walls: (N,) int64. Index of the wall that carries each landmark.
-        walls: (S, 4) float64 [m], world frame.
+        walls: (4, S) float64 [m], world frame. By rows as well.
         robot_radius: Of the other robots [m]; robots are as tall as their cameras.
         view: (7,) float64. See `view_limits`.
         seen: (K, N) bool. Written to.
     """
     forward, aside, height, max_range, tan_half, tan_vertical, cos_incidence = view
     seen[:] = False
-    in_image, rows = np.empty(places.shape[1], dtype=np.bool_), np.empty(places.shape[1], dtype=np.int64)
-    camera = np.empty(3)
+    near, near_rows = np.empty((walls.shape[1], 4)), np.empty(walls.shape[1], np.int64)
+    in_image = np.empty(marks.shape[1], np.int64)
     for k in range(len(poses)):
-        c, s = np.cos(poses[k, 2]), np.sin(poses[k, 2])
-        camera[0] = poses[k, 0] + c * forward - s * aside
-        camera[1] = poses[k, 1] + s * forward + c * aside
-        camera[2] = poses[k, 2]
-        near, indices = walls_in_wedge(camera, walls, tan_half + EPSILON, max_range)
-        for n in range(places.shape[1]):
-            dx, dy, dz = places[0, n] - camera[0], places[1, n] - camera[1], places[2, n] - height
+        theta = poses[k, 2]
+        c, s = np.cos(theta), np.sin(theta)
+        eye_x, eye_y = poses[k, 0] + c * forward - s * aside, poses[k, 1] + s * forward + c * aside
+        num_near = walls_in_wedge(eye_x, eye_y, theta, walls, tan_half + EPSILON, max_range, near, near_rows)
+        for n in range(marks.shape[1]):
+            dx, dy, dz = marks[0, n] - eye_x, marks[1, n] - eye_y, marks[2, n] - height
             ahead, left = c * dx + s * dy, c * dy - s * dx
             in_image[n] = (ahead > TOUCH) & (abs(left) <= tan_half * ahead) & (abs(dz) <= tan_vertical * ahead)
-        for n in _those(in_image, rows):
-            dx, dy, dz = places[0, n] - camera[0], places[1, n] - camera[1], places[2, n] - height
+        for n in in_image[: those(in_image)]:
+            dx, dy, dz = marks[0, n] - eye_x, marks[1, n] - eye_y, marks[2, n] - height
             ahead, left = c * dx + s * dy, c * dy - s * dx
             distance = np.sqrt(dx * dx + dy * dy + dz * dz)
-            if distance > max_range or -(dx * normals[n, 0] + dy * normals[n, 1]) <= cos_incidence * distance:
+            if distance > max_range or -(dx * marks[3, n] + dy * marks[4, n]) <= cos_incidence * distance:
                 continue
-            if _hidden(0.0, 0.0, ahead, left, own_walls[n], near, indices):
+            if _hidden(0.0, 0.0, ahead, left, own_walls[n], near[:num_near], near_rows):
                 continue
             length = np.sqrt(ahead * ahead + left * left)
             free = True
             for j in range(len(poses)):
                 if j != k and free:
-                    ox, oy = poses[j, 0] - camera[0], poses[j, 1] - camera[1]
+                    ox, oy = poses[j, 0] - eye_x, poses[j, 1] - eye_y
                     x, y = c * ox + s * oy, c * oy - s * ox
                     free = ray_to_disc(ahead / length, left / length, x, y, robot_radius) >= length
             seen[k, n] = free
@@ -145,8 +133,7 @@ def choose(
 @jit
 def detect(
     poses: FloatArray,
-    places: FloatArray,
-    normals: FloatArray,
+    marks: FloatArray,
     own_walls: IntArray,
     walls: FloatArray,
     robot_radius: float,
@@ -160,7 +147,7 @@ def detect(
 ) -> tuple[int, int]:
     """Choose among the landmarks that each camera sees and detects: `see` and `choose`, whose arguments these are."""
     seen = np.empty(keys.shape, dtype=np.bool_)
-    see(poses, places, normals, own_walls, walls, robot_radius, view, seen)
+    see(poses, marks, own_walls, walls, robot_radius, view, seen)
     return choose(seen, keys, detection_probability, num_false, most, chosen, counts)
 
 

@@ -9,37 +9,57 @@ EPSILON = 1e-9  # walls that share an end point leave no gap between them
 
 
 @jit
-def walls_in_wedge(pose: FloatArray, walls: FloatArray, tan_half: float, reach: float) -> tuple[FloatArray, IntArray]:
-    """Return the walls that may cut a wedge ahead.
+def those(rows: IntArray) -> int:
+    """Write which of some flags (n,), 0 or 1, are up in their place, first of all, and return how many are.
+
+    There are no branches, for none could be foreseen.
+    """
+    count = 0
+    for i in range(len(rows)):
+        flag = rows[i]
+        rows[count] = i
+        count += flag
+    return count
+
+
+@jit
+def walls_in_wedge(
+    x: float, y: float, theta: float, walls: FloatArray, tan_half: float, reach: float, near: FloatArray, rows: IntArray
+) -> int:
+    """Find the walls that may cut a wedge ahead.
 
     A wall is dropped only if both its ends lie beyond the same side of the wedge or of the circle's bounding box, so
     none that matters is lost.
 
     Args:
-        pose: (3,) float64 [m, m, rad], world frame. Where the wedge begins; its axis is the pose's x axis.
-        walls: (S, 4) float64 [m], world frame.
+        x: Where the wedge begins [m], world frame.
+        y: Likewise.
+        theta: Direction of its axis [rad].
+        walls: (4, S) float64 [m], world frame. By rows, for vector instructions.
         tan_half: The wedge opens by +-atan of this around its axis; <= 0 stands for all round.
         reach: Its length [m].
+        near: (S, 4) float64 [m], in the frame (x, y, theta). Written to: the ends of these walls, one after the other.
+        rows: (S,) int64. Written to: their indices.
 
     Returns:
-        Walls (n, 4) float64 [m], in the frame of `pose`, and their indices (n,) int64.
+        How many they are.
     """
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    local = np.empty((len(walls), 4))
-    indices = np.empty(len(walls), dtype=np.int64)
-    n = 0
-    for i in range(len(walls)):
-        dx1, dy1 = walls[i, 0] - pose[0], walls[i, 1] - pose[1]
-        dx2, dy2 = walls[i, 2] - pose[0], walls[i, 3] - pose[1]
+    c, s = np.cos(theta), np.sin(theta)
+    for i in range(walls.shape[1]):
+        dx1, dy1, dx2, dy2 = walls[0, i] - x, walls[1, i] - y, walls[2, i] - x, walls[3, i] - y
         x1, y1 = c * dx1 + s * dy1, c * dy1 - s * dx1
         x2, y2 = c * dx2 + s * dy2, c * dy2 - s * dx2
         beyond = (x1 > reach) & (x2 > reach) | (x1 < -reach) & (x2 < -reach)
         beyond |= (y1 > reach) & (y2 > reach) | (y1 < -reach) & (y2 < -reach)
         beside = (y1 > tan_half * x1) & (y2 > tan_half * x2) | (-y1 > tan_half * x1) & (-y2 > tan_half * x2)
-        local[n, 0], local[n, 1], local[n, 2], local[n, 3] = x1, y1, x2, y2
-        indices[n] = i
-        n += not (beyond | ((tan_half > 0.0) & beside))  # no branches, for none could be foreseen
-    return local[:n], indices[:n]
+        rows[i] = not (beyond | ((tan_half > 0.0) & beside))
+    count = those(rows)
+    for k in range(count):  # moving all of them before would take twice as long
+        i = rows[k]
+        for end in (0, 2):
+            dx, dy = walls[end, i] - x, walls[end + 1, i] - y
+            near[k, end], near[k, end + 1] = c * dx + s * dy, c * dy - s * dx
+    return count
 
 
 @jit
@@ -92,24 +112,26 @@ def cast_scans(
     Args:
         poses: (K, 3) float64 [m, m, rad], world frame.
         rays, tan_half: Of `rays_at`, robot frame. The same for all robots.
-        walls: (S, 4) float64 [m], world frame.
+        walls: (4, S) float64 [m], world frame. See `walls_in_wedge`.
         robot_radius: Of the other robots, which stop rays [m].
         max_range: Where rays end [m]; what ends there is read without error.
         sigma: Standard deviation of a reading, as a share of the distance.
         ranges: (K, R) float64. Standard normal draws; the readings [m], from 0 to `max_range`, take their places.
     """
     others, nearest = np.empty((len(poses), 2)), np.empty(rays.shape[1])
+    near, rows = np.empty((walls.shape[1], 4)), np.empty(walls.shape[1], np.int64)
     for k in range(len(poses)):
-        near, _ = walls_in_wedge(poses[k], walls, tan_half, max_range)
-        c, s = np.cos(poses[k, 2]), np.sin(poses[k, 2])
+        x, y, theta = poses[k]
+        num_near = walls_in_wedge(x, y, theta, walls, tan_half, max_range, near, rows)
+        c, s = np.cos(theta), np.sin(theta)
         num_others = 0
         for j in range(len(poses)):
-            ox, oy = poses[j, 0] - poses[k, 0], poses[j, 1] - poses[k, 1]
+            ox, oy = poses[j, 0] - x, poses[j, 1] - y
             if j != k and max(abs(ox), abs(oy)) <= max_range + robot_radius:
                 others[num_others, 0], others[num_others, 1] = c * ox + s * oy, c * oy - s * ox
                 num_others += 1
         nearest[:] = max_range
-        for i in range(len(near)):
+        for i in range(num_near):
             x1, y1, x2, y2 = near[i]
             for r in range(rays.shape[1]):
                 nearest[r] = min(nearest[r], ray_to_wall(rays[0, r], rays[1, r], x1, y1, x2, y2))
