@@ -35,8 +35,8 @@ class ParticleMaps(MapStore):
 
     # ------------------------------------------------------------------ resampling
 
-    def resample(self, ancestors: IntArray, of_robots: FloatArray, of_particles: FloatArray) -> None:
-        """Let each particle become a copy of its ancestor.
+    def resample(self, ancestors: IntArray, of_robots: FloatArray, of_particles: FloatArray) -> int:
+        """Let each particle become a copy of its ancestor, weighed alike; return the most probable one.
 
         Args:
             ancestors: (M,) ascending.
@@ -44,10 +44,11 @@ class ParticleMaps(MapStore):
         """
         if not self._free_maps:
             self._make_maps()
-        self._free_maps = _kernels.resample(
+        self._free_maps, best = _kernels.resample(
             ancestors, of_robots, of_particles, self.counts, self.table, self.maps, self.users, self.free_rows,
             self.tops, self.heads,
         )  # fmt: skip
+        return best
 
     def _make_maps(self) -> None:
         """Provide a free map, by one more or by bringing slots up to date."""

@@ -244,8 +244,6 @@ class FastSlam(FilterKnowledge):
             count = next_num_particles(self.options.adaptive, poses, self._weights)
         ancestors = RESAMPLING[self.options.resampling](self._weights, self._rng, count)
         if count == self.num_particles:
-            self._maps.resample(ancestors, self._of_robots, self._of_particles)
-            self._look_at_weights()
-            self._log_weights.fill(-np.log(count))
+            self._best = self._maps.resample(ancestors, self._of_robots, self._of_particles)
         else:
             self._become(ancestors)

@@ -1,9 +1,11 @@
 """Particles become copies of their ancestors, their landmarks lazily."""
 
+import math
+
 import numpy as np
 
 from slam_backend._jit import jit
-from slam_backend._kernels.layout import FAR, FREE_SLOTS, IDS, MAP_OF, PATH_LOG_WEIGHTS, ROW_OF
+from slam_backend._kernels.layout import FAR, FREE_SLOTS, IDS, LOG_WEIGHTS, MAP_OF, PATH_LOG_WEIGHTS, ROW_OF
 from slam_backend.errors import Float32Array, FloatArray, Int32Array, IntArray
 
 
@@ -41,19 +43,20 @@ def settle(ancestors: IntArray, count: int) -> tuple[IntArray, IntArray]:
 def resample(
     ancestors: IntArray, robots: FloatArray, weights: FloatArray, counts: Int32Array, table: IntArray,
     maps: Int32Array, users: IntArray, free_rows: IntArray, tops: IntArray, heads: Float32Array,
-) -> int:  # fmt: skip
+) -> tuple[int, int]:  # fmt: skip
     """Let particles become copies of their ancestors, their landmarks lazily, and free what no survivor holds.
 
-    Landmarks that were up to date get one new ancestor map; the others' maps are composed with it.
+    They are weighed alike then. Landmarks that were up to date get one new ancestor map; the others' maps are composed
+    with it.
 
     Args:
         ancestors: (M,) index of each new particle's parent, ascending; they are settled first.
         robots: (5, K, 3, P) as in `take_turns`; columns are copied.
-        weights: (4, P); those along paths are copied.
+        weights: (4, P); those along paths are copied, those since the last resampling begin anew.
         counts, ..., heads: The store, see `ParticleMaps`. At least one map is free.
 
     Returns:
-        How many maps are still free.
+        How many maps are still free, and the particle of the largest weight along paths.
     """
     count = len(ancestors)
     places = settle(ancestors, count)
@@ -62,6 +65,8 @@ def resample(
     path_log_weights, rows = weights[PATH_LOG_WEIGHTS], robots.reshape((-1, robots.shape[3]))
     for i in range(moves):
         path_log_weights[targets[i]] = path_log_weights[sources[i]]
+    weights[LOG_WEIGHTS, :count] = -math.log(count)
+    best = int(np.argmax(path_log_weights[:count]))
     for c in range(len(rows)):
         row = rows[c]
         for i in range(moves):
@@ -109,4 +114,4 @@ def resample(
             free_slots[tops[1]] = slot
             tops[0] += 1
             tops[1] += 1
-    return free
+    return free, best
