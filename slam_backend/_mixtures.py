@@ -115,7 +115,7 @@ def map_mixture(
         best: The particle that says which landmarks there are.
         log_weights: (M,) normalised.
         scatter: (3, 3) covariance of the map's frame about its origin [m, m, rad]; 0 where particles show all.
-        min_count: Landmarks that it measured fewer times, 1 at least, are left out.
+        min_count: Landmarks that it measured fewer times are left out.
 
     Returns:
         Means (n, 3) [m] and covariances (n, 3, 3) [m^2], map frame, descriptors (n, d) float32, counts (n,) of

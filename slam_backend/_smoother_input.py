@@ -6,7 +6,7 @@ import numpy as np
 
 from slam_backend._best_map import write_outline
 from slam_backend._particle_maps import ParticleMaps
-from slam_backend.landmark_map import MapOutline
+from slam_backend.landmark_map import OutlineRows
 from slam_backend.log_arrays import LogArrays
 from slam_backend.run_log import RobotLog
 from slam_backend.smoothing.extending import Places, first_rows
@@ -17,9 +17,9 @@ from slam_backend.smoothing.rejuvenation import Looks
 
 def places_of(maps: ParticleMaps, best: int) -> Places:
     """Return where the most probable particle holds its landmarks to be."""
-    rows = MapOutline.unwritten(len(maps.ids))
+    rows = OutlineRows.unwritten(len(maps.ids))
     held = rows.part(0, write_outline(maps, best, 1, rows, 0))
-    return Places(held.ids, held.means)
+    return Places(held.ids.copy(), held.means.copy())
 
 
 def known_of(maps: ParticleMaps, best: int) -> Known:

@@ -11,10 +11,10 @@ from slam_backend._filter_state import FilterState
 from slam_backend._mixtures import map_mixture
 from slam_backend.errors import FloatArray, IntArray, bad_argument, check_choice
 from slam_backend.geometry import between
-from slam_backend.landmark_map import LandmarkMap, MapOutline
+from slam_backend.landmark_map import LandmarkMap, MapOutline, OutlineRows
 from slam_backend.reports import PoseEstimate
 from slam_backend.run_log import RobotLog
-from slam_backend.standpoints import Standpoints, filter_rows
+from slam_backend.standpoints import Standpoints, seats
 
 NO_WEIGHTS = np.empty(0)  # nobody asks for them where all particles start at the same place
 
@@ -80,15 +80,17 @@ class FilterKnowledge(FilterState):
         know of the start, after a merge, does not blur it.
         """
         index, every = self._check_robot(robot), tuple(range(self.num_robots))
-        points = Standpoints.unwritten(len(every))
+        points = Standpoints(len(every))
         self._stand(every, every, 1.0, points)
-        return PoseEstimate(points.own[index], points.covariances[index])
+        return PoseEstimate(points.own[index].copy(), points.covariances[index].copy())
 
     def _stand(self, names: tuple[int, ...], live: tuple[int, ...], ess: float, points: Standpoints) -> None:
         """Write where the robots stand, which the team calls by these names, of those that are live; `ess` as it is."""
         weights = NO_WEIGHTS if self._from_origin else np.exp(self._log_weights)
-        of_filter = self._of_robots, weights, self._best, self._from_origin, *self._estimates
-        _kernels.stand(*of_filter, *filter_rows(names, live), ess, *points)
+        _kernels.stand(
+            self._of_robots, weights, self._best, self._from_origin, *self._estimates,
+            seats(names, live), ess, points.poses, points.beliefs,
+        )  # fmt: skip
 
     def particles_from_start(self, robot: int = 0) -> FloatArray:
         """Return a robot's poses (M, 3) [m, m, rad], each seen from where it started in that particle."""
@@ -113,10 +115,10 @@ class FilterKnowledge(FilterState):
             ValueError: If `estimate` is neither.
         """
         check_choice("estimate", estimate, ("best", "mixture"))
-        best, least = self.best_particle, max(min_count, 1)
+        best = self.best_particle
         if estimate == "best":
-            return LandmarkMap._trusted(*best_map(self._maps, best, least))
-        return LandmarkMap._trusted(*map_mixture(self._maps, best, self._log_weights, self._frame, least))
+            return LandmarkMap._trusted(*best_map(self._maps, best, min_count))
+        return LandmarkMap._trusted(*map_mixture(self._maps, best, self._log_weights, self._frame, min_count))
 
     def looks(self) -> NDArray[np.float32]:
         """Return the descriptors (n, d) of the landmarks of `map()`. A copy."""
@@ -124,8 +126,8 @@ class FilterKnowledge(FilterState):
 
     def outline(self, min_count: int = 1) -> MapOutline:
         """Return the outline of `map(min_count=min_count)`, much faster. Fresh arrays."""
-        rows = MapOutline.unwritten(self.map_room)
-        return rows.part(0, write_outline(self._maps, self._best, max(min_count, 1), rows, 0))
+        rows = OutlineRows.unwritten(self.map_room)
+        return rows.part(0, write_outline(self._maps, self._best, min_count, rows, 0))
 
     def existence(self) -> tuple[IntArray, FloatArray]:
         """Return the ids (n,) of the landmarks of `map()`, ascending, and the probability (n,) that each exists.

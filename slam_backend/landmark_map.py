@@ -35,39 +35,57 @@ class MapOutline(NamedTuple):
     counts: IntArray
     ids: IntArray
 
+
+class OutlineRows(NamedTuple):
+    """Outlines of one map or several, one after the other, in as few arrays as can be: kernels pay for each.
+
+    Attributes:
+        places: (N, 4) float64 [m, m, m, m^2]. `means` and `variances`.
+        names: (N, 2) int64. `counts` and `ids`.
+    """
+
+    places: FloatArray
+    names: IntArray
+
     @classmethod
     def unwritten(cls, room: int) -> Self:
         """Return room for so many landmarks."""
-        return cls(np.empty((room, 3)), np.empty(room), np.empty(room, np.int64), np.empty(room, np.int64))
+        return cls(np.empty((room, 4)), np.empty((room, 2), np.int64))
 
-    def part(self, first: int, last: int) -> Self:
-        """Return these landmarks alone; it shares memory with this."""
-        own = slice(first, last)
-        return type(self)(self.means[own], self.variances[own], self.counts[own], self.ids[own])
+    @classmethod
+    def of(cls, outlines: Sequence[MapOutline]) -> Self:
+        """Return these behind one another."""
+        means, variances, counts, ids = map(np.concatenate, zip(*outlines, strict=True))
+        return cls(np.column_stack([means, variances]), np.column_stack([counts, ids]))
+
+    def part(self, first: int, last: int) -> MapOutline:
+        """Return the outline of these landmarks; it shares memory with this."""
+        places, names = self.places[first:last], self.names[first:last]
+        return MapOutline(places[:, :3], places[:, 3], names[:, 0], names[:, 1])
 
 
 class TeamOutlines(NamedTuple):
-    """The outlines of the maps that the robots of a team go by, one after the other in arrays of one piece.
+    """The outlines of the maps that the robots of a team go by.
 
     Attributes:
         rows: The landmarks of all maps; those in no part mean nothing.
         parts: (K, 2) int64. Where each robot's map begins in `rows`, and where it ends; robots of one filter share one.
     """
 
-    rows: MapOutline
+    rows: OutlineRows
     parts: IntArray
 
     @classmethod
     def unwritten(cls, num_robots: int, room: int) -> Self:
         """Return room for the maps of K robots with so many landmarks in all."""
-        return cls(MapOutline.unwritten(room), np.empty((num_robots, 2), np.int64))
+        return cls(OutlineRows.unwritten(room), np.empty((num_robots, 2), np.int64))
 
     @classmethod
     def joined(cls, outlines: Sequence[MapOutline]) -> Self:
         """Return these, one for each robot, behind one another."""
         ends = np.cumsum([len(outline.ids) for outline in outlines])
-        rows = MapOutline(*map(np.concatenate, zip(*outlines, strict=True)))
-        return cls(rows, np.column_stack([np.concatenate([[0], ends[:-1]]), ends]).astype(np.int64))
+        parts = np.column_stack([np.concatenate([[0], ends[:-1]]), ends])
+        return cls(OutlineRows.of(outlines), parts.astype(np.int64))
 
     def of(self, robot: int) -> MapOutline:
         """Return that of one robot; it shares memory with this."""

@@ -1,47 +1,49 @@
 """`Standpoints`: where the robots of a team believe themselves and each other to be, each in its own start frame."""
 
 from functools import lru_cache
-from typing import NamedTuple, Self
 
 import numpy as np
 
-from slam_backend.errors import BoolArray, FloatArray, IntArray
+from slam_backend.errors import FloatArray, IntArray
+
+# Columns of `Standpoints.beliefs`: the first of three, three, one, nine, and of one for each robot of the team.
+OWN, START, ESS, COVARIANCE, SIGMAS = 0, 3, 6, 7, 16
 
 
-class Standpoints(NamedTuple):
-    """Arrays over the K robots of a team; row i is what robot i believes, in its own start frame.
+class Standpoints:
+    """What some robots of a team believe, each in its own start frame: a row for each of them.
 
-    Of a robot out of contact others know where it was when contact was lost.
+    Of a robot out of contact others know where it was when contact was lost. The arrays begin unwritten.
+
+    Args:
+        num_rows: n, as a rule the K robots of the team.
+        num_robots: K; None: n.
 
     Attributes:
-        poses: (K, K, 3) float64 [m, m, rad]. Where robot i believes robot j to be; NaN if its filter does not know j.
-        sigmas: (K, K) float64 [m]. One sigma of these positions, averaged over directions; likewise.
-        own: (K, 3) float64 [m, m, rad]. Where each robot believes itself to be: the diagonal of `poses`.
-        covariances: (K, 3, 3) float64 [m, m, rad]. Of these.
-        starts: (K, 3) float64 [m, m, rad]. The motion from the map frame of its filter to its own start frame, in the
+        poses: (n, K, 3) float64 [m, m, rad]. Where each believes robot j to be; NaN if its filter does not know j.
+        beliefs: (n, 16 + K) float64. All that follows, which are views of it: kernels pay for each array.
+        own: (n, 3) float64 [m, m, rad]. Where each robot believes itself to be: also one of its `poses`.
+        starts: (n, 3) float64 [m, m, rad]. The motion from the map frame of its filter to its own start frame, in the
             most probable particle.
-        ess: (K,) float64. Effective sample size of its filter, as a share of M.
+        ess: (n,) float64. Effective sample size of its filter, as a share of M.
+        covariances: (n, 3, 3) float64 [m, m, rad]. Of `own`.
+        sigmas: (n, K) float64 [m]. One sigma of the positions of `poses`, averaged over directions; likewise.
     """
 
-    poses: FloatArray
-    sigmas: FloatArray
-    own: FloatArray
-    covariances: FloatArray
-    starts: FloatArray
-    ess: FloatArray
+    __slots__ = ("beliefs", "covariances", "ess", "own", "poses", "sigmas", "starts")
 
-    @classmethod
-    def unwritten(cls, num_robots: int) -> Self:
-        """Return room for K robots."""
-        k = num_robots
-        shapes = (k, k, 3), (k, k), (k, 3), (k, 3, 3), (k, 3), (k,)
-        return cls(*map(np.empty, shapes))
+    def __init__(self, num_rows: int, num_robots: int | None = None) -> None:
+        known = num_rows if num_robots is None else num_robots
+        self.poses: FloatArray = np.empty((num_rows, known, 3))
+        self.beliefs: FloatArray = np.empty((num_rows, SIGMAS + known))
+        self.own: FloatArray = self.beliefs[:, OWN : OWN + 3]
+        self.starts: FloatArray = self.beliefs[:, START : START + 3]
+        self.ess: FloatArray = self.beliefs[:, ESS]
+        self.covariances: FloatArray = self.beliefs[:, COVARIANCE:SIGMAS].reshape(num_rows, 3, 3)
+        self.sigmas: FloatArray = self.beliefs[:, SIGMAS:]
 
 
 @lru_cache(maxsize=256)
-def filter_rows(robots: tuple[int, ...], live: tuple[int, ...]) -> tuple[IntArray, BoolArray]:
-    """Return the robots (n,) of a filter, and which of them (n,) go by it, as kernels take them."""
-    rows = np.array(robots, np.int64), np.array([robot in live for robot in robots], np.bool_)
-    for array in rows:
-        array.setflags(write=False)
-    return rows
+def seats(robots: tuple[int, ...], live: tuple[int, ...]) -> IntArray:
+    """Return the robots (n,) of a filter, and below each 1 if it goes by it, as kernels take them; only looked at."""
+    return np.array([robots, [robot in live for robot in robots]], np.int64)

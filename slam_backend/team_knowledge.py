@@ -155,19 +155,16 @@ class TeamKnowledge(TeamState):
             min_count: Landmarks that were measured fewer times are left out.
             into: What this has returned before; it is written to, as long as it has room. None: fresh arrays.
         """
-        branches, least = self.lineup.branches, max(min_count, 1)
-        room = 0
-        for branch in branches:
-            room += branch.filter.map_room
-        if into is None or len(into.rows.ids) < room:
-            into = TeamOutlines.unwritten(self._num_robots, room)
-        (rows, parts), last = into, 0
-        for branch in branches:
+        outlines = TeamOutlines.unwritten(self._num_robots, 0) if into is None else into
+        (rows, parts), last = outlines, 0
+        for branch in self.lineup.branches:
             slam = branch.filter
-            first, last = last, write_outline(slam._maps, slam._best, least, rows, last)
+            first, last = last, write_outline(slam._maps, slam._best, min_count, rows, last)
             for robot in branch.live:
                 parts[robot, 0], parts[robot, 1] = first, last
-        return into
+        if last > len(rows.names):
+            return self.outlines(min_count, TeamOutlines.unwritten(self._num_robots, 2 * last))
+        return outlines
 
     def standpoints(self, into: Standpoints | None = None) -> Standpoints:
         """Return where all robots stand: `pose_from_start`, `start_from_group`, `pose` at once.
@@ -175,7 +172,7 @@ class TeamKnowledge(TeamState):
         Args:
             into: What this has returned before; it is written to. None: fresh arrays.
         """
-        points = Standpoints.unwritten(self._num_robots) if into is None else into
+        points = Standpoints(self._num_robots) if into is None else into
         for branch in self.lineup.branches:
             slam, report = branch.filter, branch.report
             ess = 1.0 if report is None else report.ess / slam.num_particles

@@ -69,7 +69,7 @@ class TeamBelief:
         self._confirm_after = config.confirm_after
         self._beliefs: dict[int, Belief] = {}  # of this tick, made when asked for
         self._maps: dict[int, LandmarkMap] = {}  # of this tick, by the number of the map
-        self.points = Standpoints.unwritten(num_robots)
+        self.points = Standpoints(num_robots)
         self._outlines = TeamOutlines.unwritten(num_robots, 0)  # likewise, when asked for
         self._has_outlines = False
         self._look_up_poses()

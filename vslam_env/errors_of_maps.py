@@ -116,10 +116,10 @@ class ClaimLedger:
             true_poses: (K, 3) [m, m, rad]. Likewise.
             scores: (8 or more, K) float64. Written to: the first figures of `vslam_env.standing.Standing`.
         """
-        (means, _, _, ids), parts = outlines
+        (places, names), parts = outlines
         score_team(
-            means, ids, parts, self._books, self._book_of, self.true_positions, self.cutoff, points.own, points.sigmas,
-            points.starts, true_starts, true_poses, scores,
+            places, names, parts, self._books, self._book_of, self.true_positions, self.cutoff, points.beliefs,
+            true_starts, true_poses, scores,
         )  # fmt: skip
 
     def get_state(self) -> dict[str, Any]:

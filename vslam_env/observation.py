@@ -71,9 +71,9 @@ def observed(view: View, scans: FloatArray, goal_actions: bool) -> list[Observat
     stats, ranges = np.empty((count, 6), np.float32), np.empty(scans.shape, np.float32)
     teammates, present = np.empty((count, MOST_TEAMMATES, 5), np.float32), np.empty((count, MOST_TEAMMATES), np.int8)
     pictures = np.empty((count, len(CHANNELS), SIZE, SIZE), np.uint8)
-    (means, variances, counts, _), parts = view.outlines
+    points, ((places, names), parts) = view.points, view.outlines
     observe_team(
-        view.robots, *view.points, means, variances, counts, parts, view.cells, scans,
+        view.robots, points.poses, points.beliefs, places, names, parts, view.cells, scans,
         poses, deviations, stats, ranges, candidates, teammates, present, pictures,
     )  # fmt: skip
     observations: list[Observation] = []

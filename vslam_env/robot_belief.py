@@ -188,17 +188,13 @@ class View(NamedTuple):
         """Return what an observation shows of one belief."""
         known = {mate.robot: (mate.pose, mate.position_sigma) for mate in belief.teammates}
         known[belief.robot] = belief.pose, position_sigma(belief.covariance)
-        poses, sigmas = np.full((1, max(known) + 1, 3), np.nan), np.full((1, max(known) + 1), np.nan)
+        points = Standpoints(1, max(known) + 1)
+        points.own[0], points.starts[0] = belief.pose, belief.start_from_group
+        points.covariances[0], points.ess[0] = belief.covariance, belief.ess
+        points.poses.fill(np.nan)
+        points.sigmas.fill(np.nan)
         for robot, (pose, sigma) in known.items():
-            poses[0, robot], sigmas[0, robot] = pose, sigma
-        points = Standpoints(
-            poses=poses,
-            sigmas=sigmas,
-            own=belief.pose[None].copy(),
-            covariances=belief.covariance[None].copy(),
-            starts=belief.start_from_group[None].copy(),
-            ess=np.array([belief.ess]),
-        )
+            points.poses[0, robot], points.sigmas[0, robot] = pose, sigma
         return cls(
             robots=np.array([belief.robot]),
             points=points,

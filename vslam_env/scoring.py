@@ -7,6 +7,7 @@ import numpy as np
 
 from slam_backend._jit import inlined, jit
 from slam_backend.errors import FloatArray, IntArray
+from slam_backend.standpoints import OWN, SIGMAS, START
 
 FALSE, UNCOUNTED = -1, -2  # claims of landmarks that are no true one, or one that does not matter
 PLACED = 0.5  # [m] a landmark held nearer than this is well placed
@@ -33,16 +34,15 @@ def pose_error(start: FloatArray, estimated: FloatArray, true: FloatArray) -> tu
 
 @inlined
 def _score_map(
-    means: FloatArray, ids: IntArray, book: IntArray, x0: float, y0: float, turn: float, truths: FloatArray,
+    places: FloatArray, names: IntArray, book: IntArray, x0: float, y0: float, turn: float, truths: FloatArray,
     cutoff: float, least: FloatArray,
 ) -> tuple[float, float, float, float, float]:  # fmt: skip
     """Return the scores of a robot's map, in the order of `score_team`.
 
     Args:
-        means: (n, 3) [m]. Of its landmarks.
-        ids: (n,) int64. Their names.
+        places, names: (n, 4), (n, 2) int64. Of its landmarks, as in `OutlineRows`.
         book: What the landmark of each name claims.
-        x0, y0, turn: The motion [m, m, rad] of the means to the frame of the truths.
+        x0, y0, turn: The motion [m, m, rad] of the places to the frame of the truths.
         truths: (N, 3) [m], N >= 1.
         cutoff: c of the map error [m].
         least: (N,) overwritten: the squared distance of the nearest landmark that claims each, else infinite.
@@ -50,15 +50,15 @@ def _score_map(
     least[:] = np.inf
     c, s = math.cos(turn), math.sin(turn)
     estimated = surplus = 0
-    for i in range(len(means)):
-        claim = book[ids[i]]
+    for i in range(len(places)):
+        claim = book[names[i, 1]]
         estimated += claim != UNCOUNTED
         if claim == FALSE:
             surplus += 1
         elif claim >= 0:
-            x = x0 + c * means[i, 0] - s * means[i, 1] - truths[claim, 0]
-            y = y0 + s * means[i, 0] + c * means[i, 1] - truths[claim, 1]
-            z = means[i, 2] - truths[claim, 2]
+            x = x0 + c * places[i, 0] - s * places[i, 1] - truths[claim, 0]
+            y = y0 + s * places[i, 0] + c * places[i, 1] - truths[claim, 1]
+            z = places[i, 2] - truths[claim, 2]
             surplus += least[claim] < np.inf
             least[claim] = min(least[claim], x * x + y * y + z * z)
     matched = placed = 0
@@ -79,18 +79,18 @@ def _score_map(
 
 @jit
 def score_team(
-    means: Any, ids: Any, parts: Any, books: Any, book_of: Any, truths: Any, cutoff: float, own: Any, sigmas: Any,
-    starts: Any, true_starts: Any, true_poses: Any, scores: Any,
+    places: Any, names: Any, parts: Any, books: Any, book_of: Any, truths: Any, cutoff: float, beliefs: Any,
+    true_starts: Any, true_poses: Any, scores: Any,
 ) -> None:  # fmt: skip
     """Write how wrong the robots' maps and poses are, in their own start frames and without fitting.
 
     Args:
-        means, ids, parts: (N, 3) [m], (N,), (K, 2). Of `TeamOutlines`.
+        places, names, parts: (N, 4), (N, 2) int64, (K, 2) int64. Of `TeamOutlines`.
         books: (B, n) int64. What the landmark of each name claims, map by map: a row of truths, or as above.
         book_of: (K,) int64. Which book is that of each robot's map.
         truths: (N', 3) [m], world frame. The landmarks that count, N' >= 1.
         cutoff: c of the map error [m].
-        own, sigmas, starts: (K, 3), (K, K), (K, 3). Of `Standpoints`.
+        beliefs: (K, 16 + K). Of `Standpoints`.
         true_starts, true_poses: (K, 3) [m, m, rad], world frame.
         scores: (8 or more, K) float64. Written to: per robot the map error E of the contract [m]; the RMSE [m] of the
             matched landmarks, the cutoff where nothing is matched; matched landmarks over the true ones, and over
@@ -98,14 +98,14 @@ def score_team(
             [rad]; and what the robot believes of the former, one sigma [m].
     """
     least = np.empty(len(truths))
-    for robot in range(len(starts)):
-        held = slice(parts[robot, 0], parts[robot, 1])
-        x, y, theta = starts[robot]
+    for robot in range(len(beliefs)):
+        held, belief = slice(parts[robot, 0], parts[robot, 1]), beliefs[robot]
+        x, y, theta = belief[START], belief[START + 1], belief[START + 2]
         c, s = math.cos(true_starts[robot, 2]), math.sin(true_starts[robot, 2])
         x0 = true_starts[robot, 0] + c * x - s * y
         y0 = true_starts[robot, 1] + s * x + c * y
         turn, book = true_starts[robot, 2] + theta, books[book_of[robot]]
-        of_map = _score_map(means[held], ids[held], book, x0, y0, turn, truths, cutoff, least)
+        of_map = _score_map(places[held], names[held], book, x0, y0, turn, truths, cutoff, least)
         scores[0, robot], scores[1, robot], scores[2, robot], scores[3, robot], scores[4, robot] = of_map
-        scores[5, robot], scores[6, robot] = pose_error(true_starts[robot], own[robot], true_poses[robot])
-        scores[7, robot] = sigmas[robot, robot]
+        scores[5, robot], scores[6, robot] = pose_error(true_starts[robot], belief[OWN : OWN + 3], true_poses[robot])
+        scores[7, robot] = belief[SIGMAS + robot]

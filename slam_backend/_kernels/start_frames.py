@@ -7,7 +7,8 @@ import numpy as np
 from slam_backend._jit import inlined, jit
 from slam_backend._kernels.layout import COVARIANCES, MEANS, STARTS
 from slam_backend._kernels.weights import mixture
-from slam_backend.errors import BoolArray, FloatArray, IntArray
+from slam_backend.errors import FloatArray, IntArray
+from slam_backend.standpoints import COVARIANCE, ESS, OWN, SIGMAS, START
 
 AT_ORIGIN, KNOWN, SPREAD = 0, 1, 2  # what starts of particles can be
 
@@ -85,9 +86,7 @@ def _see_own(
 @jit
 def stand(
     robots: FloatArray, weights: FloatArray, best: int, at_origin: bool, estimates: FloatArray, spreads: FloatArray,
-    names: IntArray, live: BoolArray, ess: float,
-    poses: FloatArray, sigmas: FloatArray, own_poses: FloatArray, own_spreads: FloatArray, frames: FloatArray,
-    shares: FloatArray,
+    seats: IntArray, ess: float, poses: FloatArray, beliefs: FloatArray,
 ) -> None:  # fmt: skip
     """Write where the robots of a filter stand, and where they see each other, in their own start frames.
 
@@ -100,34 +99,37 @@ def stand(
         best: The most probable particle.
         at_origin: Whether all robots started at the origin in all particles.
         estimates, spreads: (n, 3), (n, 3, 3) [m, m, rad] the robots' poses over all particles, map frame.
-        names: (n,) int64. Which robots of the team they are.
-        live: (n,) bool. Which of them go by this filter; only their rows are written.
+        seats: (2, n) int64. Which robots of the team they are, and which of them go by this filter: only these are
+            written of.
         ess: Effective sample size of the filter, as a share of M.
-        poses, sigmas, own_poses, own_spreads, frames, shares: `Standpoints` of all robots of the team; written.
+        poses, beliefs: Of the `Standpoints` of all robots of the team; written.
     """
+    count = seats.shape[1]
     starts, means = robots[STARTS], robots[MEANS]
-    covariances = robots[COVARIANCES:].reshape((len(names), 6, robots.shape[3]))
-    for i in range(len(names)):
-        if not live[i]:
+    covariances = robots[COVARIANCES:].reshape((count, 6, robots.shape[3]))
+    for i in range(count):
+        if not seats[1, i]:
             continue
-        own = names[i]
-        poses[own], sigmas[own] = np.nan, np.nan
+        own = seats[0, i]
+        seen, belief = poses[own], beliefs[own]
+        pose, frame, sigmas = belief[OWN : OWN + 3], belief[START : START + 3], belief[SIGMAS:]
+        spread = belief[COVARIANCE:SIGMAS].reshape((3, 3))
+        seen[:], sigmas[:] = np.nan, np.nan
         x, y, theta = starts[i, 0, best], starts[i, 1, best], starts[i, 2, best]
         c, s = math.cos(theta), math.sin(theta)
-        frame = frames[own]
         frame[0], frame[1] = -c * x - s * y, s * x - c * y
         frame[2] = (math.pi - theta) % (2.0 * math.pi) - math.pi
-        own_poses[own], own_spreads[own], shares[own] = estimates[i], spreads[i], ess
+        pose[:], spread[:], belief[ESS] = estimates[i], spreads[i], ess
         if not at_origin:
             kind = start_kind(starts[i], len(weights))
-            _see_own(starts[i], means[i], covariances[i], weights, best, kind, own_poses[own], own_spreads[own])
-        poses[own, own] = own_poses[own]
-        sigmas[own, own] = math.sqrt(0.5 * (own_spreads[own, 0, 0] + own_spreads[own, 1, 1]))
+            _see_own(starts[i], means[i], covariances[i], weights, best, kind, pose, spread)
+        seen[own] = pose
+        sigmas[own] = math.sqrt(0.5 * (spread[0, 0] + spread[1, 1]))
         c, s = math.cos(frame[2]), math.sin(frame[2])
-        for j in range(len(names)):
+        for j in range(count):
             if j != i:
-                pose = poses[own, names[j]]
-                pose[0] = frame[0] + c * estimates[j, 0] - s * estimates[j, 1]
-                pose[1] = frame[1] + s * estimates[j, 0] + c * estimates[j, 1]
-                pose[2] = (frame[2] + estimates[j, 2] + math.pi) % (2.0 * math.pi) - math.pi
-                sigmas[own, names[j]] = math.sqrt(0.5 * (spreads[j, 0, 0] + spreads[j, 1, 1]))
+                mate = seats[0, j]
+                seen[mate, 0] = frame[0] + c * estimates[j, 0] - s * estimates[j, 1]
+                seen[mate, 1] = frame[1] + s * estimates[j, 0] + c * estimates[j, 1]
+                seen[mate, 2] = (frame[2] + estimates[j, 2] + math.pi) % (2.0 * math.pi) - math.pi
+                sigmas[mate] = math.sqrt(0.5 * (spreads[j, 0, 0] + spreads[j, 1, 1]))

@@ -1,10 +1,12 @@
 """The compiled gather of the most probable particle's map agrees with the plain one."""
 
 import numpy as np
+import pytest
 from gappy_filter import filter_after_some_steps
 
 from slam_backend import FastSlam, Measurements
-from slam_backend._best_map import best_map
+from slam_backend._best_map import best_map, write_outline
+from slam_backend.landmark_map import OutlineRows
 
 UNPACK = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 
@@ -39,10 +41,27 @@ def test_the_gather_agrees_with_fancy_indexing() -> None:
 def test_an_outline_is_that_of_the_map() -> None:
     """It has the map's landmarks in the map's order, with the same bits, whatever the least count."""
     slam = _filter_after_some_steps()
-    for least in (1, 3, 9):
+    for least in (0, 1, 3, 9):
         for got, expected in zip(slam.outline(least), slam.map(min_count=least).outline, strict=True):
             np.testing.assert_array_equal(got, expected)
     assert len(FastSlam(num_particles=3).outline().ids) == 0
+
+
+@pytest.mark.parametrize("room", [0, 5, 9, 100])
+def test_an_outline_tells_how_much_room_it_takes(room: int) -> None:
+    """Behind rows that are taken, and where there are too few: then none but those that there are is written."""
+    slam = _filter_after_some_steps()
+    expected = slam.outline(2)
+    size = len(expected.ids)
+    assert 9 - 3 < size < 100 - 3
+    rows = OutlineRows(np.full((room, 4), -7.0), np.full((room, 2), -7))
+    assert write_outline(slam._maps, slam.best_particle, 2, rows, 3) == 3 + size
+    for got in rows:
+        assert (got[:3] == -7).all()
+        assert (got[3 + size :] == -7).all()
+    if room >= 3 + size:
+        for got, own in zip(rows.part(3, 3 + size), expected, strict=True):
+            np.testing.assert_array_equal(got, own)
 
 
 def test_a_least_count_leaves_out_what_was_seen_less() -> None:

@@ -97,11 +97,13 @@ def test_own_frames_are_the_plain_definition() -> None:
     of_four = [np.concatenate([rows, rows[:1]]) for rows in (starts, means, covariances)]
     estimates = pose_mixtures(*of_four[1:], weights)
     robots = np.concatenate([rows.reshape(-1, 4, 3, LANES) for rows in (np.zeros((4, 3, LANES)), *of_four)])
-    names, live = np.array([3, 0, 2, 4]), np.array([True, True, True, False])
-    points = Standpoints(*(np.full_like(field, 7.0) for field in Standpoints.unwritten(5)))
-    stand(robots, weights, best, False, *estimates, names, live, 0.5, *points)
+    names, live = np.array([3, 0, 2, 4]), np.array([1, 1, 1, 0])
+    points = Standpoints(5)
+    points.poses.fill(7.0)
+    points.beliefs.fill(7.0)
+    stand(robots, weights, best, False, *estimates, np.array([names, live]), 0.5, points.poses, points.beliefs)
 
-    for field in points:
+    for field in (points.poses, points.beliefs):
         assert (field[[1, 4]] == 7.0).all()
     poses, spreads, frames = points.own[names], points.covariances[names], points.starts[names[:3]]
     np.testing.assert_allclose(frames, inverse(starts[:, :, best]), atol=1e-15)

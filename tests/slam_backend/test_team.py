@@ -108,7 +108,8 @@ def test_where_robots_stand_is_told_at_once_as_one_by_one() -> None:
         assert team.standpoints(points) is points
         outlines = team.outlines(2, outlines)
         assert team.outlines(2, outlines) is outlines
-        assert_same(points, team.standpoints())
+        fresh = team.standpoints()
+        assert_same((points.poses, points.beliefs), (fresh.poses, fresh.beliefs))
         for robot in range(3):
             assert_same(team.lineup.members[robot], team.members(robot))
             assert_same(team.lineup.mates[robot], team.mates(robot))

@@ -11,10 +11,11 @@ from vslam_env.standing import NUM_FIGURES, Standing
 
 def standing_at(starts: FloatArray) -> Standpoints:
     """Return where robots with these starts (K, 3) stand: at the origin of their own frames, without doubt."""
-    points = Standpoints.unwritten(len(starts))
-    for array in points:
-        array.fill(0.0)
-    return points._replace(starts=starts)
+    points = Standpoints(len(starts))
+    points.poses.fill(0.0)
+    points.beliefs.fill(0.0)
+    points.starts[:] = starts
+    return points
 
 
 def scored(

@@ -193,7 +193,8 @@ def test_pose_errors_are_differences_of_placed_poses() -> None:
     """An estimated pose, laid at the true start, is compared with the true pose; beside it stands the own sigma."""
     rng = np.random.default_rng(4)
     starts, estimated, true = rng.uniform(-4.0, 4.0, (3, 20, 3))
-    points = standing_at(np.zeros((20, 3)))._replace(own=estimated, sigmas=rng.random((20, 20)))
+    points = standing_at(np.zeros((20, 3)))
+    points.own[:], points.sigmas[:] = estimated, rng.random((20, 20))
     ledger = ClaimLedger(20, TRUTHS, COUNTABLE, 1.0)
     outlines = TeamOutlines.joined([LandmarkMap.empty(2).outline] * 20)
     scores = scored(ledger, outlines, points, starts, true)

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from slam_backend._jit import jit
+from slam_backend.standpoints import OWN, START
 from vslam_env.navigation import CELL, FREE, GRID_SIZE, OCCUPIED, UNKNOWN
 
 SIZE = 48
@@ -15,7 +16,7 @@ REACH = 0.75 * SIZE  # [cells] more than from the robot to a corner of its pictu
 
 
 @jit
-def paint(cells: Any, pose: Any, start_from_group: Any, means: Any, local: Any) -> None:
+def paint(cells: Any, belief: Any, places: Any, local: Any) -> None:
     """Sample the seen grid at the centres of the local cells, and mark the cells that hold landmarks.
 
     Rows go from 4.8 m ahead to 4.8 m behind, columns from 4.8 m to the left to 4.8 m to the right. Each row is written
@@ -23,13 +24,12 @@ def paint(cells: Any, pose: Any, start_from_group: Any, means: Any, local: Any) 
 
     Args:
         cells: (300, 300) uint8. Of the seen grid.
-        pose: (3,) [m, m, rad], start frame. Of the robot.
-        start_from_group: (3,) [m, m, rad]. Moves the landmarks to the start frame.
-        means: (n, 3) [m]. Of the landmarks.
+        belief: (16 or more,). Of the robot, see `Standpoints`: where it is, and what moves landmarks to its frame.
+        places: (n, 4). Of the landmarks, see `OutlineRows`.
         local: (3, 48, 48) uint8. Channels free, occupied, landmarks, of cells of 0.2 m, 0 or 255. Written to.
     """
-    x, y = pose[0], pose[1]
-    c, s = math.cos(pose[2]), math.sin(pose[2])
+    x, y = belief[OWN], belief[OWN + 1]
+    c, s = math.cos(belief[OWN + 2]), math.sin(belief[OWN + 2])
     middle = 0.5 * SIZE
     flat = cells.ravel()
     low, high = REACH - 0.5 * GRID_SIZE, 0.5 * GRID_SIZE - REACH
@@ -55,10 +55,11 @@ def paint(cells: Any, pose: Any, start_from_group: Any, means: Any, local: Any) 
             free[col] = MARK if seen[col] == FREE else 0
             occupied[col] = MARK if seen[col] == OCCUPIED else 0
             landmarks[col] = 0
-    start_c, start_s = math.cos(start_from_group[2]), math.sin(start_from_group[2])
-    for k in range(len(means)):
-        dx = start_from_group[0] + start_c * means[k, 0] - start_s * means[k, 1] - x
-        dy = start_from_group[1] + start_s * means[k, 0] + start_c * means[k, 1] - y
+    start_x, start_y = belief[START], belief[START + 1]
+    start_c, start_s = math.cos(belief[START + 2]), math.sin(belief[START + 2])
+    for k in range(len(places)):
+        dx = start_x + start_c * places[k, 0] - start_s * places[k, 1] - x
+        dy = start_y + start_s * places[k, 0] + start_c * places[k, 1] - y
         row = math.floor(middle - (c * dx + s * dy) / CELL)
         col = math.floor(middle - (c * dy - s * dx) / CELL)
         if 0 <= row < SIZE and 0 <= col < SIZE:

@@ -9,8 +9,7 @@ from vslam_env._observation_kernels.pictures import paint
 
 @jit
 def observe_team(
-    robots: Any, poses: Any, sigmas: Any, own: Any, covariances: Any, starts: Any, ess: Any,
-    means: Any, variances: Any, counts: Any, parts: Any, cells: Any, scans: Any,
+    robots: Any, poses: Any, beliefs: Any, places: Any, names: Any, parts: Any, cells: Any, scans: Any,
     clipped: Any, deviations: Any, stats: Any, ranges: Any, candidates: Any, teammates: Any, present: Any,
     pictures: Any,
 ) -> None:  # fmt: skip
@@ -18,8 +17,8 @@ def observe_team(
 
     Args:
         robots: As in `View`.
-        poses, sigmas, own, covariances, starts, ess: Of its points.
-        means, variances, counts, parts: (N, 3) [m], (N,) float64 [m^2], (N,) int64, (n, 2) int64. Of its outlines.
+        poses, beliefs: (n, K, 3), (n, 16 + K). Of its points.
+        places, names, parts: (N, 4), (N, 2) int64, (n, 2) int64. Of its outlines.
         cells: Of the view.
         scans: (n, R) float64 [m].
         clipped, deviations, stats: (n, 3), (n, 3), (n, 6) float32: `pose`, `pose_std`, `map_stats`. Written to, as all
@@ -33,8 +32,8 @@ def observe_team(
     ranges[:] = scans
     for k in range(len(robots)):
         held = slice(parts[k, 0], parts[k, 1])
-        known = write_teammates(robots[k], own[k], poses[k], sigmas[k], teammates[k], present[k])
-        write_pose(own[k], covariances[k], clipped[k], deviations[k])
-        write_map_stats(variances[held], counts[held], ess[k], 1 + known, stats[k])
+        known = write_teammates(robots[k], poses[k], beliefs[k], teammates[k], present[k])
+        write_pose(beliefs[k], clipped[k], deviations[k])
+        write_map_stats(places[held], names[held], beliefs[k], 1 + known, stats[k])
         clip_candidates(candidates[k])
-        paint(cells[k], own[k], starts[k], means[held], pictures[k])
+        paint(cells[k], beliefs[k], places[held], pictures[k])
