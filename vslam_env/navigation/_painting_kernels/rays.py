@@ -10,6 +10,10 @@ from slam_backend.errors import FloatArray
 from vslam_env.navigation._painting_kernels.evidence import CELL
 from vslam_env.navigation._painting_kernels.surveys import ALONG_X, ALONG_Y, TELLING
 
+# Rays as they are seen in the frame of a grid: after the rows of a survey that turn, how far to the left a ray gets
+# from row to row [cells], left as seen by the robot that looks to these rows; how far off the rows are of which it can
+# tell [m], less than 0 if it leads away; before which cell it crosses a row.
+SLOPE, TOP, CROSSING, NUM_SEEN_ROWS = 4, 5, 6, 7
 ASIDE = 1e12  # [cells] per row: how far off a ray crosses rows that it leads away from
 
 
@@ -32,31 +36,29 @@ def good_angles(angles: FloatArray) -> bool:
 
 
 @jit
-def look_to_side(seen: Any, side: float, slopes: Any, tops: Any) -> None:
-    """Tell how rays lead to the rows above the robot, or to those below.
+def look_to_side(told: Any, side: float, seen: Any) -> None:
+    """Write how rays lead to the rows above the robot, or to those below.
 
     Args:
-        seen: (11, n + 1) float64, of `turn`.
+        told: (15, n + 1) float64, of `survey`.
         side: 1 for the rows above, -1 for those below.
-        slopes: (n,) float64. Written to: how far to the left a ray gets from row to row [cells], left as seen by the
-            robot that looks to these rows.
-        tops: (n,) float64. Written to: how far off the rows are of which it can tell [m]; less than 0 if it leads away.
+        seen: (7, n + 1) float64, of `turn`, and as described above.
     """
     aside = -ASIDE  # all cells lie to the left of what comes before the rays that lead there, none of what comes after
-    for i in range(len(slopes)):
-        slopes[i], tops[i] = aside, -1.0
-        if side * seen[ALONG_Y, i] > 0.0:
-            aside = ASIDE
-            slopes[i] = -seen[ALONG_X, i] / seen[ALONG_Y, i]
-            tops[i] = side * seen[TELLING, i] * seen[ALONG_Y, i] + 0.5 * CELL
+    for i in range(told.shape[1] - 1):
+        up = seen[ALONG_Y, i]
+        leads_there = side * up > 0.0
+        seen[SLOPE, i] = -seen[ALONG_X, i] / (up if leads_there else 1.0) if leads_there else aside
+        seen[TOP, i] = side * told[TELLING, i] * up + 0.5 * CELL if leads_there else -1.0
+        aside = ASIDE if leads_there else aside
 
 
 @inlined
-def cross_row(slopes: Any, begin: int, end: int, steps: float, beside: float, passed: Any) -> tuple[int, int]:
+def cross_row(seen: Any, begin: int, end: int, steps: float, beside: float, passed: Any) -> tuple[int, int]:
     """Tell which rays the cells of a row lie to the left of.
 
     Args:
-        slopes: (n,) float64, of `look_to_side`.
+        seen: (7, n + 1) float64, of `look_to_side`. The crossings are written to it.
         begin: The first ray that is asked about.
         end: One past the last.
         steps: How far the row is from the robot [cells].
@@ -67,11 +69,13 @@ def cross_row(slopes: Any, begin: int, end: int, steps: float, beside: float, pa
     Returns:
         The first cell to the left of the first of these rays, and the first to the left of the last one.
     """
-    passed[:] = 0
     most = float(len(passed) - 1)
+    for i in range(begin, end):  # by itself, it becomes vector instructions
+        seen[CROSSING, i] = np.ceil(min(max(beside + steps * seen[SLOPE, i], 0.0), most))
+    passed[:] = 0
     first, crossing = len(passed) - 1, 0
     for i in range(begin, end):
-        crossing = math.ceil(min(max(beside + steps * slopes[i], 0.0), most))
+        crossing = int(seen[CROSSING, i])
         passed[np.uint32(crossing)] = i + 1
         first = min(first, crossing)
     return first, crossing

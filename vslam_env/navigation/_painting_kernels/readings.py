@@ -3,8 +3,6 @@
 import math
 from typing import Any
 
-import numpy as np
-
 from slam_backend._jit import jit
 from slam_backend.errors import BoolArray, FloatArray
 from vslam_env.navigation._painting_kernels.evidence import (
@@ -18,8 +16,8 @@ from vslam_env.navigation._painting_kernels.evidence import (
     judge,
 )
 from vslam_env.navigation._painting_kernels.rays import good_ranges
-from vslam_env.navigation._painting_kernels.scans import paint_survey
-from vslam_env.navigation._painting_kernels.surveys import NUM_ROWS, survey
+from vslam_env.navigation._painting_kernels.scans import paint_survey, room_to_paint
+from vslam_env.navigation._painting_kernels.surveys import survey
 
 
 @jit
@@ -102,13 +100,13 @@ def paint_readings(
     bad = _find_bad(shared, poses, scans)
     if bad[0] >= 0:
         return bad
-    told = np.empty((NUM_ROWS, scans.shape[1] + 1))
+    told, room = room_to_paint(scans.shape[1])
     for robot in range(len(scans)):
         survey(scans[robot], directions, max_range, told)
         for owner in range(len(shared)):
             if shared[owner, robot]:
                 x, y, theta = poses[owner, robot]
-                paint_survey(evidence[owner], cells[owner], changes[owner], bounds[owner], x, y, theta, told)
+                paint_survey(evidence[owner], cells[owner], changes[owner], bounds[owner], x, y, theta, told, room)
                 paint_disc(evidence[owner], cells[owner], changes[owner], bounds[owner], x, y, radius)
                 if bumps[robot]:
                     paint_bump(evidence[owner], cells[owner], changes[owner], bounds[owner], x, y, theta, radius)

@@ -9,6 +9,7 @@ from slam_backend.errors import FloatArray
 from vslam_env.navigation._painting_kernels.evidence import (
     CELL,
     FREE,
+    GRID_SIZE,
     HALF_WIDTH,
     HIT,
     OCCUPIED,
@@ -16,7 +17,7 @@ from vslam_env.navigation._painting_kernels.evidence import (
     cell_range,
     judge,
 )
-from vslam_env.navigation._painting_kernels.rays import cross_row, look_to_side
+from vslam_env.navigation._painting_kernels.rays import NUM_SEEN_ROWS, TOP, cross_row, look_to_side
 from vslam_env.navigation._painting_kernels.surveys import (
     ALONG_X,
     ALONG_Y,
@@ -39,32 +40,39 @@ LEAST_HEIGHT = 1e-9  # [m] that a row is taken to be from the robot, so that no 
 
 
 @inlined
-def _before(seen: Any, k: Any, u: float, v: float) -> Any:
+def _before(told: Any, seen: Any, k: Any, u: float, v: float) -> Any:
     """Return how far before the surface of a pair of rays a point lies [m]."""
-    return seen[NORMAL_X, k] * u + seen[NORMAL_Y, k] * v + seen[OFFSET, k]
+    return seen[NORMAL_X, k] * u + seen[NORMAL_Y, k] * v + told[OFFSET, k]
 
 
 @jit
-def _told_at_jump(seen: Any, k: Any, u: float, v: float, change: int) -> int:
+def _told_at_jump(told: Any, seen: Any, k: Any, u: float, v: float, change: int) -> int:
     """Return the evidence for a cell between two rays at whose ends the range jumps; seen from the robot at (u, v) [m].
 
     What is free by its distance may be on a surface that goes on from beside; what is not may hold one of the hits.
     """
     right = np.int64(k) - 1
     if change < 0:
-        goes_on = min(abs(_before(seen, right, u, v)), abs(_before(seen, k + 1, u, v))) < WALL_HALF_THICKNESS
-        return 0 if goes_on else change
+        beside = min(abs(_before(told, seen, right, u, v)), abs(_before(told, seen, k + 1, u, v)))
+        return 0 if beside < WALL_HALF_THICKNESS else change
     for i in range(right, right + 2):
-        off_x = u - seen[REACH, i] * seen[ALONG_X, i]
-        off_y = v - seen[REACH, i] * seen[ALONG_Y, i]
-        if seen[IS_HIT, i] > 0.0 and max(abs(off_x), abs(off_y)) <= 0.5 * CELL:
+        off_x = u - told[REACH, i] * seen[ALONG_X, i]
+        off_y = v - told[REACH, i] * seen[ALONG_Y, i]
+        if told[IS_HIT, i] > 0.0 and max(abs(off_x), abs(off_y)) <= 0.5 * CELL:
             return HIT
     return 0
 
 
 @jit
+def room_to_paint(num_rays: int) -> Any:
+    """Return room for a survey (15, n + 1) float64, and for what `paint_survey` works in."""
+    seen, passed = np.empty((NUM_SEEN_ROWS, num_rays + 1)), np.empty(GRID_SIZE + 1, np.uint32)
+    return np.empty((NUM_ROWS, num_rays + 1)), (seen, passed)
+
+
+@jit
 def paint_survey(
-    evidence: Any, cells: Any, changes: Any, bounds: Any, x: float, y: float, theta: float, told: Any
+    evidence: Any, cells: Any, changes: Any, bounds: Any, x: float, y: float, theta: float, told: Any, room: Any
 ) -> None:
     """Write what a scan tells into a grid, visiting each cell between rays that reach its row once.
 
@@ -84,22 +92,23 @@ def paint_survey(
         x: Where the robot was [m].
         y: Likewise.
         theta: Its heading [rad].
-        told: (11, n + 1) float64, of `survey`.
+        told: (15, n + 1) float64, of `survey`.
+        room: Of `room_to_paint`.
     """
-    seen, count = np.empty(told.shape), told.shape[1] - 1
+    seen, all_passed, count = room[0], room[1], told.shape[1] - 1
     turn(told, theta, seen)
     low_x = high_x = low_y = high_y = 0.0
     for i in range(count):
-        end_x, end_y = seen[REACH, i] * seen[ALONG_X, i], seen[REACH, i] * seen[ALONG_Y, i]
+        end_x, end_y = told[REACH, i] * seen[ALONG_X, i], told[REACH, i] * seen[ALONG_Y, i]
         low_x, high_x = min(low_x, end_x), max(high_x, end_x)
         low_y, high_y = min(low_y, end_y), max(high_y, end_y)
     first_row, last_row = cell_range(y + low_y - CELL, y + high_y + CELL)
     first_col, last_col = cell_range(x + low_x - CELL, x + high_x + CELL)
     width = last_col - first_col
     own_row = int(min(max((y + HALF_WIDTH) / CELL + 0.5, float(first_row)), float(last_row)))
-    slopes, tops, passed = np.empty(count), np.empty(count), np.empty(width + 1, np.uint32)
+    passed, tops = all_passed[: width + 1], seen[TOP]
     for side in (-1, 1):
-        look_to_side(seen, float(side), slopes, tops)
+        look_to_side(told, float(side), seen)
         right = first_col if side < 0 else last_col - 1  # seen by the robot that looks to these rows
         beside = side * (right + 0.5 - (x + HALF_WIDTH) / CELL)
         first, last = 0, count - 1
@@ -112,19 +121,19 @@ def paint_survey(
             if first > last:
                 break
             begin, end = max(first - 1, 0), min(last + 2, count)
-            start, stop = cross_row(slopes, begin, end, max(side * v, LEAST_HEIGHT) / CELL, beside, passed)
+            start, stop = cross_row(seen, begin, end, max(side * v, LEAST_HEIGHT) / CELL, beside, passed)
             evidence_row, k = evidence[row], NONE_PASSED
             for j in range(start, stop):
                 k = max(k, passed[np.uint32(j)])
                 col: Any = np.uint32(right - side * j)
                 u = (col + 0.5) * CELL - HALF_WIDTH - x
-                before, change = _before(seen, k, u, v), 0
-                if (before > WALL_HALF_THICKNESS) & (u * u + v * v < seen[FREE_BELOW, k]):
+                before, change = _before(told, seen, k, u, v), 0
+                if (before > WALL_HALF_THICKNESS) & (u * u + v * v < told[FREE_BELOW, k]):
                     change = -1
-                elif before > seen[WALL_ABOVE, k]:
+                elif before > told[WALL_ABOVE, k]:
                     change = HIT
-                if seen[IS_JUMP, k] > 0.0:
-                    change = _told_at_jump(seen, k, u, v, change)
+                if told[IS_JUMP, k] > 0.0:
+                    change = _told_at_jump(told, seen, k, u, v, change)
                 old = evidence_row[col]
                 new = bounded(old + change) if change != 0 else old
                 if new != old:
@@ -147,6 +156,6 @@ def paint_scan(
     max_range: float,
 ) -> None:
     """Write one scan of `good_ranges` into a grid: `survey` and `paint_survey`."""
-    told = np.empty((NUM_ROWS, len(ranges) + 1))
+    told, room = room_to_paint(len(ranges))
     survey(ranges, directions, max_range, told)
-    paint_survey(evidence, cells, changes, bounds, x, y, theta, told)
+    paint_survey(evidence, cells, changes, bounds, x, y, theta, told, room)
