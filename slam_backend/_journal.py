@@ -7,10 +7,11 @@ from typing import NamedTuple
 import numpy as np
 
 from slam_backend._kernels import PLACED
-from slam_backend._kernels.layout import ACT, COUNT
+from slam_backend._kernels.layout import ACT, ASSOCIATED, COUNT
 from slam_backend._rejuvenation_step import RejuvenationStep
 from slam_backend.errors import FloatArray, IntArray
 from slam_backend.input_log import StepInput
+from slam_backend.reports import StepReport
 from slam_backend.run_log import RobotLog
 
 LONGEST = 32  # steps that wait
@@ -22,18 +23,19 @@ class Entry(NamedTuple):
     Attributes:
         step: Its number.
         inputs: What was read.
-        rows: Of each robot there; -1: none.
-        found: (n,) landmark that each measurement was taken for, -1 = none; only those of the robots mean anything.
-        means: (K, 3) [m, m, rad] where the robots were thought to be.
-        num_rejected: How many of their measurements were neither matched nor new.
+        report: What the filter made of it.
+        means: (K, 3) [m, m, rad] where its robots were thought to be.
     """
 
     step: int
     inputs: StepInput
-    rows: tuple[int, ...]
-    found: IntArray
+    report: StepReport
     means: FloatArray
-    num_rejected: int
+
+    @property
+    def found(self) -> IntArray:
+        """(n,) landmark that each measurement was taken for, -1 = none; only those of the robots mean anything."""
+        return np.asarray(self.report.findings.told[ASSOCIATED])
 
 
 def write_down(entries: Sequence[Entry], logs: Sequence[RobotLog], smoother: RejuvenationStep | None) -> None:
@@ -50,19 +52,22 @@ def write_down(entries: Sequence[Entry], logs: Sequence[RobotLog], smoother: Rej
 
 def _robots_of(entry: Entry) -> tuple[int, tuple[int, ...]]:
     """Return how many robots there are readings of, and whose were taken in: these make steps alike."""
-    return len(entry.inputs.turns), entry.rows
+    return len(entry.inputs.turns), entry.report.rows
 
 
 def _write_together(entries: Sequence[Entry], logs: Sequence[RobotLog], smoother: RejuvenationStep | None) -> None:
     """Do what `write_down` does for steps that are alike."""
-    numbers, inputs, rows, found_then, means_then, _ = zip(*entries, strict=True)
+    numbers, inputs, reports, means_then = zip(*entries, strict=True)
     steps = np.array(numbers)
     table = np.concatenate([read.table for read in inputs])
     moves = np.concatenate([read.moves for read in inputs])
     sightings = np.concatenate([read.sightings for read in inputs])
-    found, means = np.concatenate(found_then), np.concatenate(means_then).reshape(len(steps), -1, 3)
+    found, means = (
+        np.concatenate([entry.found for entry in entries]),
+        np.concatenate(means_then).reshape(len(steps), -1, 3),
+    )
     turns = table.reshape(len(steps), -1, 6)
-    for robot, (row, log) in enumerate(zip(rows[0], logs, strict=True)):
+    for robot, (row, log) in enumerate(zip(reports[0].rows, logs, strict=True)):
         if row >= 0:
             log.extend(row, steps, table, moves, sightings, found)
             if smoother is not None:
@@ -75,7 +80,7 @@ def _write_together(entries: Sequence[Entry], logs: Sequence[RobotLog], smoother
 def _tell_refused(smoother: RejuvenationStep, robot: int, row: int, entries: Sequence[Entry]) -> None:
     """Tell the smoother what of a robot's measurements was neither matched nor new."""
     for entry in entries:
-        if entry.num_rejected:
+        if entry.report.num_rejected:
             _, begin, end, _, named, _ = entry.inputs.turns[row]
             if not named:
                 smoother.note_refused(robot, entry.step, entry.found[begin:end], entry.inputs.descriptors[begin:end])

@@ -1,9 +1,7 @@
 """The turns of a step: what each robot did and saw goes into all particles, and what became of it into a report."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import astuple
-from functools import lru_cache
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -11,11 +9,12 @@ import numpy as np
 from slam_backend import _kernels
 from slam_backend._filter_arrays import FilterArrays
 from slam_backend._kernels import IDLE, PLACED
-from slam_backend._kernels.layout import ASSOCIATED, CREATED, NEW_SLOTS, REJECTED
-from slam_backend.errors import BoolArray, FloatArray, IntArray
+from slam_backend._kernels.layout import NEW_SLOTS
+from slam_backend.errors import FloatArray, IntArray
 from slam_backend.filter_options import FilterOptions
+from slam_backend.findings import Findings
 from slam_backend.geometry import compose
-from slam_backend.input_log import UNHEARD, StepInput
+from slam_backend.input_log import UNHEARD, Seats, StepInput
 from slam_backend.reports import StepReport
 
 if TYPE_CHECKING:
@@ -54,9 +53,7 @@ def place(arrays: FilterArrays, robot: int, exact: FloatArray) -> None:
     arrays._frame.fill(0.0)  # it is known now
 
 
-def take_turns(
-    slam: "FilterState", inputs: StepInput, rows: tuple[int, ...], told: IntArray
-) -> tuple[Summary, list[IntArray]]:
+def take_turns(slam: "FilterState", inputs: StepInput, seats: Seats, told: IntArray) -> tuple[Summary, list[IntArray]]:
     """Move all robots of a filter, match what they saw, weigh and update (Algorithm 1, l. 6-8), and sum it up.
 
     Where one did and saw nothing no random number is drawn.
@@ -64,8 +61,8 @@ def take_turns(
     Args:
         slam: Its particles and their maps are changed, its estimates written.
         inputs: What these robots, and perhaps others, read.
-        rows: Of each robot there; -1: none.
-        told: (3, n) int64, written: what becomes of the measurements.
+        seats: Of its robots there.
+        told: (3, n) int64, written: what becomes of their measurements, see `Findings`.
 
     Returns:
         What all of it came to; and slots of landmarks that turned out not to exist, to be released when nobody asks for
@@ -73,8 +70,8 @@ def take_turns(
     """
     maps = slam._maps
     active = used = 0
-    for robot, row in enumerate(rows):
-        act, begin, end, _, _, _ = inputs.turns[row] if row >= 0 else UNHEARD
+    for robot, row in seats.heard:
+        act, begin, end, _, _, _ = inputs.turns[row]
         active, used = active + (act != IDLE), used + end - begin
         if act == PLACED:
             place(slam, robot, inputs.moves[row])
@@ -84,7 +81,7 @@ def take_turns(
     found, distances = np.empty(shape, np.int32), np.empty(shape)
     step = (
         0 if slam._rejuvenation is None else slam._rejuvenation.steps + 1, slam._assumed,
-        _as_array(rows), inputs.table, inputs.moves, slam._rng.standard_normal((active, maps.num_particles, 3)),
+        seats.array, inputs.table, inputs.moves, slam._rng.standard_normal((active, maps.num_particles, 3)),
         slam._of_robots, slam._blind, slam._of_particles, slam._frame,
         maps.values, maps.counts, maps.odds, maps.table, maps.maps, maps.users,
         maps.free_rows, maps.tops, maps.descriptors, maps.heads,
@@ -92,9 +89,9 @@ def take_turns(
         found, distances, told, *slam._estimates,
     )  # fmt: skip
     if slam._existence is None:
-        return _kernels.take_turns(0, len(rows), *step), []
+        return _kernels.take_turns(0, len(seats.rows), *step), []
     deserted, best = [], slam._best
-    for robot, row in enumerate(rows):
+    for robot, row in enumerate(seats.rows):
         summary = _kernels.take_turns(robot, robot + 1, *step)
         _, begin, end, _, _, count = inputs.turns[row] if row >= 0 else UNHEARD
         if count >= 0:
@@ -105,43 +102,23 @@ def take_turns(
     return summary, deserted
 
 
-@lru_cache(maxsize=256)
-def _as_array(rows: tuple[int, ...]) -> IntArray:
-    """Return the rows of robots as kernels take them."""
-    array = np.array(rows, np.int64)
-    array.setflags(write=False)
-    return array
-
-
-def report_of(inputs: StepInput, rows: Sequence[int], told: IntArray, summary: Summary, threshold: float) -> StepReport:
+def report_of(inputs: StepInput, seats: Seats, findings: Findings, summary: Summary, threshold: float) -> StepReport:
     """Return the report of a step.
 
     Args:
         inputs: What the robots read.
-        rows: Of each robot there; -1: none.
-        told: (3, n) int64. What became of it; the report shares it.
+        seats: Of them there.
+        findings: What became of it.
         summary: Of `take_turns`.
         threshold: Particles are to be resampled where the effective sample size is not above it.
     """
     ess, _, num_created, num_new, num_matched, _, squares, judged = summary
-    associated, created, given, used = [], [], 0, 0
-    for row in rows:
-        _, begin, end, _, _, count = inputs.turns[row] if row >= 0 else UNHEARD
-        found, made = told[ASSOCIATED, begin:end], told[CREATED, begin:end]
-        if row in inputs.masks:
-            found, made = _unmasked(found, inputs.masks[row]), _unmasked(made, inputs.masks[row])
-        associated.append(found)
-        created.append(made)
+    given = used = 0
+    for _, row in seats.heard:
+        _, begin, end, _, _, count = inputs.turns[row]
         given, used = given + max(count, 0), used + end - begin
     nis = squares / judged if judged else math.nan
     return StepReport(
-        tuple(associated), tuple(created), num_created, num_new, num_matched, given - num_new - num_matched,
-        ess, nis, used > 0 and ess <= threshold,
+        findings, seats.rows, num_created, num_new, num_matched, given - num_new - num_matched, ess, nis,
+        used > 0 and ess <= threshold,
     )  # fmt: skip
-
-
-def _unmasked(used: IntArray, mask: BoolArray) -> IntArray:
-    """Return what became of all of a robot's measurements (n,), -1 for those that were not used."""
-    every: IntArray = np.full(len(mask), REJECTED)
-    every[mask] = used
-    return every

@@ -7,14 +7,14 @@ what they have read meanwhile, in order of time, and the fork is dropped.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
 from slam_backend.errors import IntArray
 from slam_backend.filter import FastSlam
-from slam_backend.input_log import InputLog, StepInput, rows_of
+from slam_backend.findings import Findings
+from slam_backend.input_log import InputLog, Seats, StepInput, seats_of
 from slam_backend.reports import StepReport
 from slam_backend.watching import Watch
 
@@ -125,45 +125,61 @@ def landmark_counts(slam: FastSlam) -> dict[int, int]:
     return dict(zip(held.ids.tolist(), held.counts.tolist(), strict=True))
 
 
-@lru_cache(maxsize=256)
-def turns_of(robots: tuple[int, ...]) -> frozenset[int]:
-    """Return in which of `TURNS` steps the filter of some robots smooths."""
-    return frozenset(robot % TURNS for robot in robots)
+class Intake(NamedTuple):
+    """How a filter takes in steps, as long as nobody joins or leaves.
+
+    Attributes:
+        robots: Whose readings it takes in.
+        seats: Of its robots; the others stand still, unseeing.
+        turns: In which of `TURNS` steps it smooths.
+    """
+
+    robots: tuple[int, ...]
+    seats: Seats
+    turns: frozenset[int]
+
+    @classmethod
+    def of(cls, branch: Branch, robots: tuple[int, ...]) -> Self:
+        """Return how a filter takes in what some of its robots read."""
+        rows = tuple(robot if robot in robots else -1 for robot in branch.robots)
+        smoothing = branch.robots if branch.split_from is None else branch.live
+        return cls(robots, seats_of(rows), frozenset(robot % TURNS for robot in smoothing))
 
 
-def take_in(branch: Branch, step: int, robots: tuple[int, ...], inputs: StepInput) -> StepReport:
-    """Let a filter take in what some of its robots read in one step; the others stand still, unseeing.
+def take_in(branch: Branch, step: int, intake: Intake, inputs: StepInput, findings: Findings) -> StepReport:
+    """Let a filter take in what some of its robots read in one step.
 
     If there is nothing to take in the filter stays as it is, bit for bit, so that a later replay finds it unchanged.
 
     Args:
         branch: Whose filter steps; its `known`, `report` and watches move on.
         step: Number of the step; the filter's logs bear it, whenever it is taken in.
-        robots: Whose readings.
+        intake: Of the branch and these robots.
         inputs: Of all robots of the team, checked by `check_step`.
+        findings: Of `inputs`; what becomes of these robots' measurements is written there.
     """
+    robots, seats, turns = intake
     for robot in robots:
         branch.known[robot] = step
     for watch in branch.watches:
         watch.steps += len(robots) == len(branch.robots) or watch.together(robots)
     if inputs.silent and inputs.silent.issuperset(robots):
-        branch.report = _silent_report(branch)
-        return branch.report
-    slam, smoothing = branch.filter, branch.robots if branch.split_from is None else branch.live
-    slam.may_smooth = step % TURNS in turns_of(smoothing)
+        branch.report = report = _silent_report(branch, seats, findings)
+        return report
+    slam = branch.filter
+    slam.may_smooth = step % TURNS in turns
     slam._steps = step
-    branch.report = report = slam._step_checked(inputs, rows_of(branch.robots, robots))
+    branch.report = report = slam._step_checked(inputs, seats, findings)
     if report.num_created:
         for watch in branch.watches:
             watch.note(branch.robots, report)
     return report
 
 
-def _silent_report(branch: Branch) -> StepReport:
+def _silent_report(branch: Branch, seats: Seats, findings: Findings) -> StepReport:
     """Return the report of a step in which nothing happened."""
-    nothing: tuple[IntArray, ...] = tuple(np.empty(0, np.int64) for _ in branch.robots)
     ess = float(branch.filter.num_particles) if branch.report is None else branch.report.ess
-    return StepReport(nothing, nothing, 0, 0, 0, 0, ess, float("nan"), False)
+    return StepReport(findings, seats.rows, 0, 0, 0, 0, ess, float("nan"), False)
 
 
 def fork(branch: Branch, live: tuple[int, ...], number: int, rng: np.random.Generator) -> Branch:
@@ -223,5 +239,6 @@ def replay(
         step = min(due.values())
         robots = tuple(sorted(robot for robot, first in due.items() if first == step))
         inputs = log.read(step)
-        done.append(ReplayedStep(step, robots, inputs, take_in(branch, step, robots, inputs)))
+        report = take_in(branch, step, Intake.of(branch, robots), inputs, Findings.none_yet(inputs))
+        done.append(ReplayedStep(step, robots, inputs, report))
     return done

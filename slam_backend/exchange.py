@@ -39,29 +39,26 @@ class ExchangeLedger:
     """
 
     def __init__(self, num_robots: int) -> None:
-        self._sent = [0] * num_robots
+        self._sent = np.zeros(num_robots, np.int64)
         self._known: dict[tuple[int, int], dict[int, int]] = {}  # (from, to) -> landmark id -> its count when last sent
 
     @property
     def bytes_sent(self) -> IntArray:
         """(K,) int64. A copy."""
-        return np.array(self._sent, np.int64)
+        return self._sent.copy()
 
-    def record_step(
-        self, robots: tuple[int, ...], live: tuple[int, ...], report: StepReport, descriptor_size: int
-    ) -> None:
+    def record_step(self, report: StepReport, descriptor_size: int) -> None:
         """Count what the robots of a joint filter broadcast in one step: pose, landmarks updated and created.
 
         Args:
-            robots: Of the filter.
-            live: Those of them that go by it and hear each other; at least two.
-            report: Of its step.
+            report: Of the step; those of its robots that were heard hear each other.
             descriptor_size: d.
         """
-        for robot, associations, created_ids in zip(robots, report.associations, report.created, strict=True):
-            if robot in live:
-                touched = num_named(associations) if report.num_rejected else len(associations)
-                created = num_named(created_ids) if report.num_created else 0
+        findings = report.findings
+        for robot in report.rows:
+            if robot >= 0:
+                touched = num_named(findings.associated(robot)) if report.num_rejected else findings.num_given(robot)
+                created = num_named(findings.created(robot)) if report.num_created else 0
                 self._sent[robot] += POSE_BYTES + touched * LANDMARK_BYTES + created * 4 * descriptor_size
 
     def record_replay(self, replayed: Sequence[ReplayedStep]) -> None:
@@ -110,5 +107,5 @@ class ExchangeLedger:
 
     def set_state(self, state: Mapping[str, Any]) -> None:
         """Take over counts that `get_state` returned."""
-        self._sent = state["bytes_sent"].tolist()
+        self._sent = state["bytes_sent"].copy()
         self._known = copy.deepcopy(state["known"])

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from slam_backend._journal import LONGEST, Entry
-from slam_backend._kernels.layout import ASSOCIATED
 from slam_backend._rejuvenation_step import RejuvenationStep
 from slam_backend._step_input import check_step
 from slam_backend._turns import BEST, LONG_UNSEEN, report_of, take_turns
@@ -23,8 +22,9 @@ from slam_backend.errors import check_array
 from slam_backend.existence import ExistenceModel
 from slam_backend.filter_knowledge import FilterKnowledge
 from slam_backend.filter_options import FilterOptions
+from slam_backend.findings import Findings
 from slam_backend.geometry import wrap_angle
-from slam_backend.input_log import StepInput
+from slam_backend.input_log import Seats, StepInput, seats_of
 from slam_backend.measurements import Measurements
 from slam_backend.motion import OdometryModel
 from slam_backend.reports import PoseEstimates, RejuvenationReport, StepReport
@@ -159,26 +159,25 @@ class FastSlam(FilterKnowledge):
         """
         count, size = self.num_robots, self.descriptor_size
         inputs = check_step(count, size, self.options.camera, odometry, measurements, identities, poses)
-        return self._step_checked(inputs, tuple(range(count)))
+        return self._step_checked(inputs, seats_of(tuple(range(count))), Findings.none_yet(inputs))
 
-    def _step_checked(self, inputs: StepInput, rows: tuple[int, ...]) -> StepReport:
+    def _step_checked(self, inputs: StepInput, seats: Seats, findings: Findings) -> StepReport:
         """Do what `step` does with readings that `check_step` returned.
 
         Args:
             inputs: What these robots, and perhaps others, read; it is not written to.
-            rows: Of each robot there; -1: it stands still, unseeing.
+            seats: Of these robots there.
+            findings: Of `inputs`; what becomes of these robots' measurements is written there.
         """
-        maps, num_robots = self._maps, len(rows)
-        told = np.empty((3, len(inputs.sightings)), np.int64)
+        maps, num_robots = self._maps, len(seats.rows)
         self._estimates = PoseEstimates(np.empty((num_robots, 3)), np.empty((num_robots, 3, 3)))
-        summary, deserted = take_turns(self, inputs, rows, told)
+        summary, deserted = take_turns(self, inputs, seats, findings.told)
         self._best = summary[BEST]
         threshold = self.options.resample_threshold * maps.num_particles * (1.0 + 1e-9)
-        report = report_of(inputs, rows, told, summary, threshold)
-        found = told[ASSOCIATED].copy()  # the report's is the caller's
+        report = report_of(inputs, seats, findings, summary, threshold)
         if len(self._journal) == LONGEST:
             self._write_down()
-        self._journal.append(Entry(self._steps, inputs, rows, found, self._estimates.means, report.num_rejected))
+        self._journal.append(Entry(self._steps, inputs, report, self._estimates.means))
         self._steps += 1
         for slots in deserted:
             maps.release(slots)

@@ -172,7 +172,7 @@ def undone(group: Group, undoing: Undoing, records: Records, epoch: int) -> list
     restored = []
     for trunk, replayed in zip(undoing.sides, undoing.replayed, strict=True):
         trunk.live, trunk.epoch = tuple(robot for robot in trunk.robots if robot in now.live), epoch
-        records.note_replay(trunk, replayed)
+        records.note_replay(trunk.number, replayed)
         restored.append(Group(trunk))
     for branch in group.branches[1:]:
         _hand_over(branch, restored, records)

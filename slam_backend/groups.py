@@ -85,7 +85,7 @@ class Group:
             for robot, last in missing(main, other).items():
                 wanted[robot] = max(last, wanted.get(robot, -1))
         done = replay(main, records.log, wanted)
-        records.note_replay(main, done)
+        records.note_replay(main.number, done)
         records.exchange.record_replay(done)
         for other in others:
             known = other.told_by(main, done)

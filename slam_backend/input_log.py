@@ -4,6 +4,8 @@ from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from slam_backend._kernels import IDLE
 from slam_backend.errors import BoolArray, Float32Array, FloatArray, IntArray
 
@@ -52,10 +54,25 @@ def _restored(*columns: Any) -> StepInput:
     return inputs
 
 
+class Seats(NamedTuple):
+    """Where the readings of a filter's K robots stand in a `StepInput`.
+
+    Attributes:
+        rows: Of each robot there; -1: it is not heard, and stands still, unseeing.
+        heard: Of each that is: which of the K robots it is, and its row.
+        array: (K,) int64. `rows`, as kernels take them; not written to.
+    """
+
+    rows: tuple[int, ...]
+    heard: tuple[tuple[int, int], ...]
+    array: IntArray
+
+
 @lru_cache(maxsize=256)
-def rows_of(robots: tuple[int, ...], given: tuple[int, ...]) -> tuple[int, ...]:
-    """Return for each of a filter's robots its row in a `StepInput`: its name if it is given, else -1."""
-    return tuple(robot if robot in given else -1 for robot in robots)
+def seats_of(rows: tuple[int, ...]) -> Seats:
+    """Return the seats in these rows."""
+    heard = tuple((robot, row) for robot, row in enumerate(rows) if row >= 0)
+    return Seats(rows, heard, np.array(rows, np.int64))
 
 
 class InputLog:

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import NamedTuple, Self
 
-from slam_backend.branches import Branch
+from slam_backend.branches import Branch, Intake
 from slam_backend.groups import Group
 
 
@@ -13,6 +13,7 @@ class Lineup(NamedTuple):
     Attributes:
         groups: The robots of each group, by ascending first robot.
         branches: Of all groups.
+        intakes: Of each, how it takes in a step.
         places: Per robot its group, the branch that it goes by, and its place in that.
         members: Per robot those whose places its filter knows, itself included, ascending.
         mates: Per robot those that go by the same filter, itself included, ascending.
@@ -25,6 +26,7 @@ class Lineup(NamedTuple):
 
     groups: tuple[tuple[int, ...], ...]
     branches: tuple[Branch, ...]
+    intakes: tuple[Intake, ...]
     places: tuple[tuple[Group, Branch, int], ...]
     members: tuple[tuple[int, ...], ...]
     mates: tuple[tuple[int, ...], ...]
@@ -44,6 +46,7 @@ class Lineup(NamedTuple):
         return cls(
             groups=tuple(group.robots for group in groups),
             branches=tuple(branch for _, branch in owned),
+            intakes=tuple(Intake.of(branch, branch.live) for _, branch in owned),
             places=places,
             members=tuple(branch.robots for _, branch, _ in places),
             mates=tuple(branch.live for _, branch, _ in places),

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend.branches import Branch, ReplayedStep
+from slam_backend.branches import ReplayedStep
 from slam_backend.exchange import ExchangeLedger
 from slam_backend.input_log import InputLog
 from slam_backend.reports import LandmarksCreated, MapCopied, MapEntry, StepReport, num_named
@@ -42,16 +42,16 @@ class Records:
         """Write down that a filter forked."""
         self.entries.append(MapCopied(source, copy))
 
-    def note_created(self, branch: Branch, robots: Sequence[int], step: int, report: StepReport) -> None:
-        """Write down which landmarks a step of a filter created."""
-        for robot, ids in zip(branch.robots, report.created, strict=True):
-            if robot in robots and num_named(ids):
-                self.entries.append(LandmarksCreated(branch.number, robot, step, ids))
+    def note_created(self, number: int, step: int, report: StepReport) -> None:
+        """Write down which landmarks a step of the filter of a map created."""
+        for robot in report.rows:
+            if robot >= 0 and num_named(ids := report.findings.created(robot)):
+                self.entries.append(LandmarksCreated(number, robot, step, ids))
 
-    def note_replay(self, branch: Branch, replayed: Sequence[ReplayedStep]) -> None:
-        """Write down which landmarks a replay created."""
+    def note_replay(self, number: int, replayed: Sequence[ReplayedStep]) -> None:
+        """Write down which landmarks a replay created in a map."""
         for done in replayed:
-            self.note_created(branch, done.robots, done.step, done.report)
+            self.note_created(number, done.step, done.report)
 
     def get_state(self) -> dict[str, Any]:
         """Return all that decides how the records go on."""

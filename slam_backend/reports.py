@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from slam_backend.errors import FloatArray, IntArray
+from slam_backend.findings import Findings
 
 if TYPE_CHECKING:
     from slam_backend.alignment import Alignment
@@ -45,10 +46,8 @@ class StepReport(NamedTuple):
     """What one step of `FastSlam` did.
 
     Attributes:
-        associations: Per robot (n_i,) int64. Id of the landmark to which the most probable particle gave each
-            measurement (the id of a new one if it made one); -1 = rejected.
-        created: Per robot (n_i,) int64. Id of the landmark that the measurement created in at least one particle; -1
-            if none did. A landmark stems from exactly one measurement.
+        findings: What became of the measurements; `associations` and `created` are cut out of it.
+        rows: Of each robot there, -1: none.
         num_created: Measurements that created a landmark in at least one particle.
         num_new: Landmarks created by the most probable particle.
         num_matched: Measurements that the most probable particle matched to landmarks it held.
@@ -60,8 +59,8 @@ class StepReport(NamedTuple):
         rejuvenation: What came of drawing particles anew from smoothed paths; None: it was not tried in this step.
     """
 
-    associations: tuple[IntArray, ...]
-    created: tuple[IntArray, ...]
+    findings: Findings
+    rows: tuple[int, ...]
     num_created: int
     num_new: int
     num_matched: int
@@ -70,6 +69,22 @@ class StepReport(NamedTuple):
     nis: float
     resampled: bool
     rejuvenation: "RejuvenationReport | None" = None
+
+    @property
+    def associations(self) -> tuple[IntArray, ...]:
+        """Per robot (n_i,) int64. Id of the landmark to which the most probable particle gave each measurement.
+
+        That is the id of a new one if it made one; -1 = rejected. Copies.
+        """
+        return tuple([self.findings.associated(row) for row in self.rows])
+
+    @property
+    def created(self) -> tuple[IntArray, ...]:
+        """Per robot (n_i,) int64. Id of the landmark that the measurement created in at least one particle.
+
+        -1 if none did. A landmark stems from exactly one measurement. Copies.
+        """
+        return tuple([self.findings.created(row) for row in self.rows])
 
 
 def num_named(ids: IntArray) -> int:
@@ -185,9 +200,7 @@ class TeamReport(NamedTuple):
 
     Attributes:
         step: Number of this step (the first is 0).
-        associations: Per robot (n_i,) int64, as in `StepReport`, ids in the robot's map BEFORE this step's merges and
-            undos.
-        created: Per robot (n_i,) int64, as in `StepReport`, ids likewise.
+        findings: What became of the measurements; `associations` and `created` are cut out of it.
         groups: The groups after this step.
         events: This step's attempts, merges and undos, in order.
         renamings: One for each merge of this step, in order; apply them after `created`.
@@ -200,8 +213,7 @@ class TeamReport(NamedTuple):
     """
 
     step: int
-    associations: tuple[IntArray, ...]
-    created: tuple[IntArray, ...]
+    findings: Findings
     groups: tuple[tuple[int, ...], ...]
     events: tuple[MergeEvent, ...]
     renamings: tuple[Renaming, ...]
@@ -209,3 +221,13 @@ class TeamReport(NamedTuple):
     entries: tuple[MapEntry, ...]
     oldest_step: int
     rejuvenations: tuple[tuple[tuple[int, ...], RejuvenationReport], ...] = ()
+
+    @property
+    def associations(self) -> tuple[IntArray, ...]:
+        """Per robot (n_i,) int64, as in `StepReport`, ids in the robot's map BEFORE this step's merges and undos."""
+        return tuple([self.findings.associated(robot) for robot in range(len(self.maps))])
+
+    @property
+    def created(self) -> tuple[IntArray, ...]:
+        """Per robot (n_i,) int64, as in `StepReport`, ids likewise."""
+        return tuple([self.findings.created(robot) for robot in range(len(self.maps))])

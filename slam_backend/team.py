@@ -10,14 +10,14 @@ their group go on with a fork of the joint filter, which is told on their return
 
 from collections.abc import Sequence
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from slam_backend._step_input import check_step
 from slam_backend.alignment import Alignment
-from slam_backend.branches import Branch, take_in
+from slam_backend.branches import take_in
 from slam_backend.contacts import check_contacts, reach
 from slam_backend.errors import FloatArray, IntArray, bad_argument
+from slam_backend.findings import Findings
 from slam_backend.group_changes import MergePlan, contradicted, merge_groups, undone
 from slam_backend.groups import Group
 from slam_backend.input_log import StepInput
@@ -29,7 +29,7 @@ from slam_backend.team_knowledge import TeamKnowledge
 from slam_backend.trying import attempt
 from slam_backend.undoing import Undoing
 
-NO_IDS: IntArray = np.empty(0, np.int64)
+Rejuvenation = tuple[tuple[int, ...], RejuvenationReport]  # of a filter: who goes by it, and what came of it
 
 
 class TeamSlam(TeamKnowledge):
@@ -86,7 +86,7 @@ class TeamSlam(TeamKnowledge):
         records.log.record(self._step, inputs)
         if contacts is not None or lineup.is_split:
             lineup = self._regrouped(networks)
-        associations, created, rejuvenations = self._advance(lineup.branches, inputs)
+        findings, rejuvenations = self._advance(lineup, inputs)
         if lineup.is_watched:
             self._doubt()
         renamings = self._attempt(networks) if self._schedule.is_due(self._step) else ()
@@ -98,8 +98,9 @@ class TeamSlam(TeamKnowledge):
         if lineup is not self._numbered:
             self._note_dropped(lineup)
         events, entries = tuple(self._events[before:]), tuple(records.entries)
-        told = tuple(associations), tuple(created), lineup.groups, events, renamings, lineup.maps, entries
-        report = TeamReport(self._step, *told, oldest, tuple(rejuvenations))
+        report = TeamReport(
+            self._step, findings, lineup.groups, events, renamings, lineup.maps, entries, oldest, rejuvenations
+        )
         records.entries.clear()
         self._step += 1
         return report
@@ -113,27 +114,19 @@ class TeamSlam(TeamKnowledge):
             self._settle()
         return self.lineup
 
-    def _advance(
-        self, branches: Sequence[Branch], inputs: StepInput
-    ) -> tuple[list[IntArray], list[IntArray], list[tuple[tuple[int, ...], RejuvenationReport]]]:
+    def _advance(self, lineup: Lineup, inputs: StepInput) -> tuple[Findings, tuple[Rejuvenation, ...]]:
         """Step all filters with what their robots have just read; return what `TeamReport` tells of it."""
-        step, records = self._step, self._records
-        associations: list[IntArray] = [NO_IDS] * self._num_robots
-        created = list(associations)
-        rejuvenations: list[tuple[tuple[int, ...], RejuvenationReport]] = []
-        for branch in branches:
-            live = branch.live
-            report = take_in(branch, step, live, inputs)
+        step, records, findings = self._step, self._records, Findings.none_yet(inputs)
+        rejuvenations: tuple[Rejuvenation, ...] = ()
+        for branch, intake in zip(lineup.branches, lineup.intakes, strict=True):
+            report = take_in(branch, step, intake, inputs, findings)
             if report.num_created:
-                records.note_created(branch, live, step, report)
-            if len(live) > 1:  # a robot that nobody hears sends nothing
-                records.exchange.record_step(branch.robots, live, report, branch.filter.descriptor_size)
+                records.note_created(branch.number, step, report)
+            if len(intake.robots) > 1:  # a robot that nobody hears sends nothing
+                records.exchange.record_step(report, branch.filter.descriptor_size)
             if report.rejuvenation is not None:
-                rejuvenations.append((live, report.rejuvenation))
-            for robot, found, made in zip(branch.robots, report.associations, report.created, strict=True):
-                if robot in live:
-                    associations[robot], created[robot] = found, made
-        return associations, created, rejuvenations
+                rejuvenations += ((intake.robots, report.rejuvenation),)
+        return findings, rejuvenations
 
     def merge(self, robot_a: int, robot_b: int, alignment: Alignment, known: bool = False) -> Renaming:
         """Merge the joint filters of two robots' groups with a given alignment, unasked whether it is right.

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from slam_backend.errors import FloatArray
+from slam_backend.findings import Findings
 from slam_backend.plain.frame import Landmark
 from slam_backend.plain.pose_belief import PoseBelief
 from slam_backend.reports import StepReport
@@ -77,8 +78,8 @@ def report_of(records: Sequence[RobotStep], best: int, weights: FloatArray, resa
     threshold = resample_threshold * len(weights) * (1.0 + 1e-9)  # rounding must not decide
     measured = any(record.measured for record in records)
     return StepReport(
-        associations=associations,
-        created=created,
+        findings=Findings.gathered(associations, created),
+        rows=tuple(range(len(records))),
         num_created=int(np.sum(started >= 0)),
         num_new=num_new,
         num_matched=len(given) - num_new - num_rejected,

@@ -3,6 +3,7 @@ from mapped_once import looks
 from simulated_team import SIZE, SimulatedTeam
 
 from slam_backend.exchange import LANDMARK_BYTES, POSE_BYTES, ExchangeLedger
+from slam_backend.findings import Findings
 from slam_backend.landmark_map import LandmarkMap
 from slam_backend.merge_options import MergeOptions
 from slam_backend.reports import StepReport
@@ -17,12 +18,12 @@ def map_of(counts: dict[int, int]) -> LandmarkMap:
     return LandmarkMap(np.zeros((n, 3)), np.tile(np.eye(3), (n, 1, 1)), looks(ids), list(counts.values()), ids)
 
 
-def report_of(associations: list[list[int]], created: list[list[int]]) -> StepReport:
-    """A report of a joint step."""
-    rows = [tuple(np.array(row, dtype=np.int64) for row in rows) for rows in (associations, created)]
-    named, made = (np.concatenate(row) >= 0 for row in rows)
-    counts = made.sum(), 0, named.sum(), (~named).sum()
-    return StepReport(rows[0], rows[1], *counts, ess=1.0, nis=3.0, resampled=False)
+def report_of(rows: tuple[int, ...], associations: list[list[int]], created: list[list[int]]) -> StepReport:
+    """A report of a joint step of the robots in some rows; what each robot's measurements became, row by row."""
+    findings = Findings.gathered(*([np.array(ids, np.int64) for ids in each] for each in (associations, created)))
+    named, made = (np.concatenate([each[row] for row in rows if row >= 0]) for each in (associations, created))
+    counts = np.sum(made >= 0), 0, np.sum(named >= 0), np.sum(named < 0)
+    return StepReport(findings, rows, *counts, ess=1.0, nis=3.0, resampled=False)
 
 
 def test_new_landmarks_are_sent_with_descriptors_and_changed_ones_without() -> None:
@@ -45,10 +46,10 @@ def test_what_one_robot_was_told_another_was_not() -> None:
 def test_members_of_a_group_send_poses_and_the_landmarks_they_touched() -> None:
     """Per step a robot sends its pose, each landmark it matched or made, and descriptors of those it made."""
     ledger = ExchangeLedger(4)
-    ledger.record_step((1, 3), (1, 3), report_of([[4, -1, 9], [2]], [[-1, -1, 9], [-1]]), 13)
+    ledger.record_step(report_of((1, 3), [[8], [4, -1, 9], [], [2]], [[8], [-1, -1, 9], [], [-1]]), 13)
     sent = np.array([0, POSE_BYTES + 2 * LANDMARK_BYTES + LOOK, 0, POSE_BYTES + LANDMARK_BYTES])
     np.testing.assert_array_equal(ledger.bytes_sent, sent)
-    ledger.record_step((1, 3), (1, 3), report_of([[4, 9], [2]], [[-1, -1], [-1]]), 13)
+    ledger.record_step(report_of((1, 3), [[8], [4, 9], [], [2]], [[8], [-1, -1], [], [-1]]), 13)
     sent += [0, POSE_BYTES + 2 * LANDMARK_BYTES, 0, POSE_BYTES + LANDMARK_BYTES]
     np.testing.assert_array_equal(ledger.bytes_sent, sent)
 
@@ -56,7 +57,7 @@ def test_members_of_a_group_send_poses_and_the_landmarks_they_touched() -> None:
 def test_a_robot_that_has_left_does_not_send() -> None:
     """The joint filter goes on with those that hear each other."""
     ledger = ExchangeLedger(3)
-    ledger.record_step((0, 1, 2), (0, 2), report_of([[4], [], [2]], [[4], [], [-1]]), 13)
+    ledger.record_step(report_of((0, -1, 2), [[4], [7], [2]], [[4], [-1], [-1]]), 13)
     assert ledger.bytes_sent.tolist() == [POSE_BYTES + LANDMARK_BYTES + LOOK, 0, POSE_BYTES + LANDMARK_BYTES]
 
 

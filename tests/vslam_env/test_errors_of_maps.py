@@ -6,6 +6,7 @@ from scored import scored, standing_at
 from small_env import MEETING, small_env, turning
 
 from slam_backend.errors import IntArray
+from slam_backend.findings import Findings
 from slam_backend.geometry import compose, inverse, transform_points, wrap_angle
 from slam_backend.landmark_map import LandmarkMap, TeamOutlines
 from slam_backend.metrics import gospa, map_error, map_rmse
@@ -27,7 +28,8 @@ def _ids(*values: int) -> IntArray:
 def _report(created: tuple[IntArray, ...], renamings: tuple[Renaming, ...] = ()) -> TeamReport:
     robots = tuple(range(len(created)))
     entries = (*(LandmarksCreated(r, r, 0, ids) for r, ids in enumerate(created) if len(ids)), *renamings)
-    return TeamReport(0, created, created, tuple((r,) for r in robots), (), renamings, robots, entries, 1)
+    findings = Findings.gathered(created, created)
+    return TeamReport(0, findings, tuple((r,) for r in robots), (), renamings, robots, entries, 1)
 
 
 def _map(means: np.ndarray, ids: IntArray) -> LandmarkMap:
@@ -110,7 +112,8 @@ def test_books_follow_their_maps() -> None:
         if len(numbers) > 4:
             entries.append(MapDropped(numbers.pop(0)))
         maps = tuple(rng.choice(numbers, 2).tolist())
-        report = TeamReport(step, (), (), ((0,), (1,)), (), (), maps, tuple(entries), step + 1)
+        findings = Findings.gathered([ids, _ids()], [ids, _ids()])
+        report = TeamReport(step, findings, ((0,), (1,)), (), (), maps, tuple(entries), step + 1)
         ledger.record(report, [true_ids, _ids()])
         if turn % 50 == 0:
             state, ledger = ledger.get_state(), ClaimLedger(2, TRUTHS, COUNTABLE, 1.0)

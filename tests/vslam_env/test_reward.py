@@ -7,6 +7,7 @@ from small_env import MEETING, small_env, turning
 
 from agents import make_policy
 from slam_backend.alignment import Alignment
+from slam_backend.findings import Findings
 from slam_backend.landmark_map import LandmarkMap, TeamOutlines
 from slam_backend.reports import LandmarksCreated, TeamReport
 from vslam_env import ExplorationEnv, vslam_v0
@@ -147,7 +148,7 @@ def test_a_map_that_is_placed_wrong_has_no_recall() -> None:
     books = ClaimLedger(1, truths, np.ones(3, np.bool_), 1.0)
     ids = np.arange(2)
     entries = (LandmarksCreated(0, 0, 0, ids),)
-    books.record(TeamReport(0, (ids,), (ids,), ((0,),), (), (), (0,), entries, 1), [ids])
+    books.record(TeamReport(0, Findings.gathered([ids], [ids]), ((0,),), (), (), (0,), entries, 1), [ids])
     held = LandmarkMap(truths[:2], np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 2)), ids=ids)
     for shift, placed in ((0.0, 2 / 3), (0.4, 2 / 3), (0.6, 0.0)):
         outlines = TeamOutlines.joined([held.outline])
