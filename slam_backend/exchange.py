@@ -17,11 +17,8 @@ import copy
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
-
 from slam_backend._kernels import MOVED, PLACED
 from slam_backend.branches import ReplayedStep
-from slam_backend.errors import IntArray
 from slam_backend.landmark_map import LandmarkMap
 from slam_backend.reports import StepReport, num_named
 
@@ -36,16 +33,14 @@ class ExchangeLedger:
 
     Args:
         num_robots: K.
+
+    Attributes:
+        sent: Bytes that each robot has sent.
     """
 
     def __init__(self, num_robots: int) -> None:
-        self._sent = np.zeros(num_robots, np.int64)
+        self.sent = [0] * num_robots
         self._known: dict[tuple[int, int], dict[int, int]] = {}  # (from, to) -> landmark id -> its count when last sent
-
-    @property
-    def bytes_sent(self) -> IntArray:
-        """(K,) int64. A copy."""
-        return self._sent.copy()
 
     def record_step(self, report: StepReport, descriptor_size: int) -> None:
         """Count what the robots of a joint filter broadcast in one step: pose, landmarks updated and created.
@@ -59,7 +54,7 @@ class ExchangeLedger:
             if robot >= 0:
                 touched = num_named(findings.associated(robot)) if report.num_rejected else findings.num_given(robot)
                 created = num_named(findings.created(robot)) if report.num_created else 0
-                self._sent[robot] += POSE_BYTES + touched * LANDMARK_BYTES + created * 4 * descriptor_size
+                self.sent[robot] += POSE_BYTES + touched * LANDMARK_BYTES + created * 4 * descriptor_size
 
     def record_replay(self, replayed: Sequence[ReplayedStep]) -> None:
         """Count the buffered readings that returning robots send."""
@@ -68,8 +63,8 @@ class ExchangeLedger:
             for robot in done.robots:
                 act, _, _, covered, _, count = done.inputs.turns[robot]
                 if act in (MOVED, PLACED):
-                    self._sent[robot] += POSE_BYTES
-                self._sent[robot] += max(count, 0) * (each + covered * COVARIANCE_BYTES)
+                    self.sent[robot] += POSE_BYTES
+                self.sent[robot] += max(count, 0) * (each + covered * COVARIANCE_BYTES)
 
     def record_return(
         self, sender: int, known: Mapping[int, int], counts: Mapping[int, int], descriptor_size: int
@@ -84,7 +79,7 @@ class ExchangeLedger:
         """
         changed = sum(1 for name, count in counts.items() if known.get(name) != count)
         new = sum(1 for name in counts if name not in known)
-        self._sent[sender] += changed * LANDMARK_BYTES + new * 4 * descriptor_size
+        self.sent[sender] += changed * LANDMARK_BYTES + new * 4 * descriptor_size
 
     def record_maps(self, robot_a: int, robot_b: int, map_a: LandmarkMap, map_b: LandmarkMap) -> None:
         """Count the maps that two groups' first robots exchange to align them."""
@@ -93,19 +88,19 @@ class ExchangeLedger:
             counts = dict(zip(landmarks.ids.tolist(), landmarks.counts.tolist(), strict=True))
             new = sum(1 for name in counts if name not in known)
             changed = sum(1 for name, count in counts.items() if known.get(name, count) != count)
-            self._sent[sender] += (new + changed) * LANDMARK_BYTES + new * 4 * landmarks.descriptors.shape[1]
+            self.sent[sender] += (new + changed) * LANDMARK_BYTES + new * 4 * landmarks.descriptors.shape[1]
             known.update(counts)
 
     def record_straightened(self, robot_a: int, robot_b: int, map_a: LandmarkMap, map_b: LandmarkMap) -> None:
         """Count the maps once more, after both were straightened: all landmarks have moved, none looks otherwise."""
         for sender, landmarks in ((robot_a, map_a), (robot_b, map_b)):
-            self._sent[sender] += len(landmarks) * LANDMARK_BYTES
+            self.sent[sender] += len(landmarks) * LANDMARK_BYTES
 
     def get_state(self) -> dict[str, Any]:
         """Return a copy of the counts."""
-        return {"bytes_sent": self.bytes_sent, "known": copy.deepcopy(self._known)}
+        return {"bytes_sent": tuple(self.sent), "known": copy.deepcopy(self._known)}
 
     def set_state(self, state: Mapping[str, Any]) -> None:
         """Take over counts that `get_state` returned."""
-        self._sent = state["bytes_sent"].copy()
+        self.sent = list(state["bytes_sent"])
         self._known = copy.deepcopy(state["known"])

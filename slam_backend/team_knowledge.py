@@ -8,6 +8,7 @@ from slam_backend._best_map import write_outline
 from slam_backend._team_state import TeamState
 from slam_backend.branches import Branch, restored_filter
 from slam_backend.errors import FloatArray, IntArray, bad_argument
+from slam_backend.exchange import ExchangeLedger
 from slam_backend.geometry import inverse
 from slam_backend.groups import Group
 from slam_backend.landmark_map import LandmarkMap, TeamOutlines
@@ -36,7 +37,12 @@ class TeamKnowledge(TeamState):
     @property
     def bytes_sent(self) -> IntArray:
         """(K,) bytes that each robot has sent; `slam_backend.exchange` says what is counted. A copy."""
-        return self._records.exchange.bytes_sent
+        return np.array(self.exchange.sent, np.int64)
+
+    @property
+    def exchange(self) -> ExchangeLedger:
+        """Counts these bytes; to be looked at."""
+        return self._records.exchange
 
     @property
     def maps(self) -> tuple[int, ...]:

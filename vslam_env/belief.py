@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend.alignment import Alignment
-from slam_backend.errors import FloatArray, IntArray, bad_argument
+from slam_backend.errors import FloatArray, bad_argument
 from slam_backend.filter_options import FilterOptions
 from slam_backend.geometry import rotate_covariances
 from slam_backend.landmark_map import LandmarkMap, TeamOutlines
@@ -90,9 +90,9 @@ class TeamBelief:
         return self._team.events
 
     @property
-    def bytes_sent(self) -> IntArray:
-        """(K,) bytes that each robot has sent."""
-        return self._team.bytes_sent
+    def bytes_sent(self) -> tuple[int, ...]:
+        """Bytes that each robot has sent."""
+        return tuple(self._team.exchange.sent)
 
     @property
     def poses(self) -> FloatArray:

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
+from operator import add
 from typing import Any
 
 import numpy as np
@@ -75,7 +76,7 @@ class Episode:
         )
 
         self.tick = 0
-        self._keep_collisions(np.zeros(config.num_robots, np.int64))
+        self._collisions: tuple[int, ...] = (0,) * config.num_robots
         self._figures = np.zeros((NUM_FIGURES, config.num_robots))  # of `Standing`; ways are added up in their row
         self._found, self._distances = self._figures[FOUND], self._figures[DISTANCES]
         self.true_path: list[FloatArray] = []
@@ -113,7 +114,7 @@ class Episode:
         simulator, noise, stream = self._simulator, self._config.odometry, self._streams["odometry"]
         before = simulator.poses
         if simulator.step(commands):
-            self._keep_collisions(self._collisions + simulator.bumped)
+            self._collisions = tuple(map(add, self._collisions, simulator.bumped.tolist()))
         self.tick += 1
         self._perceive(read_odometry(before, simulator.poses, self.setting.bias, noise, stream, self._distances))
 
@@ -127,7 +128,7 @@ class Episode:
         self.ledger.score(belief.outlines, belief.points, self.true_starts, poses, self._figures)
         coverage = self._coverage.update(belief.grids, poses, self._found)
         counts = self._collisions, belief.bytes_sent
-        return Standing(self._figures.tolist(), *counts, coverage, len(self.merge_ticks), self.tick * TICK)
+        return Standing(self._figures.tolist(), counts, coverage, len(self.merge_ticks), self.tick * TICK)
 
     # ------------------------------------------------------------------ snapshots
 
@@ -161,17 +162,11 @@ class Episode:
         self.ledger.set_state(state["ledger"])
         self._coverage.set_state(state["coverage"])
         self.tick = state["tick"]
-        collisions, self._distances[:] = state["counts"]
-        self._keep_collisions(collisions)
+        self._collisions, self._distances[:] = state["counts"]
         self.readings, self._frames = state["last"]
         self.true_path, self.estimated_path, self.merge_ticks = (list(path) for path in state["paths"])
 
     # ------------------------------------------------------------------ within
-
-    def _keep_collisions(self, collisions: IntArray) -> None:
-        """Count on from these (K,), anew with each contact: standings hold what was before, read-only."""
-        collisions.setflags(write=False)
-        self._collisions = collisions
 
     def _perceive(self, odometry: FloatArray | None) -> None:
         """Read all other sensors at the true poses, and let the robots take it in."""

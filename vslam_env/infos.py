@@ -25,8 +25,7 @@ def infos_of(
         invalid: Per robot 1 if its action was masked.
     """
     errors, rmses, recalls, precisions, _, pose_errors, heading_errors, _, _, distances = standing.figures
-    collisions, bytes_sent = standing.collisions.tolist(), standing.bytes_sent.tolist()
-    rewards = [(f"reward/{name}", paid) for name, paid in terms.items()]
+    collisions, bytes_sent = standing.counts
     infos: dict[str, dict[str, Any]] = {}
     for robot, agent in enumerate(agents):
         group = groups[robot]
@@ -46,6 +45,6 @@ def infos_of(
             "bytes_sent": bytes_sent[robot],
             "invalid_action": invalid[robot],
         }
-        for name, paid in rewards:
-            info[name] = paid[robot]
+        for name, paid in terms.items():
+            info["reward/" + name] = paid[robot]
     return infos

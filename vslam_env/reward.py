@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from slam_backend.errors import FloatArray, bad_argument, check_float
-from vslam_env.standing import DISTANCES, FOUND, MAP_ERRORS, PLACED_RECALLS, POSE_SIGMAS, Standing
+from vslam_env.standing import COLLISIONS, DISTANCES, FOUND, MAP_ERRORS, PLACED_RECALLS, POSE_SIGMAS, Standing
 
 __all__ = [
     "COSTS", "POTENTIALS", "TERMS", "RewardSpec", "RewardTerm", "Standing", "evaluate", "make_terms", "totals",
@@ -62,19 +62,24 @@ def _map_error_squared(before: Standing, after: Standing) -> list[float]:
 
 
 def _team_map_error(before: Standing, after: Standing) -> list[float]:
-    return [float(before.map_errors.mean() - after.map_errors.mean())] * len(after.collisions)
+    return _to_each(float(before.map_errors.mean() - after.map_errors.mean()), after)
 
 
 def _coverage(before: Standing, after: Standing) -> list[float]:
-    return [after.coverage - before.coverage] * len(after.collisions)
+    return _to_each(after.coverage - before.coverage, after)
 
 
 def _collisions(before: Standing, after: Standing) -> list[float]:
-    return [float(gain) for gain in (before.collisions - after.collisions).tolist()]
+    return list(map(float, map(sub, before.counts[COLLISIONS], after.counts[COLLISIONS])))
 
 
 def _time(before: Standing, after: Standing) -> list[float]:
-    return [before.time - after.time] * len(after.collisions)
+    return _to_each(before.time - after.time, after)
+
+
+def _to_each(gain: float, after: Standing) -> list[float]:
+    """Return what all robots gain alike, robot by robot."""
+    return [gain] * len(after.figures[MAP_ERRORS])
 
 
 # Potentials telescope: what an episode pays in all is where it ends minus where it began, so that nothing is gained by
@@ -142,20 +147,19 @@ def evaluate(
     Raises:
         ValueError: If a term of one's own returns anything but one finite number for each robot.
     """
-    robots = len(after.collisions)
     rewards = {}
     for term in terms:
-        paid = term(before, after) if isinstance(term, _NamedTerm) else _own(term, before, after, robots)
+        paid = term(before, after) if isinstance(term, _NamedTerm) else _own(term, before, after)
         if shared:
-            paid = [float(np.mean(paid))] * robots
+            paid = _to_each(float(np.mean(paid)), after)
         rewards[term.name] = list(map(mul, repeat(float(term.weight)), paid))
     return rewards
 
 
-def _own(term: RewardTerm, before: Standing, after: Standing, robots: int) -> list[float]:
+def _own(term: RewardTerm, before: Standing, after: Standing) -> list[float]:
     """Return what a term of one's own pays for a step, or raise unless that is a finite number for each robot."""
     given = term(before, after)
-    paid = _floats(given)
+    paid, robots = _floats(given), len(after.figures[MAP_ERRORS])
     if len(paid) != robots or not all(map(math.isfinite, paid)):
         cure = "Return one number for each robot."
         raise bad_argument(f"reward term {term.name!r}", f"{robots} finite numbers", given, cure)

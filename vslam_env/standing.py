@@ -9,25 +9,23 @@ from slam_backend.errors import FloatArray, IntArray
 
 NUM_FIGURES = 10
 MAP_ERRORS, PLACED_RECALLS, POSE_SIGMAS, FOUND, DISTANCES = 0, 4, 7, 8, 9  # some rows of figures
+COLLISIONS, BYTES_SENT = 0, 1  # rows of counts
 
 
 class Standing(NamedTuple):
     """How the team stands.
 
     Attributes:
-        figures: (10, K). What the properties return, row by row in their order; first those of
+        figures: (10, K). What the first properties return, row by row in their order; first those of
             `vslam_env.scoring.score_team`.
-        collisions: (K,) int64. Ticks since the reset in which each robot was kept from moving as commanded. Never
-            written to, so that standings share it.
-        bytes_sent: (K,) int64. Since the reset.
+        counts: (2, K). What `collisions` and `bytes_sent` return.
         coverage: Share of the free floor that the team has seen.
         merges: Since the reset.
         time: Since the reset [s].
     """
 
     figures: Sequence[Sequence[float]]
-    collisions: IntArray
-    bytes_sent: IntArray
+    counts: tuple[tuple[int, ...], tuple[int, ...]]
     coverage: float
     merges: int
     time: float
@@ -81,3 +79,13 @@ class Standing(NamedTuple):
     def distances(self) -> FloatArray:
         """(K,) float64 [m]. Way that each has gone since the reset."""
         return np.array(self.figures[DISTANCES])
+
+    @property
+    def collisions(self) -> IntArray:
+        """(K,) int64. Ticks since the reset in which each robot was kept from moving as commanded."""
+        return np.array(self.counts[COLLISIONS], np.int64)
+
+    @property
+    def bytes_sent(self) -> IntArray:
+        """(K,) int64. Since the reset."""
+        return np.array(self.counts[BYTES_SENT], np.int64)

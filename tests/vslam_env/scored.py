@@ -23,6 +23,6 @@ def scored(
 ) -> Standing:
     """Return how a team stands of which nothing else is known."""
     robots = len(true_poses)
-    figures, nothing = np.full((NUM_FIGURES, robots), np.nan), np.zeros(robots, np.int64)
+    figures, nothing = np.full((NUM_FIGURES, robots), np.nan), (0,) * robots
     ledger.score(outlines, points, true_starts, true_poses, figures)
-    return Standing(figures.tolist(), nothing, nothing, 0.0, 0, 0.0)
+    return Standing(figures.tolist(), (nothing, nothing), 0.0, 0, 0.0)

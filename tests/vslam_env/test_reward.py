@@ -32,8 +32,7 @@ FIGURES: dict[str, list[float]] = {  # in the order of their rows
 def _standing(coverage: float = 0.25, collisions: tuple[int, int] = (0, 3), time: float = 3.0, **rows: Any) -> Standing:
     return Standing(
         figures=[*(FIGURES | rows).values()],
-        collisions=np.array(collisions),
-        bytes_sent=np.zeros(2, np.int64),
+        counts=(collisions, (7, 8)),
         coverage=coverage,
         merges=0,
         time=time,
@@ -45,6 +44,8 @@ def test_figures_go_by_their_names() -> None:
     standing = _standing()
     for name, figures in FIGURES.items():
         assert getattr(standing, name).tolist() == figures
+    assert (standing.collisions.tolist(), standing.bytes_sent.tolist()) == ([0, 3], [7, 8])
+    assert standing.collisions.dtype == standing.bytes_sent.dtype == np.int64
 
 
 def _rewards(env: ExplorationEnv, actions: dict[str, Any]) -> tuple[dict[str, float], dict[str, dict[str, Any]]]:
