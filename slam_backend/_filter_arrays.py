@@ -3,7 +3,7 @@
 import numpy as np
 
 from slam_backend._kernels.layout import COVARIANCES, LOG_WEIGHTS, MEANS, PATH_LOG_WEIGHTS, POSES, STARTS, WEIGHTS
-from slam_backend._map_store import aligned
+from slam_backend._map_store import aligned_zeros
 from slam_backend.errors import BoolArray, FloatArray
 
 
@@ -24,8 +24,8 @@ class FilterArrays:
     def _make_arrays(self, num_robots: int, num_particles: int, padded: int) -> None:
         """Begin with all robots at the origin and equal weights."""
         self.num_particles = num_particles
-        self._of_robots: FloatArray = aligned((5, num_robots, 3, padded), np.float64)
-        self._of_particles: FloatArray = aligned((4, padded), np.float64)
+        self._of_robots: FloatArray = aligned_zeros((5, num_robots, 3, padded), np.float64)
+        self._of_particles: FloatArray = aligned_zeros((4, padded), np.float64)
         self._log_weights[:] = -np.log(num_particles)
         self._weights[:] = 1.0 / num_particles
         self._blind: BoolArray = np.zeros(num_robots, dtype=np.bool_)

@@ -121,7 +121,7 @@ def join(
         extra: Added to all variances of either side first [m^2].
         scale: Factor on all covariances then [-].
         lanes: Particles in a block.
-        tiles: (>= n, blocks, 9, lanes), of which the first n are written.
+        tiles: (>= n, blocks, 9, lanes), of which the first n are written; zeros where a particle holds neither.
 
     Returns:
         Whether all went well: not if two estimates are exact along one direction.
@@ -132,9 +132,10 @@ def join(
         j, k = rows_a[i], rows_b[i]
         for block in range(tiles.shape[1]):
             tile, first = tiles[i, block], block * lanes
-            for lane in range(min(lanes, len(motion) - first)):
+            for lane in range(lanes):
                 p = first + lane
-                in_a, in_b = j >= 0 and times_a[j, p] > 0, k >= 0 and times_b[k, p] > 0
+                there = p < len(motion)
+                in_a, in_b = there and j >= 0 and times_a[j, p] > 0, there and k >= 0 and times_b[k, p] > 0
                 if in_b:
                     _widened(values_b, where_b[k, p], lanes, extra, scale, two)
                     _move(two, motion[p, 0], motion[p, 1], cos[p], sin[p])

@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from slam_backend._kernels import PLACED
-from slam_backend._kernels.layout import ACT, ASSOCIATED, COUNT
+from slam_backend._kernels.layout import ASSOCIATED
+from slam_backend._log_kernels import write_guesses
 from slam_backend._rejuvenation_step import RejuvenationStep
 from slam_backend.errors import FloatArray, IntArray
 from slam_backend.input_log import StepInput
@@ -62,18 +62,14 @@ def _write_together(entries: Sequence[Entry], logs: Sequence[RobotLog], smoother
     table = np.concatenate([read.table for read in inputs])
     moves = np.concatenate([read.moves for read in inputs])
     sightings = np.concatenate([read.sightings for read in inputs])
-    found, means = (
-        np.concatenate([entry.found for entry in entries]),
-        np.concatenate(means_then).reshape(len(steps), -1, 3),
-    )
-    turns = table.reshape(len(steps), -1, 6)
+    found, means = np.concatenate([entry.found for entry in entries]), np.concatenate(means_then)
     for robot, (row, log) in enumerate(zip(reports[0].rows, logs, strict=True)):
         if row >= 0:
             log.extend(row, steps, table, moves, sightings, found)
             if smoother is not None:
-                acts = turns[:, row, ACT]
-                (heard,) = (acts | (turns[:, row, COUNT] > 0)).nonzero()
-                smoother.note(robot, steps[heard], means[heard, robot], PLACED in acts.tolist())
+                heard, poses = np.empty_like(steps), np.empty((len(steps), 3))
+                count, is_placed = write_guesses(row, robot, steps, table, means, heard, poses)
+                smoother.note(robot, heard[:count], poses[:count], is_placed)
                 _tell_refused(smoother, robot, row, entries)
 
 

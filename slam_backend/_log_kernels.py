@@ -52,3 +52,29 @@ def write_rows(
             starts[t] = n
         base += table[(k + 1) * count - 1, END]
     return len(numbers), t, n
+
+
+@jit
+def write_guesses(
+    row: int, robot: int, numbers: IntArray, table: IntArray, means: FloatArray, steps: IntArray, poses: FloatArray
+) -> tuple[int, bool]:
+    """Write in which steps one of N robots did or measured anything, and where it was thought to be then.
+
+    Args:
+        row: Which robot.
+        robot: Which of the filter's K.
+        numbers, table: As of `write_rows`.
+        means: (T K, 3) [m, m, rad] poses after all steps, map frame.
+        steps, poses: (T,), (T, 3), results, of which the first rows are written.
+
+    Returns:
+        How many steps there are, and whether it was told where it is in any.
+    """
+    count, of_filter, num, is_placed = len(table) // len(numbers), len(means) // len(numbers), 0, False
+    for k in range(len(numbers)):
+        turn = table[k * count + row]
+        if turn[ACT] != IDLE or turn[COUNT] > 0:
+            steps[num], poses[num] = numbers[k], means[k * of_filter + robot]
+            is_placed |= turn[ACT] == PLACED
+            num += 1
+    return num, is_placed

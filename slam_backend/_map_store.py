@@ -15,12 +15,19 @@ LINE = 64  # [bytes]; vectors that straddle cache lines are slow
 
 
 def aligned(shape: tuple[int, ...], dtype: Any) -> Any:
-    """Return zeros of a shape and a numpy type that start at a cache line."""
+    """Return an array of a shape and a numpy type, yet to be written, that starts at a cache line."""
     kind = np.dtype(dtype)
     size = math.prod(shape) * kind.itemsize
-    raw = np.zeros(size + LINE, dtype=np.uint8)
+    raw = np.empty(size + LINE, dtype=np.uint8)
     start = -raw.ctypes.data % LINE
     return raw[start : start + size].view(kind).reshape(shape)
+
+
+def aligned_zeros(shape: tuple[int, ...], dtype: Any) -> Any:
+    """Return zeros of a shape and a numpy type that start at a cache line."""
+    array = aligned(shape, dtype)
+    array.fill(0)
+    return array
 
 
 def _num_heads(descriptor_size: int) -> int:
@@ -140,6 +147,8 @@ class MapStore:
     def _begin(self, new: int, descriptor_size: int) -> None:
         """Begin with `new` landmarks in the lowest slots and rows, yet to be written; arrays with room are used again.
 
+        New ones have room for half as many landmarks more: the first to come shall not move all.
+
         Args:
             new: How many.
             descriptor_size: d.
@@ -147,7 +156,8 @@ class MapStore:
         if min(len(self.ids), len(self.counts)) < new or self.descriptors.shape[1] != descriptor_size:
             self._clear(self.num_particles)
             if new or descriptor_size:
-                self.make_room(max(new, 1), descriptor_size)
+                self._grow_slots(max(64, new), descriptor_size)
+                self._grow_rows(max(64, new + new // 2 + 1))
         slots, rows = len(self.ids), len(self.counts)
         self.row_of[:new], self.map_of[:new] = np.arange(new), 0
         self.ids[new:] = self.identities[new:] = -1
@@ -161,7 +171,7 @@ class MapStore:
         old = len(self.ids)
         table = np.zeros((len(self.table), old + extra), dtype=np.int64)
         table[:, :old], table[IDS, old:], table[IDENTITIES, old:] = self.table, -1, -1
-        descriptors = aligned((old + extra, descriptor_size), np.float32)
+        descriptors = aligned_zeros((old + extra, descriptor_size), np.float32)
         if old and self.descriptors.shape[1]:
             descriptors[:old] = self.descriptors
         self.descriptors = descriptors
@@ -171,7 +181,7 @@ class MapStore:
             heads[:, :old] = self.heads
         self.heads = heads
         if self.log_odds_prior is not None:
-            odds = aligned((old + extra, self.padded), np.float64)
+            odds = aligned_zeros((old + extra, self.padded), np.float64)
             odds[:old] = self.odds
             self.odds = odds
         top = int(self.tops[1])
@@ -182,7 +192,7 @@ class MapStore:
         self.tops[1] = extra + top
 
     def _grow_rows(self, extra: int) -> None:
-        """Provide so many more rows."""
+        """Provide so many more rows, written as a whole when they are taken."""
         old, padded = len(self.counts), self.padded
         values = aligned(((old + extra) * 9 * padded,), np.float64)
         values[: len(self.values)] = self.values
@@ -190,7 +200,7 @@ class MapStore:
         counts[:old] = self.counts
         self.values, self.counts = values, counts
         top = int(self.tops[0])
-        free = np.zeros(old + extra, dtype=np.int64)
+        free = np.empty(old + extra, dtype=np.int64)
         free[:extra] = np.arange(old + extra - 1, old - 1, -1)
         free[extra : extra + top] = self.free_rows[:top]
         self.free_rows = free

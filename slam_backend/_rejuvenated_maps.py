@@ -8,7 +8,7 @@ from slam_backend._particle_maps import ParticleMaps
 from slam_backend.errors import FloatArray, IntArray
 from slam_backend.smoothing.rejuvenation import Particles
 
-NONE = -1  # no landmark is called so
+NONE = -1
 XX, YY, ZZ = 3, 6, 8  # the diagonal of a landmark's covariance, in the rows of a tile
 
 
@@ -26,10 +26,10 @@ def write_maps(maps: ParticleMaps, best: int, particles: Particles, walk: float)
         walk: Variance [m^2] along each axis, see `FilterOptions.landmark_walk`.
     """
     slots = slots_held(maps, best, 1)
-    order = np.argsort(particles.ids)
-    at = particles.ids.searchsorted(maps.ids[slots], sorter=order)
-    supported = np.append(particles.ids[order], NONE)[at] == maps.ids[slots]
-    slots, rows = slots[supported], order[at[supported]]
+    rows = np.empty_like(slots)
+    find_rows(maps.ids[slots], particles.ids, particles.ids.argsort(), rows)
+    supported = rows != NONE
+    slots, rows = slots[supported], rows[supported]
     odds = maps.dense_odds(slots)
     if odds is not None:
         held = maps.dense(slots)[1] > 0
@@ -40,6 +40,22 @@ def write_maps(maps: ParticleMaps, best: int, particles: Particles, walk: float)
         odds, maps.last_seen[slots],
     )  # fmt: skip
     write_tiles(particles.tiles, rows, walk, maps.blocks)
+
+
+@jit
+def find_rows(names: IntArray, ids: IntArray, order: IntArray, rows: IntArray) -> None:
+    """Write where the landmarks of some names lie among others.
+
+    Args:
+        names: (n,) ascending.
+        ids, order: (l,), of the others, and their rows by ascending id.
+        rows: (n,), result, `NONE` where there is none of that name.
+    """
+    at = 0
+    for n in range(len(names)):
+        while at < len(order) and ids[order[at]] < names[n]:
+            at += 1
+        rows[n] = order[at] if at < len(order) and ids[order[at]] == names[n] else NONE
 
 
 @jit

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from slam_backend._jit import jit
 from slam_backend.errors import FloatArray, check_float
 from slam_backend.geometry import compose
 
@@ -55,11 +56,9 @@ class OdometryModel:
 
     def variances(self, odometry: FloatArray) -> FloatArray:
         """Return the variances (n, 3) [m^2, m^2, rad^2] of n odometry readings (n, 3), previous robot frames."""
-        squares = odometry[:, 0] ** 2 + odometry[:, 1] ** 2
         result = np.empty((len(odometry), 3))
-        result[:, 0] = self.sigma_along**2 * squares + self.floor_position**2
-        result[:, 1] = self.sigma_across**2 * squares + self.floor_position**2
-        result[:, 2] = self.sigma_heading**2 * squares + (self.sigma_turn * odometry[:, 2]) ** 2 + self.floor_heading**2
+        grown = self.sigma_along**2, self.sigma_across**2, self.sigma_heading**2
+        _write_variances(odometry, *grown, self.sigma_turn, self.floor_position**2, self.floor_heading**2, result)
         return result
 
     def sample(self, poses: FloatArray, odometry: FloatArray, rng: np.random.Generator) -> FloatArray:
@@ -75,3 +74,17 @@ class OdometryModel:
         """
         noise = rng.standard_normal((len(poses), 3)) * self.sigmas(odometry)
         return compose(poses, odometry + noise)  # Eq. 4
+
+
+@jit
+def _write_variances(
+    odometry: FloatArray, along: float, across: float, heading: float, sigma_turn: float, floor_position: float,
+    floor_heading: float, result: FloatArray,
+) -> None:  # fmt: skip
+    """Write the variances (n, 3) of readings (n, 3); all but the sigma of turns are squares of what the model has."""
+    for n in range(len(odometry)):
+        dx, dy, turn = odometry[n, 0], odometry[n, 1], sigma_turn * odometry[n, 2]
+        square = dx * dx + dy * dy
+        result[n, 0] = along * square + floor_position
+        result[n, 1] = across * square + floor_position
+        result[n, 2] = heading * square + turn * turn + floor_heading

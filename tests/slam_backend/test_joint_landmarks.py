@@ -53,14 +53,14 @@ def test_the_join_agrees_with_matrices(sizes: tuple[int, int]) -> None:
     rows_b[[1, 2, 3, 4, -2, -1]] = [5, 0, 1, 4, 2, 3]
     motion = rng.uniform(-2.0, 2.0, (40, 3))
     before = [side.get_state() for side in maps]
-    tiles = np.zeros((len(rows_a) + 1, 1, 9, LANES))
+    tiles = np.full((len(rows_a) + 1, 1, 9, LANES), np.nan)
     write_joint(a, b, rows_a, rows_b, motion, EXTRA, SCALE, tiles)
     plain, plain_counts = plain_join(a, b, rows_a, rows_b, motion)
     found = tiles[:-1].transpose(0, 1, 3, 2).reshape(len(rows_a), -1, 9)
     np.testing.assert_array_equal(joint_counts(a, b, rows_a, rows_b), plain_counts)
     np.testing.assert_allclose(found[:, :40], plain, rtol=1e-9, atol=1e-12)
     assert not found[:, 40:].any()
-    assert not tiles[-1].any()
+    assert np.isnan(tiles[-1]).all()
     both = (a.counts[[1, 2, 3, 4]] > 0) & (b.counts[[5, 0, 1, 4]] > 0)
     assert both.any()
     for side, state in zip(maps, before, strict=True):

@@ -1,3 +1,5 @@
+from typing import Any
+
 import numpy as np
 import pytest
 from filter_contents import arrays_of, contents
@@ -20,6 +22,7 @@ from mapped_once import (
 )
 from same_bits import assert_same
 
+from slam_backend import _map_store
 from slam_backend._packed import UNPACK
 from slam_backend.alignment import Alignment
 from slam_backend.errors import IntArray
@@ -249,6 +252,30 @@ def test_the_same_stream_gives_the_same_merge() -> None:
         a, b = both()
         results.append(merge_filters(a, b, known_alignment(), PAIRS, np.random.default_rng(5))[0])
     assert_same(contents(results[0]), contents(results[1]))
+
+
+def test_what_lay_in_the_memory_of_new_rows_is_never_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rows are made without being written: whatever was there, a run and a merge come to the same bits."""
+    states, make = [], _map_store.aligned
+    for byte in (0, 255):  # 0.0, or NaN and -1
+
+        def filled(*kind: Any, byte: int = byte) -> Any:
+            array = make(*kind)
+            array.view(np.uint8).fill(byte)
+            return array
+
+        monkeypatch.setattr(_map_store, "aligned", filled)
+        a, b = both()
+        joint = merge_filters(a, b, known_alignment(), PAIRS, np.random.default_rng(5))[0]
+        merged = joint.get_state()
+        for _ in range(3):
+            joint.step([MOVE, MOVE], [new_frame(), new_frame()])
+            joint._resample()
+        joint.rejuvenate()
+        joint._maps.make_room(len(joint._maps.ids), joint.descriptor_size)
+        joint.step([MOVE, None], [new_frame(), None])
+        states.append([a.get_state(), b.get_state(), merged, joint.get_state()])
+    assert_same(*states)
 
 
 def parents_of(joint: FastSlam, robot: int, slam: FastSlam) -> IntArray:

@@ -12,6 +12,7 @@ from same_bits import assert_same
 
 from slam_backend._kernels import IDLE, MOVED, PLACED
 from slam_backend._kernels import STOOD as STOOD_STILL
+from slam_backend._log_kernels import write_guesses
 from slam_backend.log_arrays import EXACT, ODOMETRY, STOOD
 from slam_backend.run_log import MEASUREMENTS, ROWS, RobotLog
 
@@ -232,6 +233,23 @@ def test_steps_of_a_table_are_as_one_by_one(most: int, optional: float, together
     with pytest.raises(ValueError, match="Log steps in order"):
         log.extend(row, steps, table, np.array(moves), np.concatenate(sightings), ids[:last])
     assert_same(log.get_state(), expected.get_state())
+
+
+def test_guesses_are_of_the_steps_in_which_a_robot_did_or_measured_anything() -> None:
+    """One row for each of these, of one robot of the table and another number in the filter; whether it was told."""
+    count, size, num_steps, rng = 3, 2, 40, np.random.default_rng(8)
+    numbers, means = np.arange(7, 7 + num_steps), rng.normal(size=(num_steps * size, 3))
+    for row, acts in ((0, [IDLE, MOVED]), (2, [IDLE, STOOD_STILL, PLACED])):
+        table = np.zeros((num_steps * count, 6), np.int64)
+        table[:, 0], table[:, 5] = rng.choice(acts, len(table)), rng.integers(-1, 2, len(table))
+        turns = table.reshape(num_steps, count, 6)[:, row]
+        kept = [t for t, turn in enumerate(turns) if turn[0] != IDLE or turn[5] > 0]
+        assert 0 < len(kept) < num_steps
+        steps, poses = np.empty(num_steps, np.int64), np.empty((num_steps, 3))
+        num, is_placed = write_guesses(row, 1, numbers, table, means, steps, poses)
+        np.testing.assert_array_equal(steps[:num], numbers[kept])
+        np.testing.assert_array_equal(poses[:num], means[1::size][kept])
+        assert is_placed == (PLACED in acts)
 
 
 def test_memory_of_a_long_run() -> None:
