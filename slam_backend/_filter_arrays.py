@@ -4,7 +4,7 @@ import numpy as np
 
 from slam_backend._kernels.layout import COVARIANCES, LOG_WEIGHTS, MEANS, PATH_LOG_WEIGHTS, POSES, STARTS, WEIGHTS
 from slam_backend._map_store import aligned_zeros
-from slam_backend.errors import BoolArray, FloatArray
+from slam_backend.errors import FloatArray, Int32Array, IntArray
 
 
 class FilterArrays:
@@ -16,9 +16,11 @@ class FilterArrays:
         num_particles: M.
         _of_robots: (5, K, 3, P) float64. `_poses`, `_starts`, `_means`, and in the last two `_covariances`.
         _of_particles: (4, P) float64. `_log_weights`, `_path_log_weights`, `_weights`, and what a step adds to them.
-        _blind: (K,) bool. Whether N(x^, P^) was propagated since the last sighting.
+        _blind: (K,) int64. 1 where N(x^, P^) was propagated since the last sighting, else 0.
         _frame: (3, 3) float64 [m, m, rad]. Covariance of a motion of the whole map that the particles do not show, as
             their frame was held when they were drawn anew; estimates have their share of it.
+        _found, _distances: (n, P) int32, float64. Room for what is made of measurements within a step, see
+            `update_fastslam2`.
     """
 
     def _make_arrays(self, num_robots: int, num_particles: int, padded: int) -> None:
@@ -28,8 +30,16 @@ class FilterArrays:
         self._of_particles: FloatArray = aligned_zeros((4, padded), np.float64)
         self._log_weights[:] = -np.log(num_particles)
         self._weights[:] = 1.0 / num_particles
-        self._blind: BoolArray = np.zeros(num_robots, dtype=np.bool_)
+        self._blind: IntArray = np.zeros(num_robots, np.int64)
         self._frame: FloatArray = np.zeros((3, 3))
+        self._found: Int32Array = np.empty((0, padded), np.int32)
+        self._distances: FloatArray = np.empty((0, padded))
+
+    def _make_room_for(self, count: int) -> None:
+        """See to it that there is room for what is made of so many measurements."""
+        if len(self._found) < count:
+            shape = 2 * count, self._found.shape[1]
+            self._found, self._distances = np.empty(shape, np.int32), np.empty(shape)
 
     @property
     def num_robots(self) -> int:

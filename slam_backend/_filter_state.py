@@ -36,7 +36,7 @@ class FilterState(FilterArrays):
         _from_origin: Whether all robots started at the origin, as in a filter that was never merged.
         _best: Index of the largest weight along paths.
         _maps: The landmarks of all particles.
-        _estimates: The poses of all robots over all particles, as of the last step; never written to afterwards.
+        _estimates: The poses of all robots over all particles; written to in each step.
         _journal: What the last steps came to that the logs do not hold yet.
         _steps: Number of the next step.
         _rng: The filter's own random stream.
@@ -106,11 +106,11 @@ class FilterState(FilterArrays):
         self._means[:] = self._poses
         self._covariances.fill(0.0)
         self._frame[:] = new.frame
-        self._blind.fill(False)
+        self._blind.fill(0)
         self._log_weights[:], self._path_log_weights[:] = new.log_weights, new.log_densities
         self._look_at_weights()
         self._weights[:] = np.exp(new.log_weights)
-        self._estimates = PoseEstimates(new.means, new.covariances)
+        self._estimates.means[:], self._estimates.covariances[:] = new.means, new.covariances
 
     def reorder(self, order: IntArray) -> None:
         """Renumber the robots: robot i becomes the one that was `order[i]`; (K,) a permutation."""

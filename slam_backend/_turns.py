@@ -1,33 +1,28 @@
-"""The turns of a step: what each robot did and saw goes into all particles, and what became of it into a report."""
+"""The turns of a step: what each robot did and saw goes into all particles, and what became of it is summed up."""
 
-import math
 from dataclasses import astuple
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from slam_backend import _kernels
 from slam_backend._filter_arrays import FilterArrays
 from slam_backend._kernels import IDLE, PLACED
-from slam_backend._kernels.layout import NEW_SLOTS
+from slam_backend._kernels.layout import CREATED
 from slam_backend.errors import FloatArray, IntArray
 from slam_backend.filter_options import FilterOptions
-from slam_backend.findings import Findings
 from slam_backend.geometry import compose
 from slam_backend.input_log import UNHEARD, Seats, StepInput
-from slam_backend.reports import StepReport
 
 if TYPE_CHECKING:
     from slam_backend._filter_state import FilterState
 
-# What `_kernels.take_turns` returns; `report_of` takes it apart.
-Summary = tuple[float, int, int, int, int, int, float, int]
-BEST: Final = 1
-LONG_UNSEEN: Final = 5
+# The most probable particle, how many landmarks not seen for long it matched, and seven numbers of a `StepReport`.
+Summary = tuple[int, int, int, int, int, int, float, float, bool]
 
 
 def assumed(options: FilterOptions) -> FloatArray:
-    """Return what a filter assumes, (27,) float64, as `_kernels.layout` names the numbers.
+    """Return what a filter assumes, (28,) float64, as `_kernels.layout` names the numbers.
 
     The noise of the odometry (6,), see `OdometryModel`; of the camera (7,) the focal length [px], the baseline [m], the
     sigmas of image coordinates and of the disparity [px], and the mount [m]; the sigmas (3,) [m, m, rad] of the prior
@@ -42,7 +37,7 @@ def assumed(options: FilterOptions) -> FloatArray:
         options.dead_radius, options.ambiguity,
         np.log(options.new_landmark_density), options.landmark_walk,
         options.proposal == "fastslam2", options.one_to_one,
-        options.smoothing.closure_after,
+        options.smoothing.closure_after, options.resample_threshold,
     ])  # fmt: skip
 
 
@@ -62,7 +57,7 @@ def take_turns(slam: "FilterState", inputs: StepInput, seats: Seats, told: IntAr
         slam: Its particles and their maps are changed, its estimates written.
         inputs: What these robots, and perhaps others, read.
         seats: Of its robots there.
-        told: (3, n) int64, written: what becomes of their measurements, see `Findings`.
+        told: (2, n) int64, written: what becomes of their measurements, see `Findings`.
 
     Returns:
         What all of it came to; and slots of landmarks that turned out not to exist, to be released when nobody asks for
@@ -77,8 +72,7 @@ def take_turns(slam: "FilterState", inputs: StepInput, seats: Seats, told: IntAr
             place(slam, robot, inputs.moves[row])
     if used:
         maps.make_room(used, inputs.descriptors.shape[1])
-    shape = len(inputs.sightings), maps.padded
-    found, distances = np.empty(shape, np.int32), np.empty(shape)
+        slam._make_room_for(len(inputs.sightings))
     step = (
         0 if slam._rejuvenation is None else slam._rejuvenation.steps + 1, slam._assumed,
         seats.array, inputs.table, inputs.moves, slam._rng.standard_normal((active, maps.num_particles, 3)),
@@ -86,39 +80,17 @@ def take_turns(slam: "FilterState", inputs: StepInput, seats: Seats, told: IntAr
         maps.values, maps.counts, maps.odds, maps.table, maps.maps, maps.users,
         maps.free_rows, maps.tops, maps.descriptors, maps.heads,
         inputs.sightings, inputs.descriptors, inputs.names,
-        found, distances, told, *slam._estimates,
+        slam._found, slam._distances, told, *slam._estimates,
     )  # fmt: skip
     if slam._existence is None:
-        return _kernels.take_turns(0, len(seats.rows), *step), []
-    deserted, best = [], slam._best
+        return _kernels.take_turns(0, len(seats.rows), True, *step), []
+    deserted = []
     for robot, row in enumerate(seats.rows):
-        summary = _kernels.take_turns(robot, robot + 1, *step)
+        _kernels.take_turns(robot, robot + 1, False, *step)
         _, begin, end, _, _, count = inputs.turns[row] if row >= 0 else UNHEARD
         if count >= 0:
-            given, new_slots = found[begin:end], told[NEW_SLOTS, begin:end]
+            found, new_slots = slam._found[begin:end], told[CREATED, begin:end]
             # Room for this was left by `make_room`; only where nobody saw anything may it grow, and then no later turn
             # looks at a map: so the arrays that later turns are given stay as they are.
-            deserted.append(slam._existence.weigh(maps, slam._poses[robot], best, given, new_slots))
-    return summary, deserted
-
-
-def report_of(inputs: StepInput, seats: Seats, findings: Findings, summary: Summary, threshold: float) -> StepReport:
-    """Return the report of a step.
-
-    Args:
-        inputs: What the robots read.
-        seats: Of them there.
-        findings: What became of it.
-        summary: Of `take_turns`.
-        threshold: Particles are to be resampled where the effective sample size is not above it.
-    """
-    ess, _, num_created, num_new, num_matched, _, squares, judged = summary
-    given = used = 0
-    for _, row in seats.heard:
-        _, begin, end, _, _, count = inputs.turns[row]
-        given, used = given + max(count, 0), used + end - begin
-    nis = squares / judged if judged else math.nan
-    return StepReport(
-        findings, seats.rows, num_created, num_new, num_matched, given - num_new - num_matched, ess, nis,
-        used > 0 and ess <= threshold,
-    )  # fmt: skip
+            deserted.append(slam._existence.weigh(maps, slam._poses[robot], slam._best, found, new_slots))
+    return _kernels.take_turns(len(seats.rows), len(seats.rows), True, *step), deserted

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from slam_backend._journal import LONGEST, Entry
 from slam_backend._rejuvenation_step import RejuvenationStep
 from slam_backend._step_input import check_step
-from slam_backend._turns import BEST, LONG_UNSEEN, report_of, take_turns
+from slam_backend._turns import take_turns
 from slam_backend.adaptation import AdaptiveParticles, next_num_particles
 from slam_backend.camera import StereoCamera
 from slam_backend.errors import check_array
@@ -27,7 +27,7 @@ from slam_backend.geometry import wrap_angle
 from slam_backend.input_log import Seats, StepInput, seats_of
 from slam_backend.measurements import Measurements
 from slam_backend.motion import OdometryModel
-from slam_backend.reports import PoseEstimates, RejuvenationReport, StepReport
+from slam_backend.reports import RejuvenationReport, StepReport
 from slam_backend.resampling import RESAMPLING
 from slam_backend.smoothing.options import SmoothingOptions
 
@@ -169,22 +169,19 @@ class FastSlam(FilterKnowledge):
             seats: Of these robots there.
             findings: Of `inputs`; what becomes of these robots' measurements is written there.
         """
-        maps, num_robots = self._maps, len(seats.rows)
-        self._estimates = PoseEstimates(np.empty((num_robots, 3)), np.empty((num_robots, 3, 3)))
         summary, deserted = take_turns(self, inputs, seats, findings.told)
-        self._best = summary[BEST]
-        threshold = self.options.resample_threshold * maps.num_particles * (1.0 + 1e-9)
-        report = report_of(inputs, seats, findings, summary, threshold)
+        self._best, long_unseen, created, new, matched, rejected, ess, nis, is_depleted = summary
+        report = StepReport(findings, seats.rows, created, new, matched, rejected, ess, nis, is_depleted)
         if len(self._journal) == LONGEST:
             self._write_down()
-        self._journal.append(Entry(self._steps, inputs, report, self._estimates.means))
+        self._journal.append(Entry(self._steps, inputs, report, self._estimates.means.copy()))
         self._steps += 1
         for slots in deserted:
-            maps.release(slots)
-        if report.resampled:
+            self._maps.release(slots)
+        if is_depleted:
             self._resample()
         if (smoother := self._rejuvenation) is not None:
-            smoother.count(report.num_new + report.num_matched, summary[LONG_UNSEEN])
+            smoother.count(new + matched, long_unseen)
             is_busy = self.may_smooth and not smoother.waits(self._steps - 1)
             if is_busy and (news := self._rejuvenate(smoother)) is not None:
                 return report._replace(rejuvenation=news)

@@ -15,8 +15,8 @@ class Findings(NamedTuple):
     """What became of N robots' measurements in one step; nobody writes to it when the step is over.
 
     Attributes:
-        told: (3, n) int64. Of all measurements used, one robot's after the other's: the landmark that each was taken
-            for, and that which it created, as in `StepReport`; and a slot, which means nothing after the step.
+        told: (2, n) int64. Of all measurements used, one robot's after the other's: the landmark that each was taken
+            for, and that which it created, as in `StepReport`.
         turns: Of each robot, as in `StepInput`.
         masks: By robot which of its measurements were used, as there.
     """
@@ -28,15 +28,14 @@ class Findings(NamedTuple):
     @classmethod
     def none_yet(cls, inputs: StepInput) -> Self:
         """Return room for what becomes of some readings; until it is written all measurements are rejected."""
-        told = np.empty((3, len(inputs.sightings)), np.int64)
+        told = np.empty((2, len(inputs.sightings)), np.int64)
         told.fill(REJECTED)
         return cls(told, inputs.turns, inputs.masks)
 
     @classmethod
     def gathered(cls, associations: Sequence[IntArray], created: Sequence[IntArray]) -> Self:
         """Return those of robots of each of which both are known, (n_i,) ids."""
-        found = np.concatenate(associations)
-        told = np.stack([found, np.concatenate(created), np.full_like(found, REJECTED)])
+        told = np.stack([np.concatenate(associations), np.concatenate(created)])
         turns, begin = [], 0
         for own in associations:
             turns.append((STOOD, begin, begin + len(own), False, False, len(own)))

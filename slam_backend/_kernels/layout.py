@@ -42,13 +42,13 @@ POSES, STARTS, MEANS, COVARIANCES = range(4)
 LOG_WEIGHTS, PATH_LOG_WEIGHTS, WEIGHTS, LOG_LIKELIHOOD = range(4)
 ROW_OF, MAP_OF, IDS, IDENTITIES, LAST_SEEN, FREE_SLOTS = range(6)  # of the table of a map's slots, (6, slots)
 ACT, BEGIN, END, GIVEN, NAMED, COUNT = range(6)  # of a robot's turn
-ASSOCIATED, CREATED, NEW_SLOTS = range(3)  # what becomes of measurements, (3, n)
+ASSOCIATED, CREATED = range(2)  # what becomes of measurements, (2, n)
 # What a filter assumes: the first of six numbers, seven and three, and then one each.
 NOISE, CAMERA, RECOVERY = 0, 6, 13
 (
     DESCRIPTOR_GATE, DESCRIPTOR_VARIANCE, POSITION_GATE, DEAD_ZONE, DEAD_RADIUS, AMBIGUITY, LOG_P0, WALK,
-    IS_SIGHTING, IS_ONE_TO_ONE, LONG,
-) = range(16, 27)  # fmt: skip
+    IS_SIGHTING, IS_ONE_TO_ONE, LONG, RESAMPLE_THRESHOLD,
+) = range(16, 28)  # fmt: skip
 
 TILE = 9 * LANES  # particle m is lane m % LANES of block m // LANES
 BLOCK = np.uint32(LANES)  # to divide by: unsigned numbers take half the instructions

@@ -13,6 +13,7 @@ from slam_backend._kernels.layout import (
     BEGIN,
     CAMERA,
     COVARIANCES,
+    CREATED,
     DEAD_RADIUS,
     DEAD_ZONE,
     DESCRIPTOR_GATE,
@@ -32,18 +33,18 @@ from slam_backend._kernels.layout import (
     MAP_OF,
     MEANS,
     NAMED,
-    NEW_SLOTS,
     NOISE,
     POSES,
     POSITION_GATE,
     RECOVERY,
+    RESAMPLE_THRESHOLD,
     ROW_OF,
     WALK,
     WORK_ROWS,
 )
 from slam_backend._kernels.motion import move_blind
 from slam_backend._kernels.weights import conclude
-from slam_backend.errors import BoolArray, Float32Array, FloatArray, Int32Array, IntArray
+from slam_backend.errors import Float32Array, FloatArray, Int32Array, IntArray
 
 IDLE, STOOD, MOVED, PLACED = 0, 1, 2, 3  # what a robot did: nothing at all, stood and looked, moved, was told its pose
 
@@ -59,29 +60,31 @@ def write_sigmas(noise: FloatArray, move: FloatArray, sigmas: FloatArray) -> Non
 
 @jit
 def take_turns(
-    low: int, high: int, now: int, assumed: FloatArray, rows: IntArray, turns: IntArray, moves: FloatArray,
-    normals: FloatArray, robots: FloatArray, blind: BoolArray, weights: FloatArray, frame: FloatArray,
+    low: int, high: int, is_over: bool, now: int, assumed: FloatArray,
+    rows: IntArray, turns: IntArray, moves: FloatArray, normals: FloatArray,
+    robots: FloatArray, blind: IntArray, weights: FloatArray, frame: FloatArray,
     values: FloatArray, counts: Int32Array, odds: FloatArray, table: IntArray, maps: Int32Array, users: IntArray,
     free_rows: IntArray, tops: IntArray, stored: Float32Array, heads: Float32Array,
     sightings: FloatArray, descriptors: Float32Array, names: IntArray,
     found: Int32Array, distances: FloatArray, told: IntArray,
     mean: FloatArray, covariance: FloatArray,
-) -> tuple[float, int, int, int, int, int, float, int]:  # fmt: skip
+) -> tuple[int, int, int, int, int, int, float, float, bool]:  # fmt: skip
     """Move robots `low` to `high` - 1 in all particles, match, weigh and update landmarks (Algorithm 1, l. 6-8).
 
     What belongs together comes in one array, whose rows `layout` names: it is the number of arrays that a call costs.
 
     Args:
-        low, high: Whose turns are taken; the step begins with the first robot, and with the last one it is concluded.
+        low, high: Whose turns are taken; the step begins with the first robot.
+        is_over: Whether these were the last turns, and the step is concluded.
         now: Number of the step, above 0 if anyone asks when landmarks were seen last.
-        assumed: (27,) noise of the odometry, camera, and the rest, see `layout`.
+        assumed: (28,) noise of the odometry, camera, and the rest, see `layout`.
         rows: (K,) which of the N robots that `turns` tells of each is; -1: none, it did nothing at all.
         turns: (N, 6) int64. What each did: `IDLE`, `STOOD`, `MOVED`, or `PLACED`, with the pose already written; where
             its measurements begin and end among all n; whether these come with covariances, and with names.
         moves: (N, 3) odometry [m, m, rad] of those that moved.
         normals: (k, M, 3) standard normal draws, for the k robots that are not idle.
         robots: (5, K, 3, P) samples, starts, and N(x^, P^) before sampling.
-        blind: (K,) whether that was propagated since the last sighting.
+        blind: (K,) 1 where that was propagated since the last sighting, else 0.
         weights: (4, P), read and written up to M.
         frame: (3, 3) as in `conclude`.
         values, ..., heads: The store, see `ParticleMaps`. n + 1 rows and n slots are free.
@@ -89,7 +92,7 @@ def take_turns(
         descriptors: (n, d).
         names: (n,) the caller's names, of the robots that have them; or (0,).
         found, distances: (n, P), written as in `update_fastslam2`.
-        told: (3, n), written: as in `summarise`, and the slots of the landmarks that were started.
+        told: (2, n), written: the slots of the landmarks that were started, -1 = none; in the end as in `summarise`.
         mean, covariance: (K, 3), (K, 3, 3), written in the end, as in `conclude`.
 
     Returns:
@@ -100,7 +103,7 @@ def take_turns(
     is_one_to_one = assumed[IS_ONE_TO_ONE] > 0.0
     poses, means = robots[POSES], robots[MEANS]
     covariances = robots[COVARIANCES:].reshape((num_robots, 6, robots.shape[3]))
-    log_likelihood, new_slots = weights[LOG_LIKELIHOOD], told[NEW_SLOTS]
+    log_likelihood, new_slots = weights[LOG_LIKELIHOOD], told[CREATED]
     row_of, map_of, ids, identities = table[ROW_OF], table[MAP_OF], table[IDS], table[IDENTITIES]
     free_slots = table[FREE_SLOTS]
     points, noises = sightings[:, :3], sightings[:, 3:]
@@ -123,7 +126,7 @@ def take_turns(
             move[:] = moves[row]
             write_sigmas(assumed[NOISE : NOISE + 6], move, sigmas)
         own_poses, own_means, own_covariances = poses[robot], means[robot], covariances[robot]
-        was_blind = blind[robot] and not placed
+        was_blind = blind[robot] > 0 and not placed
         lost = still if placed else recovery
         if assumed[IS_SIGHTING] == 0.0:
             update_fastslam1(
@@ -151,9 +154,9 @@ def take_turns(
             move_blind(own_poses, own_means, own_covariances, was_blind, move, sigmas, normals[drawn], work)
             was_blind = True
         blind[robot] = was_blind
-    if high < num_robots:
-        return 0.0, 0, 0, 0, 0, 0, 0.0, 0
+    if not is_over:
+        return 0, 0, 0, 0, 0, 0, 0.0, 0.0, False
     return conclude(
         weights, num_particles, means, covariances, frame, mean, covariance, rows, turns, found, distances, told, ids,
-        table[LAST_SEEN], now, assumed[LONG],
+        table[LAST_SEEN], now, assumed[LONG], assumed[RESAMPLE_THRESHOLD],
     )  # fmt: skip

@@ -9,12 +9,12 @@ from slam_backend._kernels.lane_math import sine_cosine, wrapped
 from slam_backend._kernels.layout import (
     ASSOCIATED,
     BEGIN,
+    COUNT,
     CREATED,
     END,
     LANES,
     LOG_LIKELIHOOD,
     LOG_WEIGHTS,
-    NEW_SLOTS,
     PATH_LOG_WEIGHTS,
     REJECTED,
     WEIGHTS,
@@ -131,16 +131,15 @@ def add_share(scatter: FloatArray, poses: FloatArray, covariances: FloatArray) -
 def summarise(
     rows: IntArray, turns: IntArray, found: Int32Array, distances: FloatArray, told: IntArray, best: int, ids: IntArray,
     last_seen: IntArray, now: int, long: float,
-) -> tuple[int, int, int, int, float, int]:  # fmt: skip
+) -> tuple[int, int, int, int, int, float]:  # fmt: skip
     """Tell what became of the robots' measurements.
 
     Args:
         rows, turns: Which of all n measurements they are, as in `take_turns`; those of others are passed over.
         found: (n, P) slots to which the particles gave the measurements, -1 = rejected.
         distances: (n, P) squared distances of matches.
-        told: (3, n). Read: the slots of the landmarks that were started, -1 = none. Written: the id to which the most
-            probable particle gave each measurement, -1 = rejected; and the id of the landmark that it created in any
-            particle, -1 = none.
+        told: (2, n), written: the id to which the most probable particle gave each measurement, -1 = rejected; and the
+            id of the landmark that it created in any particle, -1 = none. There the slots of these landmarks stand.
         best: The most probable particle.
         ids: (slots,) stable names.
         last_seen: (slots,) number of the step in which the most probable particle last matched a landmark, 0 = it never
@@ -149,17 +148,19 @@ def summarise(
         long: Steps after which a landmark was not seen for long.
 
     Returns:
-        How many started a landmark in any particle; how many the most probable particle started, and matched; how many
-        of the latter to landmarks not seen for long; and the sum and number of its squared distances, without what it
-        predicted behind the camera.
+        How many landmarks not seen for long the most probable particle matched; how many measurements started a
+        landmark in any particle; how many the most probable particle started, matched, and made nothing of, unused ones
+        included; and the mean of its squared distances, without what it predicted behind the camera, NaN if there is
+        none.
     """
-    associated, created, new_slots = told[ASSOCIATED], told[CREATED], told[NEW_SLOTS]
-    num_created, num_new, num_matched, num_long_unseen, squares, judged = 0, 0, 0, 0, 0.0, 0
+    associated, created = told[ASSOCIATED], told[CREATED]
+    num_given, num_created, num_new, num_matched, num_long_unseen, squares, judged = 0, 0, 0, 0, 0, 0.0, 0
     for row in rows:
         if row < 0:
             continue
+        num_given += max(turns[row, COUNT], 0)
         for b in range(turns[row, BEGIN], turns[row, END]):
-            slot, new = found[b, best], new_slots[b]
+            slot, new = found[b, best], created[b]
             associated[b] = ids[slot] if slot >= 0 else REJECTED
             created[b] = ids[new] if new >= 0 else REJECTED
             if new >= 0:
@@ -176,15 +177,16 @@ def summarise(
                 if distances[b, best] < np.inf:
                     squares += distances[b, best]
                     judged += 1
-    return num_created, num_new, num_matched, num_long_unseen, squares, judged
+    num_rejected = num_given - num_new - num_matched
+    return num_long_unseen, num_created, num_new, num_matched, num_rejected, squares / judged if judged > 0 else np.nan
 
 
 @jit
 def conclude(
     weights: FloatArray, count: int, means: FloatArray, covariances: FloatArray, frame: FloatArray,
     mean: FloatArray, covariance: FloatArray, rows: IntArray, turns: IntArray, found: Int32Array, distances: FloatArray,
-    told: IntArray, ids: IntArray, last_seen: IntArray, now: int, long: float,
-) -> tuple[float, int, int, int, int, int, float, int]:  # fmt: skip
+    told: IntArray, ids: IntArray, last_seen: IntArray, now: int, long: float, threshold: float,
+) -> tuple[int, int, int, int, int, int, float, float, bool]:  # fmt: skip
     """Do what `weigh`, `mixture` and `add_share` for each of K robots and, for their measurements, `summarise` do.
 
     Args:
@@ -193,10 +195,12 @@ def conclude(
         means, covariances: (K, 3, P), (K, 6, P) N(x^, P^) before sampling.
         frame: (3, 3) covariance of a motion of the whole map that particles do not show, or zeros.
         mean, covariance: (K, 3), (K, 3, 3), written: of each robot's pose over all particles.
-        The others are as in `summarise`.
+        rows, ..., long: As in `summarise`.
+        threshold: Share of M below which the effective sample size asks for resampling.
 
     Returns:
-        The effective sample size, the most probable particle, and what `summarise` returns of that one.
+        The most probable particle; the first five that `summarise` returns of it; the effective sample size; the last
+        one; and whether the particles are to be resampled, now that something was measured.
     """
     path_log_weights, own = weights[PATH_LOG_WEIGHTS][:count], weights[WEIGHTS][:count]
     ess = weigh(weights[LOG_LIKELIHOOD][:count], weights[LOG_WEIGHTS][:count], path_log_weights, own)
@@ -205,7 +209,12 @@ def conclude(
     if frame[0, 0] != 0.0 or frame[2, 2] != 0.0:
         add_share(frame, mean, covariance)
     best = int(path_log_weights.argmax())
-    created, new, matched, long_unseen, squares, judged = summarise(
+    long_unseen, created, new, matched, rejected, nis = summarise(
         rows, turns, found, distances, told, best, ids, last_seen, now, long
     )  # fmt: skip
-    return ess, best, created, new, matched, long_unseen, squares, judged
+    used = 0
+    for row in rows:
+        if row >= 0:
+            used += turns[row, END] - turns[row, BEGIN]
+    is_depleted = used > 0 and ess <= threshold * count * (1.0 + 1e-9)  # rounding must not decide
+    return best, long_unseen, created, new, matched, rejected, ess, nis, is_depleted

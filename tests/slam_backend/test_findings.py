@@ -33,7 +33,7 @@ def test_measurements_that_were_not_used_are_rejected(seeds: list[int]) -> None:
     inputs = checked(list(map(reading, seeds)))
     findings = Findings.none_yet(inputs)
     assert (findings.told == -1).all()
-    findings.told[:] = np.arange(3 * len(inputs.sightings)).reshape(3, -1)
+    findings.told[:] = np.arange(2 * len(inputs.sightings)).reshape(2, -1)
     for robot, turn in enumerate(inputs.turns):
         _, begin, end, _, _, count = turn
         mask = inputs.masks.get(robot, np.full(max(count, 0), True))
