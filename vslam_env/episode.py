@@ -187,7 +187,7 @@ class Episode:
         if self._tap.recorder is not None:
             self._tap.recorder(self.readings.of_each())
         report = self.belief.step(self.readings)
-        self.ledger.record(report, frames.true_ids)
+        self.ledger.record(report, frames.names)
         for made in report.renamings:
             self.merge_ticks.append((self.tick, made.robots_a, made.robots_b))
         if config.oracle_merge:

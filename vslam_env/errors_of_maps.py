@@ -56,14 +56,14 @@ class ClaimLedger:
         self._books = np.empty((num_robots, 0), np.int64)  # in each row what the ids of one map claim
         self._row_of = {number: number for number in range(num_robots)}
         self._go_by(tuple(range(num_robots)))
-        self._seen: dict[int, Sequence[IntArray]] = {}  # by step: true ids of what each robot measured then
+        self._seen: dict[int, Sequence[IntArray] | IntArray] = {}  # by step: true ids of what each robot measured then
 
-    def record(self, report: TeamReport, true_ids: Sequence[IntArray]) -> None:
+    def record(self, report: TeamReport, true_ids: Sequence[IntArray] | IntArray) -> None:
         """Enter all that a step did to maps.
 
         Args:
             report: Of the step.
-            true_ids: Per robot (n_i,) int64. The landmark behind each measurement; -1 for a false point.
+            true_ids: Per robot (n_i or more,) int64. The landmark behind each measurement; -1 for a false point.
         """
         self._seen[report.step] = true_ids
         for entry in report.entries:

@@ -11,8 +11,8 @@ from slam_backend.geometry import compose
 from vslam_env.sensors import LandmarkSensor, LandmarkSensorConfig
 from vslam_env.sensors._landmark_kernels import make_up, measure, mix_in
 from vslam_env.world import FreeSpace, Landmarks, World, make_world, place_landmarks
-from vslam_env.world.sight_kernels import choose
-from vslam_env.world.visibility import view_limits
+from vslam_env.world.sight_kernels import choose, detect
+from vslam_env.world.visibility import marks_of, view_limits, visible_landmarks
 
 SHARP = StereoCamera(sigma_px=1e-9, sigma_disparity_px=1e-9)
 PERFECT = LandmarkSensorConfig(
@@ -142,6 +142,7 @@ def test_a_frame_is_the_plain_definition() -> None:
     rng = np.random.default_rng(8)
     camera = StereoCamera(mount=(0.1, -0.2, 0.3))
     ids, counts = np.array([2, -1, 4, 0, -2, 3]), np.array([3, 0, 3])
+    in_rows = np.array([[2, -1, 4, 7], [7, 7, 7, 7], [0, -2, 3, 7]])
     robots = np.repeat(np.arange(3), counts)
     poses = rng.uniform(-1.0, 1.0, (3, 3))
     seen = rng.uniform([-1.0, -1.0, 2.0], [1.0, 1.0, 6.0], (6, 3))
@@ -164,9 +165,9 @@ def test_a_frame_is_the_plain_definition() -> None:
     optics = np.array([*camera.mount, camera.focal_px, camera.baseline, camera.sigma_px, camera.sigma_disparity_px])
     made_of = np.hstack([positions, looks]), np.hstack([false, false_looks[:2]])
     got_points, got_looks = np.empty((6, 3)), np.empty((6, 4), np.float32)
-    assert measure(ids, counts, poses, *made_of, noise, optics, 0.3, got_points, got_looks) == 4
+    assert measure(in_rows, counts, poses, *made_of, noise, optics, 0.3, got_points, got_looks) == 4
     assert counts.tolist() == [2, 2, 4]  # where those that are written end
-    assert ids[:4].tolist() == [-1, 4, 0, 3]
+    assert [in_rows[0, :2].tolist(), in_rows[2, :2].tolist()] == [[-1, 4], [0, 3]]
     np.testing.assert_allclose(got_points[:4], camera.triangulate(pixels), rtol=1e-9)
     np.testing.assert_allclose(got_looks[:4], disturbed / np.linalg.norm(disturbed, axis=1, keepdims=True), rtol=1e-6)
 
@@ -192,31 +193,48 @@ def test_false_points_are_mixed_in_by_their_keys() -> None:
     """Each robot's points, landmarks before false ones, are sorted by its share of the keys."""
     rng = np.random.default_rng(11)
     num_true, num_false = np.array([2, 0, 3, 0, 1]), np.array([1, 2, 0, 0, 4])
-    ids, keys = rng.permutation(40)[:6], rng.random(13)
-    own = np.split(ids, np.cumsum(num_true)[:-1])
+    ids, keys = rng.permutation(40)[:30].reshape(5, 6), rng.random(13)
     false = np.split(-1 - np.arange(7), np.cumsum(num_false)[:-1])
     shares = np.split(keys, np.cumsum(num_true + num_false)[:-1])
-    expected = [np.concatenate(pair)[np.argsort(share)] for *pair, share in zip(own, false, shares, strict=True)]
-    counts, mixed = num_true.copy(), np.empty(13, np.int64)
-    mix_in(num_false, ids, keys.copy(), counts, mixed)
-    assert mixed.tolist() == np.concatenate(expected).tolist()
-    assert counts.tolist() == [len(points) for points in expected]
+    own = [np.concatenate([row[:n], made_up]) for row, n, made_up in zip(ids, num_true, false, strict=True)]
+    expected = [points[np.argsort(share)].tolist() for points, share in zip(own, shares, strict=True)]
+    counts, mixed = num_true.copy(), ids.copy()
+    mix_in(num_false, keys.copy(), mixed, counts)
+    assert counts.tolist() == [3, 2, 3, 0, 5]
+    assert [row[:n].tolist() for row, n in zip(mixed, counts, strict=True)] == expected
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_the_choice_is_that_of_the_smallest_keys(seed: int) -> None:
-    """Of what is visible and detected the smallest keys are taken, in their order, as false points leave places."""
+    """Of what is visible and detected the smallest keys are taken, in their order, as many as there are places."""
     rng = np.random.default_rng(seed)
-    visible, keys, most = rng.random((4, 30)) < 0.4, rng.random((4, 30)), 6
-    num_false, counts, chosen = np.array([0, 2, 6, 9]), np.empty(4, np.int64), np.empty(24, np.int64)
-    detected = [np.flatnonzero(seen & (own < 0.7)) for seen, own in zip(visible, keys, strict=True)]
-    places = np.maximum(most - num_false, 0)
-    expected = [n[np.argsort(own[n])][:left] for n, own, left in zip(detected, keys, places, strict=True)]
-    total, extra = choose(visible, keys, 0.7, num_false, most, chosen, counts)
-    assert chosen[:total].tolist() == np.concatenate(expected).tolist()
-    assert counts.tolist() == [len(own) for own in expected]
-    assert num_false.tolist() == [0, 2, 6, 6]
-    assert extra == 14
+    for places in (0, 2, 4, 6, 30):
+        visible, keys = np.flatnonzero(rng.random(30) < 0.4), rng.random(30)
+        detected = visible[keys[visible] < 0.7]
+        expected = detected[np.argsort(keys[detected])][:places]
+        chosen = np.empty(max(places, 1), np.int64)
+        count = choose(visible, keys, 0.7, places, chosen)
+        assert chosen[:count].tolist() == expected.tolist()
+
+
+def test_each_robot_detects_what_it_sees_as_false_points_leave_places() -> None:
+    """Compiled for all robots in one, it is the choice for each of them among what it sees."""
+    world, free, marks = office(5)
+    camera, rng = StereoCamera(), np.random.default_rng(12)
+    poses, view = free.draw_starts(4, rng, 1.0), view_limits(camera, 1.0)
+    keys, num_false = rng.random((4, len(marks))), np.array([0, 2, 4, 9])
+    chosen, counts = np.empty((4, 4), np.int64), np.empty(4, np.int64)
+    sight = marks_of(marks), marks.walls.copy(), world.walls.T.copy(), 0.2, view
+    total, extra = detect(poses, *sight, keys, 0.8, num_false, chosen, counts)
+    assert num_false.tolist() == [0, 2, 4, 4]
+    assert (total, extra) == (counts.sum(), 10)
+    for seen, own, left, names in zip(
+        visible_landmarks(poses, marks, world.walls, 0.2, view), keys, [4, 2, 0, 0], chosen, strict=True
+    ):
+        detected = np.flatnonzero(seen & (own < 0.8))
+        expected = detected[np.argsort(own[detected])][:left]
+        assert names[: len(expected)].tolist() == expected.tolist()
+    assert counts[0] > 0
 
 
 def test_descriptor_noise_has_the_stated_length() -> None:

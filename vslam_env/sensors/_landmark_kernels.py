@@ -48,31 +48,29 @@ def make_up(
 
 
 @jit
-def mix_in(num_false: IntArray, ids: IntArray, keys: FloatArray, counts: IntArray, mixed: IntArray) -> None:
+def mix_in(num_false: IntArray, keys: FloatArray, ids: IntArray, counts: IntArray) -> None:
     """Put the false points of each robot among its landmarks, in random order.
 
     Args:
         num_false: (K,) int64. How many false points each robot reports.
-        ids: (at least n - m,) int64. The landmarks that robots report, one robot after the other.
         keys: (n,) float64, uniform. Of each robot's landmarks, then of its false points. Changed: put in order.
+        ids: (K, B) int64. In each row the landmarks that a robot reports; changed to landmarks, and -1 - j for false
+            point j, by rising keys.
         counts: (K,) int64. How many landmarks each robot reports; changed to how many points.
-        mixed: (n,) int64. Written to: landmarks, and -1 - j for false point j, of each robot by rising keys.
     """
-    end = true = false = 0
-    for k in range(len(counts)):
-        begin, num_true = end, counts[k]
+    begin = false = 0
+    for k in range(len(ids)):
+        num_true = counts[k]
         counts[k] += num_false[k]
+        own = keys[begin : begin + counts[k]]
         for i in range(counts[k]):
-            if i < num_true:
-                name, true = ids[true], true + 1
-            else:
-                name, false = -1 - false, false + 1
-            key, at = keys[end], end
-            while at > begin and keys[at - 1] > key:
-                keys[at], mixed[at] = keys[at - 1], mixed[at - 1]
+            name = ids[k, i] if i < num_true else num_true - i - 1 - false
+            key, at = own[i], i
+            while at > 0 and own[at - 1] > key:
+                own[at], ids[k, at] = own[at - 1], ids[k, at - 1]
                 at -= 1
-            keys[at], mixed[at] = key, name
-            end += 1
+            own[at], ids[k, at] = key, name
+        begin, false = begin + counts[k], false + num_false[k]
 
 
 @jit
@@ -94,8 +92,8 @@ def measure(
     vanishes in the noise, no matcher reports a point: the later ones move up.
 
     Args:
-        ids: (n,) int64. Landmarks that the robots report, one robot after the other; -1 - j for false point j. Changed
-            to those behind what is written, -1 for a false point.
+        ids: (K, B) int64. In each row the landmarks that a robot reports; -1 - j for false point j. Changed to those
+            behind what is written, -1 for a false point.
         counts: (K,) int64. How many each robot reports; changed to where those of each robot that are written end.
         poses: (K, 3) float64 [m, m, rad], world frame. Robots.
         landmarks: (N, 3 + d) float64. Their positions [m], world frame, and descriptors, unit vectors.
@@ -117,15 +115,16 @@ def measure(
     i = kept = 0
     for k in range(len(poses)):
         cosine, sine = np.cos(poses[k, 2]), np.sin(poses[k, 2])
-        for _ in range(counts[k]):
-            if ids[i] >= 0:
-                row = landmarks[ids[i]]
+        num_kept = 0
+        for name in ids[k, : counts[k]]:
+            if name >= 0:
+                row = landmarks[name]
                 dx, dy = row[0] - poses[k, 0], row[1] - poses[k, 1]
                 right = aside - (cosine * dy - sine * dx)
                 down = height - row[2]
                 ahead = cosine * dx + sine * dy - forward
             else:
-                row = false_points[-1 - ids[i]]
+                row = false_points[-1 - name]
                 right, down, ahead = row[:3]
             scale = focal / ahead
             disparity = baseline * scale + sigma_disparity * noise[i, 2]
@@ -140,8 +139,8 @@ def measure(
                 length = np.sqrt(square)
                 for j in range(size):
                     looks[kept, j] = look[j] / length
-                ids[kept] = max(ids[i], -1)
-                kept += 1
+                ids[k, num_kept] = max(name, -1)
+                num_kept, kept = num_kept + 1, kept + 1
             i += 1
         counts[k] = kept
     return kept

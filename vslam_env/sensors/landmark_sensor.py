@@ -1,8 +1,7 @@
 """The landmark sensor: true poses become noisy measurements of the landmarks that each camera sees."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -59,37 +58,23 @@ class Frame(NamedTuple):
     true_ids: IntArray
 
 
-class TrueIds(Sequence[IntArray]):
-    """The landmarks behind all robots' points, in one piece; each robot's are cut out for who asks.
-
-    Args:
-        ids: (n,) int64. One robot's after the other's; -1 for a false point.
-        ends: (K,) int64. Per robot where its own end.
-    """
-
-    __slots__ = ("_ends", "_ids")
-
-    def __init__(self, ids: IntArray, ends: IntArray) -> None:
-        self._ids, self._ends = ids, ends
-
-    def __len__(self) -> int:
-        return len(self._ends)
-
-    def __getitem__(self, robot: Any) -> Any:
-        begin = self._ends[robot - 1] if robot else 0
-        return self._ids[begin : self._ends[robot]]
-
-
 class Frames(NamedTuple):
     """The frames of all robots in one tick.
 
     Attributes:
         measurements: In one piece.
-        true_ids: Per robot as of its `Frame`.
+        names: (K, B) int64. In each row the landmarks behind a robot's points, -1 for a false point; what follows them
+            means nothing.
     """
 
     measurements: TeamMeasurements
-    true_ids: Sequence[IntArray]
+    names: IntArray
+
+    @property
+    def true_ids(self) -> list[IntArray]:
+        """Per robot as of its `Frame`."""
+        ends = self.measurements.ends.tolist()
+        return [row[: end - begin] for row, begin, end in zip(self.names, [0, *ends[:-1]], ends, strict=True)]
 
     def of_each(self) -> list[Frame]:
         """Return the frame of each robot."""
@@ -112,7 +97,6 @@ class LandmarkSensor:
         self.config = config
         self._walls = check_array("walls", walls, (None, 4), "Give rows x1 y1 x2 y2 in metres.")
         self._landmarks = landmarks
-        self._scenery = marks_of(landmarks), landmarks.walls.copy(), self._walls.T.copy()  # as kernels expect it
         descriptors = landmarks.descriptors.astype(np.float64)
         self._points = np.hstack([landmarks.positions, descriptors])
         self._robot_radius = check_float("robot_radius", robot_radius, "Give metres.", at_least=0.0)
@@ -120,6 +104,8 @@ class LandmarkSensor:
         lens = camera.focal_px, camera.baseline, camera.sigma_px, camera.sigma_disparity_px
         self._optics = np.array([*camera.mount, *lens])
         self._view = view_limits(camera, config.max_incidence)
+        walls_by_rows = self._walls.T.copy()
+        self._sight = marks_of(landmarks), landmarks.walls.copy(), walls_by_rows, self._robot_radius, self._view
         self._frame_shape = config.max_measurements, self._points.shape[1]
         self._no_false_points = np.empty((0, self._points.shape[1]))
         # False points look like landmarks of this world: the common part of all descriptors and a part of their own.
@@ -146,40 +132,25 @@ class LandmarkSensor:
         config, robots, (most, size) = self.config, len(poses), self._frame_shape
         num_false = rng.poisson(config.false_points, robots)
         keys = rng.random((robots, len(self._points)))
-        ids, ends = np.empty(robots * most, np.int64), np.empty(robots, np.int64)
-        total, extra = detect(
-            poses, *self._scenery, self._robot_radius, self._view, keys, config.detection_probability, num_false, most,
-            ids, ends,
-        )  # fmt: skip
+        ids, ends = np.empty((robots, most), np.int64), np.empty(robots, np.int64)
+        total, extra = detect(poses, *self._sight, keys, config.detection_probability, num_false, ids, ends)
         false_points = self._no_false_points
         if extra:
             total += extra
-            ids, false_points = self._mixed(num_false, ids, ends, total, extra, rng)
+            false_points = self._made_up(extra, rng)
+            mix_in(num_false, rng.random(total), ids, ends)
         noise = rng.standard_normal((total, size))
         points, looks = np.empty((total, 3)), np.empty((total, size - 3), np.float32)
         truth = ids, ends, poses, self._points, false_points
         kept = measure(*truth, noise, self._optics, config.descriptor_noise, points, looks)
         if kept < total:
             points, looks = points[:kept], looks[:kept]
-        return Frames(TeamMeasurements.trusted(points, looks, ends), TrueIds(ids, ends))
+        return Frames(TeamMeasurements.trusted(points, looks, ends), ids)
 
-    def _mixed(
-        self, num_false: IntArray, ids: IntArray, counts: IntArray, total: int, extra: int, rng: np.random.Generator
-    ) -> tuple[IntArray, FloatArray]:
-        """Mix false points into frames.
-
-        Args:
-            num_false, ids, counts: As of `mix_in`.
-            total: How many points there are then.
-            extra: How many of these are false.
-            rng: Source of the draws.
-
-        Returns:
-            The names of all points (total,), as `measure` takes them, and the false points (extra, 3 + d).
-        """
+    def _made_up(self, count: int, rng: np.random.Generator) -> FloatArray:
+        """Draw points that are no landmarks, and descriptors of them (count, 3 + d)."""
         size = len(self._common)
-        mixed, points = np.empty(total, np.int64), np.empty((extra, 3 + size))
-        places, looks = rng.random((3, extra)), rng.standard_normal((extra, size))
+        places, looks = rng.random((3, count)), rng.standard_normal((count, size))
+        points = np.empty((count, 3 + size))
         make_up(places, looks, self._common, self._own_share, self._view, points)
-        mix_in(num_false, ids, rng.random(total), counts, mixed)
-        return mixed, points
+        return points

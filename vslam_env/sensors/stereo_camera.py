@@ -135,7 +135,8 @@ class StereoEye:
         """Return the walls (n, 4) [m] that an eye at `place` may see, in its frame, and their indices (n,)."""
         local, indices = np.empty(self._walls.T.shape), np.empty(self._walls.shape[1], np.int64)
         x, y, theta = place.tolist()
-        count = walls_in_wedge(x, y, theta, self._walls, self._tan_half, VIEW, local, indices)
+        c, s = np.cos(theta), np.sin(theta)
+        count = walls_in_wedge(x, y, c, s, self._walls, self._tan_half, VIEW, local, indices)
         return local[:count], indices[:count]
 
     def trace(self, poses: FloatArray, robot: int, columns: FloatArray) -> Traced:

@@ -89,6 +89,11 @@ class EyeFrames(NamedTuple):
     right: Sequence[Image]
     seen: Sequence[StereoFrame]
 
+    @property
+    def names(self) -> Sequence[IntArray]:
+        """The true ids, as those who ask any sensor's frames look for them."""
+        return self.true_ids
+
     def of_each(self) -> list[EyeFrame]:
         """Return the frame of each robot."""
         return list(map(EyeFrame, *self))

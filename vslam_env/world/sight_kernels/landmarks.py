@@ -25,6 +25,72 @@ def _hidden(x: float, y: float, dx: float, dy: float, own_wall: int, walls: Floa
 
 
 @jit
+def _find_visible(
+    robot: int,
+    poses: FloatArray,
+    marks: FloatArray,
+    own_walls: IntArray,
+    walls: FloatArray,
+    robot_radius: float,
+    view: FloatArray,
+    near: FloatArray,
+    near_rows: IntArray,
+    rows: IntArray,
+) -> int:
+    """Find the landmarks that a robot's camera sees.
+
+    Args:
+        robot: Its row of the poses.
+        poses: As of `see`, as what follows.
+        marks: (5, N) float64.
+        own_walls: (N,) int64.
+        walls: (4, S) float64.
+        robot_radius: [m].
+        view: (7,) float64.
+        near: (S, 4) float64. Room for the walls ahead.
+        near_rows: (S,) int64. Room for which they are.
+        rows: (N,) int64. Written to: their indices, in rising order.
+
+    Returns:
+        How many they are.
+    """
+    forward, aside, height, max_range, tan_half, tan_vertical, cos_incidence = view
+    c, s = np.cos(poses[robot, 2]), np.sin(poses[robot, 2])
+    eye_x, eye_y = poses[robot, 0] + c * forward - s * aside, poses[robot, 1] + s * forward + c * aside
+    num_near = walls_in_wedge(eye_x, eye_y, c, s, walls, tan_half + EPSILON, max_range, near, near_rows)
+    for n in range(marks.shape[1]):
+        dx, dy, dz = marks[0, n] - eye_x, marks[1, n] - eye_y, marks[2, n] - height
+        ahead, left = c * dx + s * dy, c * dy - s * dx
+        rows[n] = (ahead > TOUCH) & (abs(left) <= tan_half * ahead) & (abs(dz) <= tan_vertical * ahead)
+    count = 0
+    for n in rows[: those(rows)]:
+        dx, dy, dz = marks[0, n] - eye_x, marks[1, n] - eye_y, marks[2, n] - height
+        ahead, left = c * dx + s * dy, c * dy - s * dx
+        distance = np.sqrt(dx * dx + dy * dy + dz * dz)
+        if distance > max_range or -(dx * marks[3, n] + dy * marks[4, n]) <= cos_incidence * distance:
+            continue
+        if _hidden(0.0, 0.0, ahead, left, own_walls[n], near[:num_near], near_rows):
+            continue
+        length = np.sqrt(ahead * ahead + left * left)
+        free = True
+        for j in range(len(poses)):
+            if j != robot and free:
+                ox, oy = poses[j, 0] - eye_x, poses[j, 1] - eye_y
+                x, y = c * ox + s * oy, c * oy - s * ox
+                free = ray_to_disc(ahead / length, left / length, x, y, robot_radius) >= length
+        if free:
+            rows[count] = n
+            count += 1
+    return count
+
+
+@jit
+def _room_to_look(num_walls: int, num_landmarks: int) -> tuple[FloatArray, IntArray, IntArray]:
+    """Return what `_find_visible` works in and writes to."""
+    return np.empty((num_walls, 4)), np.empty(num_walls, np.int64), np.empty(num_landmarks, np.int64)
+
+
+@jit
 def see(
     poses: FloatArray,
     marks: FloatArray,
@@ -49,85 +115,47 @@ def see(
         view: (7,) float64. See `view_limits`.
         seen: (K, N) bool. Written to.
     """
-    forward, aside, height, max_range, tan_half, tan_vertical, cos_incidence = view
     seen[:] = False
-    near, near_rows = np.empty((walls.shape[1], 4)), np.empty(walls.shape[1], np.int64)
-    in_image = np.empty(marks.shape[1], np.int64)
+    near, near_rows, rows = _room_to_look(walls.shape[1], marks.shape[1])
     for k in range(len(poses)):
-        theta = poses[k, 2]
-        c, s = np.cos(theta), np.sin(theta)
-        eye_x, eye_y = poses[k, 0] + c * forward - s * aside, poses[k, 1] + s * forward + c * aside
-        num_near = walls_in_wedge(eye_x, eye_y, theta, walls, tan_half + EPSILON, max_range, near, near_rows)
-        for n in range(marks.shape[1]):
-            dx, dy, dz = marks[0, n] - eye_x, marks[1, n] - eye_y, marks[2, n] - height
-            ahead, left = c * dx + s * dy, c * dy - s * dx
-            in_image[n] = (ahead > TOUCH) & (abs(left) <= tan_half * ahead) & (abs(dz) <= tan_vertical * ahead)
-        for n in in_image[: those(in_image)]:
-            dx, dy, dz = marks[0, n] - eye_x, marks[1, n] - eye_y, marks[2, n] - height
-            ahead, left = c * dx + s * dy, c * dy - s * dx
-            distance = np.sqrt(dx * dx + dy * dy + dz * dz)
-            if distance > max_range or -(dx * marks[3, n] + dy * marks[4, n]) <= cos_incidence * distance:
-                continue
-            if _hidden(0.0, 0.0, ahead, left, own_walls[n], near[:num_near], near_rows):
-                continue
-            length = np.sqrt(ahead * ahead + left * left)
-            free = True
-            for j in range(len(poses)):
-                if j != k and free:
-                    ox, oy = poses[j, 0] - eye_x, poses[j, 1] - eye_y
-                    x, y = c * ox + s * oy, c * oy - s * ox
-                    free = ray_to_disc(ahead / length, left / length, x, y, robot_radius) >= length
-            seen[k, n] = free
+        count = _find_visible(k, poses, marks, own_walls, walls, robot_radius, view, near, near_rows, rows)
+        for n in rows[:count]:
+            seen[k, n] = True
 
 
 @jit
-def choose(
-    visible: BoolArray,
-    keys: FloatArray,
-    detection_probability: float,
-    num_false: IntArray,
-    most: int,
-    chosen: IntArray,
-    counts: IntArray,
-) -> tuple[int, int]:
+def choose(visible: IntArray, keys: FloatArray, detection_probability: float, places: int, chosen: IntArray) -> int:
     """Detect landmarks and choose among the detected ones.
 
     A landmark with a uniform key in [0, 1) is detected if the key is below the probability. The detected ones with the
     smallest keys are then a uniform choice in uniformly random order.
 
     Args:
-        visible: (K, N) bool.
-        keys: (K, N) float64, uniform.
+        visible: (n,) int64. Indices of visible landmarks.
+        keys: (N,) float64, uniform. Of all landmarks.
         detection_probability: Of a visible landmark.
-        num_false: (K,) int64. Places that false points take in the frame of each robot; changed to `most` where larger.
-        most: Places in each frame.
-        chosen: (K most,) int64. Written to: the chosen landmarks of all robots one after the other.
-        counts: (K,) int64. Written to: the number for each robot.
+        places: How many may be chosen.
+        chosen: (at least places,) int64. Written to: the chosen landmarks.
 
     Returns:
-        How many are chosen, and how many false points there are.
+        How many are chosen.
     """
-    total = extra = 0
-    for k in range(len(visible)):
-        num_false[k] = min(num_false[k], most)
-        extra += num_false[k]
-        begin, places = total, most - num_false[k]
-        for n in range(visible.shape[1]):
-            if not visible[k, n] or keys[k, n] >= detection_probability:
-                continue
-            if total - begin < places:
-                at = total
-                total += 1
-            elif total > begin and keys[k, n] < keys[k, chosen[total - 1]]:
-                at = total - 1
-            else:
-                continue
-            while at > begin and keys[k, chosen[at - 1]] > keys[k, n]:
-                chosen[at] = chosen[at - 1]
-                at -= 1
-            chosen[at] = n
-        counts[k] = total - begin
-    return total, extra
+    count = 0
+    for n in visible:
+        if keys[n] >= detection_probability:
+            continue
+        if count < places:
+            at = count
+            count += 1
+        elif count > 0 and keys[n] < keys[chosen[count - 1]]:
+            at = count - 1
+        else:
+            continue
+        while at > 0 and keys[chosen[at - 1]] > keys[n]:
+            chosen[at] = chosen[at - 1]
+            at -= 1
+        chosen[at] = n
+    return count
 
 
 @jit
@@ -141,14 +169,36 @@ def detect(
     keys: FloatArray,
     detection_probability: float,
     num_false: IntArray,
-    most: int,
     chosen: IntArray,
     counts: IntArray,
 ) -> tuple[int, int]:
-    """Choose among the landmarks that each camera sees and detects: `see` and `choose`, whose arguments these are."""
-    seen = np.empty(keys.shape, dtype=np.bool_)
-    see(poses, marks, own_walls, walls, robot_radius, view, seen)
-    return choose(seen, keys, detection_probability, num_false, most, chosen, counts)
+    """Choose among the landmarks that each camera sees and detects.
+
+    Args:
+        poses: (K, 3) float64. As of `see`, as what follows.
+        marks: (5, N) float64.
+        own_walls: (N,) int64.
+        walls: (4, S) float64.
+        robot_radius: [m].
+        view: (7,) float64.
+        keys: (K, N) float64, uniform. See `choose`.
+        detection_probability: Likewise.
+        num_false: (K,) int64. Places that false points take in the frame of each robot; changed to B where larger.
+        chosen: (K, B) int64. Written to: the chosen landmarks of each robot.
+        counts: (K,) int64. Written to: how many they are.
+
+    Returns:
+        How many are chosen in all, and how many false points there are.
+    """
+    near, near_rows, rows = _room_to_look(walls.shape[1], marks.shape[1])
+    total = extra = 0
+    for k in range(len(poses)):
+        count = _find_visible(k, poses, marks, own_walls, walls, robot_radius, view, near, near_rows, rows)
+        num_false[k] = min(num_false[k], chosen.shape[1])
+        places = chosen.shape[1] - num_false[k]
+        counts[k] = choose(rows[:count], keys[k], detection_probability, places, chosen[k])
+        total, extra = total + counts[k], extra + num_false[k]
+    return total, extra
 
 
 @jit

@@ -24,7 +24,15 @@ def those(rows: IntArray) -> int:
 
 @jit
 def walls_in_wedge(
-    x: float, y: float, theta: float, walls: FloatArray, tan_half: float, reach: float, near: FloatArray, rows: IntArray
+    x: float,
+    y: float,
+    cosine: float,
+    sine: float,
+    walls: FloatArray,
+    tan_half: float,
+    reach: float,
+    near: FloatArray,
+    rows: IntArray,
 ) -> int:
     """Find the walls that may cut a wedge ahead.
 
@@ -34,17 +42,18 @@ def walls_in_wedge(
     Args:
         x: Where the wedge begins [m], world frame.
         y: Likewise.
-        theta: Direction of its axis [rad].
+        cosine: Of the direction of its axis.
+        sine: Likewise.
         walls: (4, S) float64 [m], world frame. By rows, for vector instructions.
         tan_half: The wedge opens by +-atan of this around its axis; <= 0 stands for all round.
         reach: Its length [m].
-        near: (S, 4) float64 [m], in the frame (x, y, theta). Written to: the ends of these walls, one after the other.
+        near: (S, 4) float64 [m], in the frame of the wedge. Written to: the ends of these walls, one after the other.
         rows: (S,) int64. Written to: their indices.
 
     Returns:
         How many they are.
     """
-    c, s = np.cos(theta), np.sin(theta)
+    c, s = cosine, sine
     for i in range(walls.shape[1]):
         dx1, dy1, dx2, dy2 = walls[0, i] - x, walls[1, i] - y, walls[2, i] - x, walls[3, i] - y
         x1, y1 = c * dx1 + s * dy1, c * dy1 - s * dx1
@@ -122,8 +131,8 @@ def cast_scans(
     near, rows = np.empty((walls.shape[1], 4)), np.empty(walls.shape[1], np.int64)
     for k in range(len(poses)):
         x, y, theta = poses[k]
-        num_near = walls_in_wedge(x, y, theta, walls, tan_half, max_range, near, rows)
         c, s = np.cos(theta), np.sin(theta)
+        num_near = walls_in_wedge(x, y, c, s, walls, tan_half, max_range, near, rows)
         num_others = 0
         for j in range(len(poses)):
             ox, oy = poses[j, 0] - x, poses[j, 1] - y
