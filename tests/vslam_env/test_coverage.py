@@ -4,7 +4,7 @@ import numpy as np
 
 from slam_backend.errors import FloatArray
 from tests.vslam_env.small_env import small_env
-from vslam_env.coverage import Coverage, CoverageMeter
+from vslam_env.coverage import SEERS, Coverage, CoverageMeter
 from vslam_env.navigation import TeamGrids
 
 STARTS = np.array([[1.0, 2.0, 0.0], [7.0, 2.0, np.pi]])
@@ -45,12 +45,12 @@ def test_finds_are_those_of_a_plain_count() -> None:
         positions = rng.uniform(0.0, 8.0, (3, 2))
         said = np.empty(3)
         share = coverage.update(team, positions, said)
-        fresh = (coverage._seers > 0) & ~ever
+        fresh = (coverage._floor[SEERS] > 0) & ~ever
         nearest = np.hypot(*np.moveaxis(SQUARES[:, None] - positions, -1, 0)).argmin(axis=1)
         found += np.bincount(nearest[fresh], minlength=3) / len(SQUARES)
         ever |= fresh
         np.testing.assert_allclose(said, found)
-        assert share == np.mean(coverage._seers > 0)
+        assert share == np.mean(coverage._floor[SEERS] > 0)
     assert ever.mean() > 0.3
 
 

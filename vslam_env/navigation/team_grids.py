@@ -16,7 +16,7 @@ class TeamGrids:
 
     Attributes:
         grids: Of the robots.
-        cells: (K, 300, 300) uint8, read-only. Their cells, one after the other.
+        cells: (K, 300, 300) uint8. Their cells, one after the other. To be looked at.
         changes: (K, 1 + n) int32. Per grid how many verdicts have changed since whoever keeps count of the cells set
             this number to 0, then the places of that many cells in the flat grid (some may stand there twice). -1 if
             all may have changed, as in the beginning.
@@ -26,12 +26,10 @@ class TeamGrids:
 
     def __init__(self, num_robots: int) -> None:
         shape = (num_robots, GRID_SIZE, GRID_SIZE)
-        self._evidence, self._cells = np.zeros(shape, np.int8), np.full(shape, UNKNOWN, np.uint8)
+        self._evidence, self.cells = np.zeros(shape, np.int8), np.full(shape, UNKNOWN, np.uint8)
         self.changes = np.full((num_robots, 1 + _painting.MOST_CHANGES), -1, np.int32)
         self.bounds = np.zeros((num_robots, 4), np.int32)
-        self.grids = list(map(SeenGrid._of, self._evidence, self._cells, self.changes, self.bounds))
-        self.cells = self._cells.view()
-        self.cells.flags.writeable = False
+        self.grids = list(map(SeenGrid._of, self._evidence, self.cells, self.changes, self.bounds))
 
     def paint_readings(
         self,
@@ -57,7 +55,7 @@ class TeamGrids:
         Raises:
             ValueError: If one of these poses is not finite, or ranges are less than 0; then nothing is painted.
         """
-        grids = self._evidence, self._cells, self.changes, self.bounds
+        grids = self._evidence, self.cells, self.changes, self.bounds
         owner, robot = _painting.paint_readings(*grids, shared, poses, scans, bumps, directions, max_range, radius)
         if owner >= 0:
             pose_floats(poses[owner, robot])
