@@ -22,6 +22,7 @@ g = A^T S^-1 r to the gradient. A gate takes S + A P A^T, with P the covariance 
 
 from slam_backend._kernels.landmark_updates import YOUNG
 from slam_backend._kernels.layout import FAR, LANES, MIN_DEPTH
+from slam_backend._kernels.particle_maps import gather, hold, outline
 from slam_backend._kernels.places import carry_odds, refresh
 from slam_backend._kernels.readings import extent, noises_to_robot_axes, read_team, to_robot_axes
 from slam_backend._kernels.resampling import resample
@@ -31,6 +32,6 @@ from slam_backend._kernels.weights import add_share, mixture
 
 __all__ = [
     "FAR", "IDLE", "LANES", "MIN_DEPTH", "MOVED", "PLACED", "STOOD", "YOUNG",
-    "add_share", "carry_odds", "extent", "mixture", "noises_to_robot_axes", "read_team", "refresh", "resample", "stand",
-    "take_turns", "to_robot_axes", "write_sigmas",
+    "add_share", "carry_odds", "extent", "gather", "hold", "mixture", "noises_to_robot_axes", "outline", "read_team",
+    "refresh", "resample", "stand", "take_turns", "to_robot_axes", "write_sigmas",
 ]  # fmt: skip
