@@ -36,10 +36,9 @@ class FilterArrays:
         self._distances: FloatArray = np.empty((0, padded))
 
     def _make_room_for(self, count: int) -> None:
-        """See to it that there is room for what is made of so many measurements."""
-        if len(self._found) < count:
-            shape = 2 * count, self._found.shape[1]
-            self._found, self._distances = np.empty(shape, np.int32), np.empty(shape)
+        """Provide room for what is made of so many measurements, and more."""
+        shape = 2 * count, self._found.shape[1]
+        self._found, self._distances = np.empty(shape, np.int32), np.empty(shape)
 
     @property
     def num_robots(self) -> int:

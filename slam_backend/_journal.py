@@ -2,14 +2,13 @@
 
 from collections.abc import Sequence
 from itertools import groupby
-from typing import NamedTuple
 
 import numpy as np
 
 from slam_backend._kernels.layout import ASSOCIATED
 from slam_backend._log_kernels import write_guesses
 from slam_backend._rejuvenation_step import RejuvenationStep
-from slam_backend.errors import FloatArray, IntArray
+from slam_backend.errors import FloatArray
 from slam_backend.input_log import StepInput
 from slam_backend.reports import StepReport
 from slam_backend.run_log import RobotLog
@@ -17,25 +16,8 @@ from slam_backend.run_log import RobotLog
 LONGEST = 32  # steps that wait
 
 
-class Entry(NamedTuple):
-    """One step.
-
-    Attributes:
-        step: Its number.
-        inputs: What was read.
-        report: What the filter made of it.
-        means: (K, 3) [m, m, rad] where its robots were thought to be.
-    """
-
-    step: int
-    inputs: StepInput
-    report: StepReport
-    means: FloatArray
-
-    @property
-    def found(self) -> IntArray:
-        """(n,) landmark that each measurement was taken for, -1 = none; only those of the robots mean anything."""
-        return np.asarray(self.report.findings.told[ASSOCIATED])
+# Of one step: its number, what was read, what the filter made of it, and where its robots were thought to be (K, 3).
+Entry = tuple[int, StepInput, StepReport, FloatArray]
 
 
 def write_down(entries: Sequence[Entry], logs: Sequence[RobotLog], smoother: RejuvenationStep | None) -> None:
@@ -52,7 +34,8 @@ def write_down(entries: Sequence[Entry], logs: Sequence[RobotLog], smoother: Rej
 
 def _robots_of(entry: Entry) -> tuple[int, tuple[int, ...]]:
     """Return how many robots there are readings of, and whose were taken in: these make steps alike."""
-    return len(entry.inputs.turns), entry.report.rows
+    _, inputs, report, _ = entry
+    return len(inputs.turns), report.rows
 
 
 def _write_together(entries: Sequence[Entry], logs: Sequence[RobotLog], smoother: RejuvenationStep | None) -> None:
@@ -62,7 +45,8 @@ def _write_together(entries: Sequence[Entry], logs: Sequence[RobotLog], smoother
     table = np.concatenate([read.table for read in inputs])
     moves = np.concatenate([read.moves for read in inputs])
     sightings = np.concatenate([read.sightings for read in inputs])
-    found, means = np.concatenate([entry.found for entry in entries]), np.concatenate(means_then)
+    found = np.concatenate([report.findings.told[ASSOCIATED] for report in reports])
+    means = np.concatenate(means_then)
     for robot, (row, log) in enumerate(zip(reports[0].rows, logs, strict=True)):
         if row >= 0:
             log.extend(row, steps, table, moves, sightings, found)
@@ -75,8 +59,9 @@ def _write_together(entries: Sequence[Entry], logs: Sequence[RobotLog], smoother
 
 def _tell_refused(smoother: RejuvenationStep, robot: int, row: int, entries: Sequence[Entry]) -> None:
     """Tell the smoother what of a robot's measurements was neither matched nor new."""
-    for entry in entries:
-        if entry.report.num_rejected:
-            _, begin, end, _, named, _ = entry.inputs.turns[row]
+    for step, inputs, report, _ in entries:
+        if report.num_rejected:
+            _, begin, end, _, named, _ = inputs.turns[row]
             if not named:
-                smoother.note_refused(robot, entry.step, entry.found[begin:end], entry.inputs.descriptors[begin:end])
+                found = report.findings.told[ASSOCIATED, begin:end]
+                smoother.note_refused(robot, step, found, inputs.descriptors[begin:end])

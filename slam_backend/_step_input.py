@@ -36,7 +36,7 @@ def check_step(
     limit = min(FARTHEST_POINT, FLATTEST * camera.baseline * camera.sigma_px / camera.sigma_disparity_px)
     if isinstance(measurements, TeamMeasurements):
         if identities is None and poses is None:
-            inputs = _read_at_a_glance(k, size, limit, odometry, measurements)
+            inputs = read_by_team(k, size, odometry, measurements, FARTHEST_MOVE, limit)
             if inputs is not None:
                 return inputs
         measurements = _cut_out(measurements)
@@ -50,21 +50,6 @@ def check_step(
         if names[robot] is not None:
             names[robot] = _check_names(robot, names[robot], 0 if frame is None else len(frame))
     return in_one_table(moves, moved, exact, *seen_by_each(frames, names))
-
-
-def _read_at_a_glance(k: int, size: int, limit: float, odometry: Any, frames: TeamMeasurements) -> StepInput | None:
-    """Return what k robots read if all moved and looked and nothing is amiss; None: it has to be looked at one by one.
-
-    Args:
-        k, size, odometry, frames: As of `check_step`.
-        limit: As of `_check_frame`, which takes all that is taken here.
-    """
-    if type(odometry) is not np.ndarray or odometry.dtype != np.float64 or odometry.shape != (k, 3):
-        return None
-    count, own_size = frames.descriptors.shape
-    if len(frames.ends) != k or len(frames.points) != count or (size and own_size != size):
-        return None
-    return read_by_team(odometry.copy(), frames, FARTHEST_MOVE, limit)
 
 
 def _cut_out(frames: TeamMeasurements) -> list[Measurements]:

@@ -1,6 +1,7 @@
 """The readings of several robots in one table, with their measurements in the axes that kernels take."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -22,17 +23,21 @@ Seen = tuple[list[Span], dict[int, BoolArray], FloatArray, Float32Array, IntArra
 
 
 def read_by_team(
-    moves: FloatArray, frames: TeamMeasurements, farthest_move: float, farthest_point: float
+    k: int, size: int, odometry: Any, frames: TeamMeasurements, farthest_move: float, farthest_point: float
 ) -> StepInput | None:
-    """Return what N robots read that have all moved and looked; None if anything is amiss, or a limit is passed.
+    """Return what k robots read if all moved and looked and nothing is amiss; None: it has to be looked at one by one.
 
     Args:
-        moves: (N, 3) odometry; the caller is not to write to it any more.
-        frames: Of the N robots.
+        k, size, odometry, frames: As of `check_step`, which takes all that is taken here.
         farthest_move, farthest_point: Limits [m, rad] to the odometry and [m] to points, as of `_kernels.read_team`.
     """
+    if type(odometry) is not np.ndarray or odometry.dtype != np.float64 or odometry.shape != (k, 3):
+        return None
     points, descriptors, ends = frames
-    table, sightings = np.empty((len(moves), 6), np.int64), np.empty((len(points), 9))
+    count, own_size = descriptors.shape
+    if len(ends) != k or len(points) != count or (size and own_size != size):
+        return None
+    moves, table, sightings = odometry.copy(), np.empty((k, 6), np.int64), np.empty((count, 9))
     if not _kernels.read_team(moves, points, ends, farthest_move, farthest_point, table, sightings):
         return None
     return StepInput(table.tolist(), table, moves, {}, sightings, descriptors, NO_NAMES, frozenset())

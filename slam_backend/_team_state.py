@@ -33,7 +33,7 @@ class TeamState:
         lineup: Who goes by which filter; the same object until that changes.
         _is_stale: Whether the groups have changed since.
         _together: (K,) int64. Networks of robots that are all in contact.
-        _numbers: Of all maps that are in use, as of the lineup `_numbered`.
+        _numbers: Of all maps that are in use, as of the lineup `_last_lineup`.
         _step: Number of the next step.
         _epoch: How many merges and undos there were.
         _size: Length of the descriptors, 0 before it is known.
@@ -79,7 +79,7 @@ class TeamState:
         self._together = reach(None, count)
         self._numbers = frozenset(range(count))
         self._settle()
-        self._numbered: Lineup | None = None
+        self._last_lineup: Lineup | None = None
         self._step = 0
         self._epoch = 0
         self._size = 0
@@ -122,7 +122,7 @@ class TeamState:
         at_hand = {group.robots: group.trunk.filter for group in self._groups}  # filling is faster than building
         self._groups = [Group.from_state(group, at_hand) for group in state["groups"]]
         self._settle()
-        self._numbered, self._size = None, 0
+        self._last_lineup, self._size = None, 0
         self._numbers = frozenset(state["numbers"])
         self._alignment, self._merging = state["alignment"], state["merging"]
         self._schedule.set_state(state["schedule"])

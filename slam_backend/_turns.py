@@ -72,7 +72,8 @@ def take_turns(slam: "FilterState", inputs: StepInput, seats: Seats, told: IntAr
             place(slam, robot, inputs.moves[row])
     if used:
         maps.make_room(used, inputs.descriptors.shape[1])
-        slam._make_room_for(len(inputs.sightings))
+        if len(slam._found) < len(inputs.sightings):
+            slam._make_room_for(len(inputs.sightings))
     step = (
         0 if slam._rejuvenation is None else slam._rejuvenation.steps + 1, slam._assumed,
         seats.array, inputs.table, inputs.moves, slam._rng.standard_normal((active, maps.num_particles, 3)),

@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from slam_backend._journal import LONGEST, Entry
+from slam_backend._journal import LONGEST
 from slam_backend._rejuvenation_step import RejuvenationStep
 from slam_backend._step_input import check_step
 from slam_backend._turns import take_turns
@@ -174,7 +174,7 @@ class FastSlam(FilterKnowledge):
         report = StepReport(findings, seats.rows, created, new, matched, rejected, ess, nis, is_depleted)
         if len(self._journal) == LONGEST:
             self._write_down()
-        self._journal.append(Entry(self._steps, inputs, report, self._estimates.means.copy()))
+        self._journal.append((self._steps, inputs, report, self._estimates.means.copy()))
         self._steps += 1
         for slots in deserted:
             self._maps.release(slots)

@@ -83,9 +83,10 @@ class TeamSlam(TeamKnowledge):
         camera = lineup.branches[0].filter.options.camera
         inputs = check_step(count, size, camera, odometry, measurements, identities, poses)
         records, before = self._records, len(self._events)
-        records.log.record(self._step, inputs)
         if contacts is not None or lineup.is_split:
             lineup = self._regrouped(networks)
+        if lineup.oldest is not None:
+            records.log.record(self._step, inputs)
         findings, rejuvenations = self._advance(lineup, inputs)
         if lineup.is_watched:
             self._doubt()
@@ -94,9 +95,9 @@ class TeamSlam(TeamKnowledge):
             self._settle()
             lineup = self.lineup
         oldest = self._step + 1 if lineup.oldest is None else lineup.oldest
-        records.log.forget_before(oldest)
-        if lineup is not self._numbered:
+        if lineup is not self._last_lineup:
             self._note_dropped(lineup)
+            records.log.forget_before(oldest)
         events, entries = tuple(self._events[before:]), tuple(records.entries)
         report = TeamReport(
             self._step, findings, lineup.groups, events, renamings, lineup.maps, entries, oldest, rejuvenations
@@ -224,7 +225,7 @@ class TeamSlam(TeamKnowledge):
     def _note_dropped(self, lineup: Lineup) -> None:
         """Write down which maps are gone since the last lineup."""
         self._records.entries += [MapDropped(number) for number in sorted(self._numbers - lineup.numbers)]
-        self._numbered, self._numbers = lineup, lineup.numbers
+        self._last_lineup, self._numbers = lineup, lineup.numbers
 
     def _descriptor_size(self) -> int:
         """Return the length of the descriptors in use, 0 before the first one; it stays the same from there on."""
