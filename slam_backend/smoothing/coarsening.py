@@ -31,13 +31,13 @@ def coarsened(
         graph: At its mode, with what is known there of its spreads; see `at_mode`.
         camera: As in `find_mode`.
         options: How many keys, and how many of them fresh, of all robots together.
-        sightings: Of the graph, wherever linearised; None: they are gathered.
+        sightings: Of the graph, wherever they were linearised before they are here; None: they are gathered.
     """
     k, robots = graph.num_keys, len(graph.tips)
     fresh, raw, sighted = (np.empty(k, dtype=np.bool_) for _ in range(3))
     share = max(1, options.fresh_keys // robots)
     _kernels.look_at_keys(graph.robots, graph.frame_keys, share, MOST_FRAMES, fresh, raw)
-    seen = Sightings.of(graph) if sightings is None else sightings.copy()
+    seen = Sightings.of(graph) if sightings is None else sightings
     graph, seen = _consistent(graph, seen, raw, camera, options)
     rows = np.empty(len(seen.keys), dtype=np.int64)
     rows = rows[: _kernels.to_freeze(seen.frozen, seen.keys, raw, rows, sighted)]

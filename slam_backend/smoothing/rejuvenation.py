@@ -12,6 +12,7 @@ from slam_backend.geometry import wrap_angle
 from slam_backend.log_arrays import EXACT, LogArrays
 from slam_backend.motion import OdometryModel
 from slam_backend.resampling import systematic
+from slam_backend.smoothing import _kernels
 from slam_backend.smoothing.coarsening import at_mode, coarsened, compacted
 from slam_backend.smoothing.duplicates import find_duplicates, without_duplicates
 from slam_backend.smoothing.extending import Places, extended, first_rows
@@ -188,13 +189,13 @@ def drawn(
         camera, num_particles, rng, options, looks: As of `rejuvenate`.
     """
     draws = draw_paths(grown, mode, num_particles, rng)
-    graph = coarsened(at_mode(grown, mode, draws.spreads), camera, options, mode.sightings)
     chosen, ess = draws, draws.sample_size
     needed = options.least_ess * num_particles
     if needed > ess >= needed / options.more_draws:
         many = draw_paths(grown, mode, options.more_draws * num_particles, rng)
         chosen = many.taken(systematic(many.weights, rng, num_particles))
         ess = min(many.sample_size, float(num_particles))
+    graph = coarsened(at_mode(grown, mode, draws.spreads), camera, options, mode.sightings)
     if not ess >= needed:
         return Rejuvenation(graph, f"an effective sample size of {ess:.1f}", ess, mode.iterations, None)
     if looks is not None and len(looks.ids):
@@ -223,10 +224,10 @@ def _particles(graph: PathGraph, mode: Mode, draws: Draws) -> Particles:
     covariances = np.zeros((len(means), 3, 3))
     (sought,) = (mode.columns[graph.tips] >= 0).nonzero()
     joint = mode.covariance(graph.tips[sought])
-    off = (poses - means[:, :, None])[sought].reshape(-1, poses.shape[2])
+    off, densities = (poses - means[:, :, None])[sought].reshape(-1, poses.shape[2]), np.empty(len(weights))
     for place, robot in enumerate(sought):
         covariances[robot] = joint[3 * place : 3 * place + 3, 3 * place : 3 * place + 3]
-    densities = -0.5 * np.einsum("im,im->m", off, np.linalg.solve(joint, off)) if len(off) else np.zeros(len(weights))
+    _kernels.weigh_deviations(joint, off, densities)
     frame = np.zeros((3, 3))
     in_view = np.zeros(len(seen), dtype=np.bool_)
     in_view[graph.point_landmarks] = True

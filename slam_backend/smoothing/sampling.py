@@ -6,7 +6,6 @@ from typing import Self
 import numpy as np
 
 from slam_backend.errors import FloatArray, IntArray
-from slam_backend.geometry import between
 from slam_backend.resampling import effective_sample_size
 from slam_backend.smoothing import _kernels
 from slam_backend.smoothing._kernels import LANES, POSE_ROWS, WORK_ROWS
@@ -152,9 +151,8 @@ def weigh_odometry(graph: PathGraph, mode: Mode, rows: FloatArray, num_particles
     """
     blocks, k = rows.shape[:2]
     log_density, spreads = np.zeros(blocks * LANES), np.zeros(k)
-    moved = between(mode.poses[np.maximum(graph.previous, 0)], mode.poses)
     _kernels.odometry_of_paths(
-        rows.reshape(-1), k, blocks, num_particles, graph.previous, moved, graph.motions, mode.odometry_infos, LEVER,
-        log_density, spreads,
+        rows.reshape(-1), k, blocks, num_particles, graph.previous, mode.poses, graph.motions, mode.odometry_infos,
+        LEVER, log_density, spreads,
     )  # fmt: skip
     return log_density[:num_particles], spreads

@@ -61,13 +61,6 @@ class Sightings:
             squares=np.zeros(n),
         )
 
-    def copy(self) -> Self:
-        """Return the same with forms of their own, which may be linearised elsewhere."""
-        return type(self)(
-            self.keys, self.landmarks, self.starts, self.frozen, self.centres.copy(), self.infos.copy(),
-            self.slopes.copy(), self.counts, self.of_points, self.squares.copy(),
-        )  # fmt: skip
-
     def linearise(
         self, graph: PathGraph, poses: FloatArray, landmarks: FloatArray, camera: FloatArray, scale: float,
         kernel: float,

@@ -1,6 +1,7 @@
 """Compiled inner loops of the smoother: forms of sightings, normal equations, their factor, many paths at a time."""
 
 from slam_backend.smoothing._kernels.coarsening import add_sightings, join_keys, look_at_keys, to_freeze
+from slam_backend.smoothing._kernels.densities import weigh_deviations
 from slam_backend.smoothing._kernels.drawing import draw
 from slam_backend.smoothing._kernels.dropping import drop_unused
 from slam_backend.smoothing._kernels.equations import advance, form
@@ -15,4 +16,5 @@ __all__ = [
     "FREE", "LANES", "POSE_ROWS", "WORK_ROWS", "add_sightings", "advance", "condense", "covariance", "draw",
     "drop_unused", "factorise", "form", "gather", "invert", "join_keys", "lay_out", "look_at_keys", "minimum_degree",
     "neighbours", "odometry_of_paths", "replay", "scatter_of_links", "seek", "solve", "to_freeze", "to_lanes",
+    "weigh_deviations",
 ]  # fmt: skip

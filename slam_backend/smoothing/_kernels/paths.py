@@ -129,7 +129,7 @@ def odometry_of_paths(
         poses, num_keys, num_blocks: As in `replay`.
         num_paths: M; the lanes after these are copies.
         previous, motions, infos: (k,), (k, 3), (k, 3, 3) odometry from the previous key and its information.
-        mode: (k, 3) motion from the previous key in the most probable path.
+        mode: (k, 3) [m, m, rad] the most probable path.
         lever: [m] At which an error of the heading counts.
         log_density: (num_blocks * LANES,), result: log p(path given odometry) up to a constant.
         spreads: (k,), result [m^2]: mean square of what the motion from the previous key differs from that of the mode.
@@ -142,7 +142,9 @@ def odometry_of_paths(
         if a < 0:
             continue
         u0, u1, u2 = motions[b, 0], motions[b, 1], motions[b, 2]
-        d0, d1, d2 = mode[b, 0] - u0, mode[b, 1] - u1, mode[b, 2] - u2
+        c, s = math.cos(mode[a, 2]), math.sin(mode[a, 2])
+        dx, dy = mode[b, 0] - mode[a, 0], mode[b, 1] - mode[a, 1]
+        d0, d1, d2 = c * dx + s * dy - u0, c * dy - s * dx - u1, mode[b, 2] - mode[a, 2] - u2
         w = infos[b]
         w00, w01, w02, w11, w12, w22 = w[0, 0], w[0, 1], w[0, 2], w[1, 1], w[1, 2], w[2, 2]
         total = 0.0

@@ -7,7 +7,7 @@ from slam_backend._kernels import LANES as FILTER_LANES
 from slam_backend.errors import FloatArray
 from slam_backend.motion import OdometryModel
 from slam_backend.run_log import RobotLog
-from slam_backend.smoothing._kernels import LANES
+from slam_backend.smoothing._kernels import LANES, weigh_deviations
 from slam_backend.smoothing.extending import extended
 from slam_backend.smoothing.graph import PathGraph
 from slam_backend.smoothing.sampling import draw_paths, drawn_spreads, lane_rows, replay, weigh_odometry
@@ -119,6 +119,21 @@ def test_stereo_paths_are_weighed_evenly():
     weights = draw_paths(graph, mode, 300, np.random.default_rng(6)).log_weights
     weights = np.exp(weights - weights.max())
     assert weights.sum() ** 2 / (weights**2).sum() > 270.0
+
+
+@pytest.mark.parametrize("size", [0, 1, 3, 9])
+def test_deviations_have_their_gaussian_density(size):
+    """Half of the squared Mahalanobis distance off zero, which stays exactly 0."""
+    rng = np.random.default_rng(size)
+    root, off = rng.normal(size=(size, size + 2)), rng.normal(size=(size, 70))
+    off[:, 0] = 0.0
+    covariance, found = root @ root.T, np.empty(70)
+    expected = -0.5 * (off * np.linalg.solve(covariance, off)).sum(axis=0)
+    before = covariance.copy()
+    weigh_deviations(covariance, off, found)
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
+    assert found[0] == 0.0
+    np.testing.assert_array_equal(covariance, before)
 
 
 def test_odometry_of_paths_has_its_gaussian_density():

@@ -1,0 +1,35 @@
+"""How probable many vectors at a time are under one Gaussian."""
+
+import math
+
+from slam_backend._jit import lanes
+from slam_backend.errors import FloatArray
+
+
+@lanes
+def weigh_deviations(covariance: FloatArray, off: FloatArray, log_densities: FloatArray) -> None:
+    """Write the logarithms of a Gaussian's density, up to a constant: 0 at its mean.
+
+    Of L L^T the covariance, the squares of L^-1 d add up to the squared distance of a deviation d.
+
+    Args:
+        covariance: (n, n), positive definite.
+        off: (n, M) deviations from the mean; changed: L^-1 times these.
+        log_densities: (M,), result.
+    """
+    lower, m = covariance.copy(), off.shape[1]
+    log_densities[:] = 0.0
+    for i in range(len(lower)):
+        row = lower[i]
+        for j in range(i):
+            for k in range(j):
+                row[j] -= row[k] * lower[j, k]
+            row[j] /= lower[j, j]
+            row[i] -= row[j] * row[j]
+            for p in range(m):
+                off[i, p] -= row[j] * off[j, p]
+        row[i] = math.sqrt(row[i])
+        scale = 1.0 / row[i]
+        for p in range(m):
+            off[i, p] *= scale
+            log_densities[p] -= 0.5 * off[i, p] * off[i, p]
