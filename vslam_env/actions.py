@@ -59,9 +59,11 @@ def _continuous_commands(actions: Mapping[str, Any], agents: Sequence[str]) -> l
     commands = []
     for agent in agents:
         action = actions[agent]
-        if type(action) is np.ndarray and action.shape == (2,) and action.dtype.kind == "f":  # what nearly all send
-            speed, turn = action.tolist()
-        else:
+        try:
+            speed, turn = action.tolist()  # what nearly all send
+        except (AttributeError, TypeError, ValueError):
+            speed = turn = None
+        if type(speed) is not float or type(turn) is not float:
             speed, turn = _pair(agent, action)
         if not (-1.0 <= speed <= 1.0 and -1.0 <= turn <= 1.0):  # false for NaN
             raise bad_argument(f"actions[{agent!r}]", "two numbers in [-1, 1]", [speed, turn], PAIR_CURE)

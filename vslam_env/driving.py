@@ -95,12 +95,11 @@ class Drivers:
             driver.choose(candidate, poses[robot], beliefs.cells(robot))
         for _ in range(self._ticks):
             poses, bumps = beliefs.poses, episode.readings.bumps.tolist()
-            episode.advance(
-                [
-                    driver.command(poses[robot], beliefs.cells(robot), bumps[robot])
-                    for robot, driver in enumerate(self._drivers)
-                ]
-            )
+            driven = [
+                driver.command(poses[robot], beliefs.cells(robot), bumps[robot])
+                for robot, driver in enumerate(self._drivers)
+            ]
+            episode.advance(np.array(driven))
         return [int(action != 0 and found is None) for action, found in zip(chosen, candidates, strict=True)]
 
     def get_state(self) -> list[dict[str, Any]]:

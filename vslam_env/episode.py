@@ -109,11 +109,14 @@ class Episode:
         """Each robot's frame of the last tick, with the true landmarks behind its measurements."""
         return self._frames.of_each()
 
-    def advance(self, commands: Any) -> None:
-        """Drive all robots with velocity commands (K, 2) [m/s, rad/s] for a tick, and let them perceive and believe."""
+    def advance(self, commands: FloatArray) -> None:
+        """Drive all robots with velocity commands (K, 2) [m/s, rad/s] for a tick, and let them perceive and believe.
+
+        Commands are not checked.
+        """
         simulator, noise, stream = self._simulator, self._config.odometry, self._streams["odometry"]
         before = simulator.poses
-        if simulator.step(commands):
+        if simulator.drive(commands):
             self._collisions = tuple(map(add, self._collisions, simulator.bumped.tolist()))
         self.tick += 1
         self._perceive(read_odometry(before, simulator.poses, self.setting.bias, noise, stream, self._distances))
@@ -178,7 +181,7 @@ class Episode:
             odometry,
             frames.measurements,
             scans,
-            self._simulator.bumped.copy(),
+            self._simulator.bumped,
             between(self.true_starts, poses) if config.oracle_pose else None,
             frames.true_ids if config.oracle_association else None,
             heard,

@@ -48,9 +48,10 @@ class Scan:
     def __init__(self, config: ScanConfig, walls: FloatArray, robot_radius: float = 0.2) -> None:
         self.config = config
         self.ray_angles = config.ray_angles
-        self._rays, self._tan_half = rays_at(self.ray_angles)
-        self._walls = check_array("walls", walls, (None, 4), "Give rows x1 y1 x2 y2 in metres.").T.copy()
-        self._robot_radius = check_float("robot_radius", robot_radius, "Give metres.", at_least=0.0)
+        walls = check_array("walls", walls, (None, 4), "Give rows x1 y1 x2 y2 in metres.")
+        robot_radius = check_float("robot_radius", robot_radius, "Give metres.", at_least=0.0)
+        fan = *rays_at(self.ray_angles), walls.T.copy()
+        self._sight = *fan, robot_radius, config.max_range, config.sigma  # as the kernel expects it
 
     def measure(self, poses: FloatArray, rng: np.random.Generator) -> FloatArray:
         """Read all rays of all robots.
@@ -62,7 +63,6 @@ class Scan:
         Returns:
             (K, R) float64 [m] in [0, max_range]. A ray that meets nothing reads exactly `max_range`.
         """
-        limits = self._robot_radius, self.config.max_range, self.config.sigma
         ranges = rng.standard_normal((len(poses), len(self.ray_angles)))
-        cast_scans(poses, self._rays, self._tan_half, self._walls, *limits, ranges)
+        cast_scans(poses, *self._sight, ranges)
         return ranges

@@ -23,8 +23,7 @@ def _drive_freely(
 ) -> bool:
     """Write down where robots end after a tick if nothing stops them; tell whether surely nothing can.
 
-    A robot goes along the chord of its arc, so that it ends where the arc does. A command that is not finite leads
-    nowhere, and so never surely freely.
+    A robot goes along the chord of its arc, so that it ends where the arc does.
 
     Args:
         poses: (K, 3) float64 [m, m, rad], world frame.
@@ -44,7 +43,6 @@ def _drive_freely(
         goals[k, 1] = poses[k, 1] + chord * np.sin(poses[k, 2] + half)
         goals[k, 2] = (poses[k, 2] + turn + np.pi) % (2.0 * np.pi) - np.pi
         reach[k] = radius + abs(chord)
-        clear &= np.isfinite(reach[k])
     for k in range(len(poses)):
         for i in range(len(walls)):
             ex, ey = walls[i, 2] - walls[i, 0], walls[i, 3] - walls[i, 1]
@@ -69,7 +67,7 @@ class Simulator:
         tick: Duration of a step [s].
         poses: True poses (K, 3) float64 [m, m, rad], world frame, theta in [-pi, pi). Each tick makes both
             arrays anew: what was looked at stays as it was, and nobody is to write to it.
-        bumped: Which robots (K,) bool something kept from going where they were commanded in the last tick.
+        bumped: Which robots (K,) bool something kept from going where they were commanded in the last tick. Read-only.
 
     Raises:
         ValueError: If a number is out of range or poses are not (K, 3) finite numbers.
@@ -78,7 +76,7 @@ class Simulator:
     def __init__(self, world: World, start_poses: FloatArray, radius: float = 0.2, tick: float = 0.1) -> None:
         self.radius = check_float("radius", radius, "Give the radius of a robot in metres.", above=0.0)
         self.tick = check_float("tick", tick, "Give seconds.", above=0.0)
-        self._walls = world.walls
+        self._walls = world.walls.copy()
         self._space = pymunk.Space()
         self._space.collision_slop = SLOP
         self._space.collision_persistence = 1  # a contact is forgotten in the first substep without it
@@ -95,6 +93,7 @@ class Simulator:
             self._space.add(body, pymunk.Circle(body, radius + SKIN))
             self._bodies.append(body)
         self.bumped = self._nobody = np.zeros(len(self._bodies), dtype=np.bool_)
+        self._nobody.setflags(write=False)
 
     def step(self, commands: Any) -> bool:
         """Drive all robots for one tick.
@@ -108,20 +107,20 @@ class Simulator:
         Raises:
             ValueError: If the shape is wrong or a number is not finite.
         """
-        shape, cure = (len(self._bodies), 2), "Give (v, omega) for each robot."
-        as_it_stands = type(commands) is np.ndarray and commands.dtype == np.float64 and commands.flags.c_contiguous
-        if not as_it_stands or commands.shape != shape:
-            commands = check_array("commands", commands, shape, cure)
+        return self.drive(check_array("commands", commands, (len(self._bodies), 2), "Give (v, omega) for each robot."))
+
+    def drive(self, commands: FloatArray) -> bool:
+        """Drive all robots as `step` does, by commands that are as they have to be: nothing is checked."""
         goals = np.empty((len(self._bodies), 3))
         clear = _drive_freely(self.poses, commands, self.tick, self._walls, self.radius + SKIN, goals)
         if clear:
             self.bumped = self._nobody
         else:
-            check_array("commands", commands, shape, cure)  # for only finite ones are surely free
             way = goals[:, :2] - self.poses[:, :2]
             goals[:, :2] = self._move_in_contact(way)
             achieved = np.sum((goals[:, :2] - self.poses[:, :2]) * way, axis=1)
             self.bumped = achieved < (1.0 - SHORTFALL) * np.sum(way * way, axis=1)
+            self.bumped.setflags(write=False)
         self.poses = goals
         return not clear
 
@@ -158,3 +157,4 @@ class Simulator:
         cure = "Give what get_state returned, for the same number of robots."
         self.poses = check_array("state['poses']", state["poses"], (robots, 3), cure)
         self.bumped = check_array("state['bumped']", state["bumped"], (robots,), cure, dtype=np.bool_)
+        self.bumped.setflags(write=False)

@@ -70,12 +70,13 @@ def cross_row(seen: Any, begin: int, end: int, steps: float, beside: float, pass
         The first cell to the left of the first of these rays, and the first to the left of the last one.
     """
     most = float(len(passed) - 1)
-    for i in range(begin, end):  # by itself, it becomes vector instructions
-        seen[CROSSING, i] = np.ceil(min(max(beside + steps * seen[SLOPE, i], 0.0), most))
+    slopes, crossings = seen[SLOPE, begin:end], seen[CROSSING, begin:end]
+    for i in range(len(slopes)):  # by itself, it becomes vector instructions
+        crossings[i] = np.ceil(min(max(beside + steps * slopes[i], 0.0), most))
     passed[:] = 0
     first, crossing = len(passed) - 1, 0
-    for i in range(begin, end):
-        crossing = int(seen[CROSSING, i])
-        passed[np.uint32(crossing)] = i + 1
+    for i in range(len(crossings)):
+        crossing = int(crossings[i])
+        passed[np.uint32(crossing)] = begin + i + 1
         first = min(first, crossing)
     return first, crossing
