@@ -15,7 +15,7 @@ from slam_backend._mixtures import pose_mixtures
 from slam_backend._particle_maps import MAPS_KEPT, ParticleMaps
 from slam_backend._rejuvenated_maps import write_maps
 from slam_backend._rejuvenation_step import SCHEDULE, RejuvenationStep
-from slam_backend._turns import assumed
+from slam_backend._turns import assumed, spans_of
 from slam_backend.errors import IntArray, bad_argument, check_int, check_seed
 from slam_backend.filter_options import FilterOptions
 from slam_backend.reports import PoseEstimates
@@ -34,6 +34,7 @@ class FilterState(FilterArrays):
         options: What it assumes and how it decides.
         may_smooth: Whether it may in the next step; filters of a team take turns.
         _from_origin: Whether all robots started at the origin, as in a filter that was never merged.
+        _spans: Whose turns are taken in each call; where existence is kept, one by one.
         _best: Index of the largest weight along paths.
         _maps: The landmarks of all particles.
         _estimates: The poses of all robots over all particles; written to in each step.
@@ -53,6 +54,7 @@ class FilterState(FilterArrays):
         self._camera = self._assumed[CAMERA:RECOVERY]
         existence = options.existence
         self._existence = None if existence is None else ExistenceStep(existence, options.camera)
+        self._spans = spans_of(k, existence is not None)
         self._rejuvenation = None if options.rejuvenate_every is None else RejuvenationStep(options, k)
         self._maps = ParticleMaps(m, None if existence is None else existence.log_odds_prior)
         self._make_arrays(k, m, self._maps.padded)

@@ -45,11 +45,10 @@ def _write_together(entries: Sequence[Entry], logs: Sequence[RobotLog], smoother
     table = np.concatenate([read.table for read in inputs])
     moves = np.concatenate([read.moves for read in inputs])
     sightings = np.concatenate([read.sightings for read in inputs])
-    found = np.concatenate([report.findings.told[ASSOCIATED] for report in reports])
-    means = np.concatenate(means_then)
+    told, means = np.concatenate([report.findings.told for report in reports], axis=1), np.concatenate(means_then)
     for robot, (row, log) in enumerate(zip(reports[0].rows, logs, strict=True)):
         if row >= 0:
-            log.extend(row, steps, table, moves, sightings, found)
+            log.extend(row, steps, table, moves, sightings, told[ASSOCIATED])
             if smoother is not None:
                 heard, poses = np.empty_like(steps), np.empty((len(steps), 3))
                 count, is_placed = write_guesses(row, robot, steps, table, means, heard, poses)

@@ -12,7 +12,7 @@ from slam_backend._kernels.layout import CREATED
 from slam_backend.errors import FloatArray, IntArray
 from slam_backend.filter_options import FilterOptions
 from slam_backend.geometry import compose
-from slam_backend.input_log import UNHEARD, Seats, StepInput
+from slam_backend.input_log import Seats, StepInput
 
 if TYPE_CHECKING:
     from slam_backend._filter_state import FilterState
@@ -39,6 +39,13 @@ def assumed(options: FilterOptions) -> FloatArray:
         options.proposal == "fastslam2", options.one_to_one,
         options.smoothing.closure_after, options.resample_threshold,
     ])  # fmt: skip
+
+
+def spans_of(num_robots: int, one_by_one: bool) -> tuple[tuple[int, int, bool], ...]:
+    """Return whose turns are taken in each call of a step, from which robot to before which, and if it is over then."""
+    if one_by_one:
+        return (*((robot, robot + 1, False) for robot in range(num_robots)), (num_robots, num_robots, True))
+    return ((0, num_robots, True),)
 
 
 def place(arrays: FilterArrays, robot: int, exact: FloatArray) -> None:
@@ -74,24 +81,21 @@ def take_turns(slam: "FilterState", inputs: StepInput, seats: Seats, told: IntAr
         maps.make_room(used, inputs.descriptors.shape[1])
         if len(slam._found) < len(inputs.sightings):
             slam._make_room_for(len(inputs.sightings))
-    step = (
-        0 if slam._rejuvenation is None else slam._rejuvenation.steps + 1, slam._assumed,
-        seats.array, inputs.table, inputs.moves, slam._rng.standard_normal((active, maps.num_particles, 3)),
-        slam._of_robots, slam._blind, slam._of_particles, slam._frame,
-        maps.values, maps.counts, maps.odds, maps.table, maps.maps, maps.users,
-        maps.free_rows, maps.tops, maps.descriptors, maps.heads,
-        inputs.sightings, inputs.descriptors, inputs.names,
-        slam._found, slam._distances, told, *slam._estimates,
-    )  # fmt: skip
-    if slam._existence is None:
-        return _kernels.take_turns(0, len(seats.rows), True, *step), []
-    deserted = []
-    for robot, row in enumerate(seats.rows):
-        _kernels.take_turns(robot, robot + 1, False, *step)
-        _, begin, end, _, _, count = inputs.turns[row] if row >= 0 else UNHEARD
-        if count >= 0:
-            found, new_slots = slam._found[begin:end], told[CREATED, begin:end]
-            # Room for this was left by `make_room`; only where nobody saw anything may it grow, and then no later turn
-            # looks at a map: so the arrays that later turns are given stay as they are.
-            deserted.append(slam._existence.weigh(maps, slam._poses[robot], slam._best, found, new_slots))
-    return _kernels.take_turns(len(seats.rows), len(seats.rows), True, *step), deserted
+    now = 0 if slam._rejuvenation is None else slam._rejuvenation.steps + 1
+    normals = slam._rng.standard_normal((active, maps.num_particles, 3))
+    means, covariances = slam._estimates
+    deserted: list[IntArray] = []
+    for low, high, is_over in slam._spans:
+        summary = _kernels.take_turns(
+            low, high, is_over, now, slam._assumed, seats.array, inputs.table, inputs.moves, normals,
+            slam._of_robots, slam._blind, slam._of_particles, slam._frame,
+            maps.values, maps.counts, maps.odds, maps.table, maps.maps, maps.users, maps.free_rows, maps.tops,
+            maps.descriptors, maps.heads, inputs.sightings, inputs.descriptors, inputs.names,
+            slam._found, slam._distances, told, means, covariances,
+        )  # fmt: skip
+        if slam._existence is not None and not is_over and (row := seats.rows[low]) >= 0:
+            _, begin, end, _, _, count = inputs.turns[row]
+            if count >= 0:
+                found, new_slots = slam._found[begin:end], told[CREATED, begin:end]
+                deserted.append(slam._existence.weigh(maps, slam._poses[low], slam._best, found, new_slots))
+    return summary, deserted
