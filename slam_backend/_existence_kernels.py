@@ -9,7 +9,7 @@ their cache would not notice a change of it.
 
 import numpy as np
 
-from slam_backend._jit import inlined, jit, lanes
+from slam_backend._jit import fused, in_place, inlined, jit, lanes
 from slam_backend.errors import Float32Array, FloatArray, Int32Array, IntArray
 
 ROUNDED = 1.0 + 1e-9  # no rounding decides what is looked at in detail
@@ -137,7 +137,7 @@ def _is_expected(
     return False
 
 
-@jit
+@in_place
 def count_expected(
     slots: IntArray, row_of: IntArray, values: FloatArray, counts: Int32Array, m: int, pose: FloatArray,
     mount: FloatArray, nearest: float, side: float, rise: float, reach_squared: float,
@@ -179,7 +179,7 @@ def mark_seen(slots: IntArray, num_slots: int, found: Int32Array) -> Int32Array:
     return seen
 
 
-@lanes
+@fused
 def weigh_existence(
     slots: IntArray, seen: Int32Array, odds: FloatArray, row_of: IntArray, values: FloatArray, counts: Int32Array,
     poses: FloatArray, cosines: FloatArray, sines: FloatArray, mount: FloatArray, nearest: float, side: float,
@@ -231,7 +231,7 @@ def weigh_existence(
     return deserted[:num]
 
 
-@jit
+@in_place
 def release(
     slots: IntArray, ids: IntArray, row_of: IntArray, heads: Float32Array, free_rows: IntArray, free_slots: IntArray,
     tops: IntArray, far: np.float32,

@@ -8,29 +8,25 @@ from typing import Any, ParamSpec, TypeVar, cast
 
 import numba
 from llvmlite import ir
-from numba.core import types
+from numba.core import cgutils, types
+from numba.core.cpu import CPUTargetOptions
 from numba.extending import intrinsic
+from numba.np import arrayobj
+
+from slam_backend.errors import FloatArray
 
 P = ParamSpec("P")
 T = TypeVar("T")
 
+LINE = 64  # bytes of a line of the cache
 KERNELS = "_kernels"  # ends the name of a folder whose modules hold kernels that call each other
 
 
-def jit(function: Callable[P, T]) -> Callable[P, T]:
-    """Compile `function` with numba and keep its signature for the type checker.
-
-    numba's disk cache notices edits of the file that holds `function`, not of other files whose kernels it calls:
-    kernels that call each other therefore live in one module, or in one folder whose name ends in `_kernels`, of which
-    an edit of any file is noticed. `parallel=True` is left out on purpose, because it breaks forked workers.
-    """
-    return _compiled(function)
-
-
-def inlined(function: Callable[P, T]) -> Callable[P, T]:
-    """Compile a small building block into each kernel that calls it: passing arrays costs more than its arithmetic."""
-    return _compiled(function, forceinline=True)
-
+# numba counts the references to each array: it makes a counter for each one that Python hands over, and each slice in a
+# kernel costs two atomic instructions. A kernel that only works in arrays which it is given can do without. numba
+# refuses to make an array in one of those, but not to call a kernel that returns some, which nobody would free: a test
+# looks for that. The option is numba's own; in a version that does not know it references are counted everywhere.
+CAN_LEAVE_UNCOUNTED = hasattr(CPUTargetOptions, "_nrt")
 
 # Lane kernels run the same arithmetic over a fixed number of particles, so that the compiler turns it into vector
 # instructions. Two things it needs: a product and a sum may be fused into one instruction (`contract`; sums are not
@@ -38,28 +34,54 @@ def inlined(function: Callable[P, T]) -> Callable[P, T]:
 _LANES: dict[str, Any] = {"fastmath": {"contract"}, "error_model": "numpy"}
 
 
+def jit(function: Callable[P, T]) -> Callable[P, T]:
+    """Compile a kernel that may make arrays, and keep its signature for the type checker.
+
+    numba's disk cache notices edits of the file that holds `function`, not of other files whose kernels it calls:
+    kernels that call each other therefore live in one module, or in one folder whose name ends in `_kernels`, of which
+    an edit of any file is noticed. `parallel=True` is left out on purpose, because it breaks forked workers.
+    """
+    return _compiled(function, counted=True)
+
+
+def fused(function: Callable[P, T]) -> Callable[P, T]:
+    """Compile a kernel that may make arrays and does little but add products: each is rounded once, as by `lanes`."""
+    return _compiled(function, counted=True, **_LANES)
+
+
+def in_place(function: Callable[P, T]) -> Callable[P, T]:
+    """Compile a kernel that works in the arrays it is given: references to them are not counted.
+
+    It makes no arrays, returns none, and calls none that returns some. So do all kernels compiled by the following.
+    """
+    return _compiled(function, counted=False)
+
+
+def inlined(function: Callable[P, T]) -> Callable[P, T]:
+    """Compile a small building block into each kernel that calls it: passing arrays costs more than its arithmetic."""
+    return _compiled(function, counted=False, forceinline=True)
+
+
 def lanes(function: Callable[P, T]) -> Callable[P, T]:
     """Compile a kernel whose loops over lanes are to become vector instructions."""
-    return _compiled(function, **_LANES)
+    return _compiled(function, counted=False, **_LANES)
 
 
 def lanes_inlined(function: Callable[P, T]) -> Callable[P, T]:
     """Compile the arithmetic of one lane into the loops that call it."""
-    return _compiled(function, forceinline=True, **_LANES)
-
-
-def fused(function: Callable[P, T]) -> Callable[P, T]:
-    """Compile a kernel that does little but add products: each is one instruction, rounded once."""
-    return _compiled(function, **_LANES)
+    return _compiled(function, counted=False, forceinline=True, **_LANES)
 
 
 def any_order(function: Callable[P, T]) -> Callable[P, T]:
     """Compile a sum over an array that may be taken in any order, the same one each time, so that it is vectorised."""
-    return _compiled(function, forceinline=True, fastmath={"contract", "reassoc", "nsz"}, error_model="numpy")
+    order = {"contract", "reassoc", "nsz"}
+    return _compiled(function, counted=False, forceinline=True, fastmath=order, error_model="numpy")
 
 
-def _compiled(function: Callable[P, T], **options: Any) -> Callable[P, T]:
+def _compiled(function: Callable[P, T], counted: bool, **options: Any) -> Callable[P, T]:
     """Compile without the interpreter lock and with the cache on disk, if there is a place for it."""
+    if CAN_LEAVE_UNCOUNTED:
+        options["_nrt"] = counted  # said of each: numba would take that of the kernel that calls it first
     try:
         kernel = numba.njit(cache=True, nogil=True, **options)(function)
     except RuntimeError:  # neither the package's folder nor the user's can be written: each process compiles anew
@@ -100,3 +122,30 @@ def _bits_float(typing_context: Any, x: Any) -> Any:
 
 float_bits = cast(Callable[[float], int], intrinsic(_float_bits))
 bits_float = cast(Callable[[int], float], intrinsic(_bits_float))
+
+
+# numba declares no types for these.
+alloca_once: Callable[..., Any] = cgutils.alloca_once
+populate_array: Callable[..., Any] = arrayobj.populate_array
+
+
+def _room(typing_context: Any, size: Any) -> Any:
+    """Return an array (size,) of float64, unset, on the stack (inside kernels only)."""
+    if not isinstance(size, types.IntegerLiteral):
+        return None
+    row = types.Array(types.float64, 1, "C")
+
+    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        data = alloca_once(builder, ir.DoubleType(), size=size.literal_value)
+        data.align = LINE
+        array = context.make_array(row)(context, builder)
+        item, length = (context.get_constant(types.intp, number) for number in (8, size.literal_value))
+        populate_array(array, data=data, shape=[length], strides=[item], itemsize=item, meminfo=None)
+        return array._getvalue()
+
+    return row(size), code
+
+
+# An array of as many float64 as a constant says, unset, that lives as long as the call of a kernel: it costs nothing,
+# and even a kernel that works `in_place` may have it, but not return it.
+room = cast(Callable[[int], FloatArray], intrinsic(prefer_literal=True)(_room))

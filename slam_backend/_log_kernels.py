@@ -3,14 +3,14 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend._jit import jit
+from slam_backend._jit import in_place
 from slam_backend._kernels import IDLE, MOVED, PLACED
 from slam_backend._kernels.layout import ACT, BEGIN, COUNT, END, GIVEN
 from slam_backend.errors import BoolArray, FloatArray, IntArray
 from slam_backend.log_arrays import EXACT, ODOMETRY, STOOD
 
 
-@jit
+@in_place
 def write_rows(
     row: int, first: int, numbers: IntArray, table: IntArray, moves: FloatArray, sightings: FloatArray,
     found: IntArray, most: int, t: int, n: int,
@@ -43,9 +43,11 @@ def write_rows(
                 return k, t, n
             steps[t], given[t] = numbers[k], False
             kinds[t] = EXACT if turn[ACT] == PLACED else ODOMETRY if turn[ACT] == MOVED else STOOD
-            motions[t] = moves[k * count + row]
+            for c in range(3):
+                motions[t, c] = moves[k * count + row, c]
             for b in range(base + turn[BEGIN], base + turn[END]):
-                points[n] = sightings[b, :3]
+                for c in range(3):
+                    points[n, c] = sightings[b, c]
                 ids[n] = found[b]
                 n += 1
             t += 1
@@ -54,7 +56,7 @@ def write_rows(
     return len(numbers), t, n
 
 
-@jit
+@in_place
 def write_guesses(
     row: int, robot: int, numbers: IntArray, table: IntArray, means: FloatArray, steps: IntArray, poses: FloatArray
 ) -> tuple[int, bool]:
@@ -74,7 +76,9 @@ def write_guesses(
     for k in range(len(numbers)):
         turn = table[k * count + row]
         if turn[ACT] != IDLE or turn[COUNT] > 0:
-            steps[num], poses[num] = numbers[k], means[k * of_filter + robot]
+            steps[num] = numbers[k]
+            for c in range(3):
+                poses[num, c] = means[k * of_filter + robot, c]
             is_placed |= turn[ACT] == PLACED
             num += 1
     return num, is_placed

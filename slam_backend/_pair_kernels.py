@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from slam_backend._jit import jit, lanes
+from slam_backend._jit import in_place, jit, lanes
 from slam_backend.errors import BoolArray, FloatArray, IntArray
 
 WIDTH = 16  # pairs in a block
@@ -65,7 +65,7 @@ def _add(records: FloatArray, at: int, state: FloatArray) -> None:
         state[DET + i] = det
 
 
-@jit
+@in_place
 def _gather(
     landmarks_a: FloatArray, held_a: BoolArray, landmarks_b: FloatArray, held_b: BoolArray, from_a: IntArray,
     from_b: IntArray, first: int, records: FloatArray, shared: IntArray,
@@ -88,7 +88,7 @@ def _gather(
         shared[pair] = count
 
 
-@jit
+@in_place
 def _sum(records: FloatArray, motions: FloatArray, first: int, state: FloatArray, log_dets: FloatArray) -> None:
     """Sum over all landmarks of a block at its motions; the logs of |2 pi S|, too, where they are asked for."""
     for p in range(WIDTH):
@@ -104,7 +104,7 @@ def _sum(records: FloatArray, motions: FloatArray, first: int, state: FloatArray
                     log_dets[first + p] += math.log(state[DET + p]) + 3.0 * LOG_2PI
 
 
-@jit
+@in_place
 def _step(state: FloatArray, first: int, shared: IntArray, motions: FloatArray) -> None:
     """Do a step of Gauss and Newton with the pairs of a block that share enough."""
     for p in range(min(WIDTH, len(motions) - first)):

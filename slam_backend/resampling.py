@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from slam_backend._jit import jit
+from slam_backend._jit import in_place
 from slam_backend.errors import FloatArray, IntArray
 
 
@@ -29,7 +29,7 @@ def _invert(weights: FloatArray, uniforms: FloatArray) -> IntArray:
     return np.minimum(np.searchsorted(edges, uniforms, side="right"), len(weights) - 1).astype(np.int64)
 
 
-@jit
+@in_place
 def _write_strata(weights: FloatArray, offsets: FloatArray, ancestors: IntArray) -> None:
     """Write the ancestors of (i + offset) / count, i = 0 .. count - 1; `offsets` has one for all or one for each."""
     count = len(ancestors)

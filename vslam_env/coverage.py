@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend._jit import jit
+from slam_backend._jit import in_place
 from slam_backend.errors import FloatArray
 from slam_backend.geometry import inverse, transform_points
 from vslam_env.navigation import FREE, GRID_SIZE, TeamGrids, cell_of
@@ -15,7 +15,7 @@ PLACE, CELL = 0, 1  # rows of what is laid
 SEERS, EVER = 0, 1  # rows of the floor
 
 
-@jit
+@in_place
 def _recount(changes: Any, cells: Any, places: Any, laid: Any, seen: Any, floor: Any, fresh: Any) -> int:
     """Bring up to date what one robot sees of the floor.
 
@@ -33,7 +33,7 @@ def _recount(changes: Any, cells: Any, places: Any, laid: Any, seen: Any, floor:
         How many more floor cells are seen by some robot than before.
     """
     seers, ever = floor[SEERS], floor[EVER]
-    more, flat, all_may_have = 0, cells.ravel(), changes[0] < 0
+    more, flat, all_may_have = 0, cells.reshape(cells.size), changes[0] < 0
     for k in range(1 if all_may_have else changes[0]):
         for i in range(0 if all_may_have else np.searchsorted(places, changes[1 + k]), len(places)):
             if not all_may_have and places[i] != changes[1 + k]:
@@ -53,7 +53,7 @@ def _recount(changes: Any, cells: Any, places: Any, laid: Any, seen: Any, floor:
     return more
 
 
-@jit
+@in_place
 def _find(fresh: Any, floor: Any, area: Any, positions: Any, found: Any) -> None:
     """Count floor cells that are seen for the first time for the robot nearest to them.
 
@@ -78,7 +78,7 @@ def _find(fresh: Any, floor: Any, area: Any, positions: Any, found: Any) -> None
     fresh[0] = 0
 
 
-@jit
+@in_place
 def _update(
     changes: Any, cells: Any, laid: Any, bounds: Any, seen: Any, floor: Any, fresh: Any, area: Any, positions: Any,
     found: Any, shares: Any,

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend._jit import jit
+from slam_backend._jit import in_place
 from slam_backend.errors import FloatArray, IntArray, check_float
 from slam_backend.landmark_map import TeamOutlines
 from slam_backend.reports import LandmarksCreated, MapCopied, MapDropped, Renaming, TeamReport
@@ -16,7 +16,7 @@ from vslam_env.scoring import FALSE, UNCOUNTED, score_team
 UNUSED = -3  # an id that no landmark has had so far
 
 
-@jit
+@in_place
 def _note_claims(book: IntArray, ids: IntArray, true_ids: IntArray, claim_of: IntArray) -> int:
     """Note what new landmarks claim, if there is room for all of them.
 

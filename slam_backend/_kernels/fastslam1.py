@@ -4,19 +4,19 @@ import math
 
 import numpy as np
 
-from slam_backend._jit import lanes
+from slam_backend._jit import fused, room
 from slam_backend._kernels.candidates import find_candidates
 from slam_backend._kernels.choices import admit, bar_taken, mask_of, write_found
 from slam_backend._kernels.innovations import innovate
 from slam_backend._kernels.landmark_updates import gate_and_update, new_landmark
 from slam_backend._kernels.layout import CANDIDATE_ROWS, CLUTTER, LANES, Q_D, REJECTED
 from slam_backend._kernels.likelihoods import clear_likelihood, total_log_likelihood
-from slam_backend._kernels.motion import enter_pose, sample_motion, take_draws
+from slam_backend._kernels.motion import enter_pose, sample_motion, take_as_exact
 from slam_backend._kernels.places import carry_odds, name_new, open_slot, refresh, tile_of
 from slam_backend.errors import Float32Array, FloatArray, Int32Array, IntArray
 
 
-@lanes
+@fused
 def update_fastslam1(
     poses: FloatArray, means: FloatArray, covariances: FloatArray, moved: bool, odometry: FloatArray,
     sigmas: FloatArray, normals: FloatArray,
@@ -64,7 +64,7 @@ def update_fastslam1(
     records = np.empty((len(slots), CANDIDATE_ROWS * LANES))
     new_rows = np.empty(num, dtype=np.int64)
     match = np.empty((num, LANES))
-    mask, draws = np.empty(LANES), np.zeros(3 * LANES)
+    mask = room(LANES)
     gate = np.inf if named else position_gate
     for b in range(num):
         new_slots[b] = REJECTED
@@ -72,8 +72,7 @@ def update_fastslam1(
         first = block * LANES
         real = min(LANES, num_particles - first)
         if moved:
-            take_draws(draws, normals, first, real)
-            sample_motion(work, poses, first, odometry, sigmas, draws)
+            sample_motion(work, poses, first, odometry, sigmas, normals)
         enter_pose(work, poses, first)
         clear_likelihood(work)
         for b in range(num):
@@ -82,7 +81,7 @@ def update_fastslam1(
                 chosen[i] = -2.0 if i < real else -1.0
             for q in range(starts[b], starts[b + 1]):  # l. 15-24: the nearest descriptor inside the gate
                 row = row_of[slots[q]]
-                tile, record, seen = tile_of(values, padded, row, block), records[q], counts[row, first : first + LANES]
+                tile, record, seen = values[tile_of(padded, row, block)], records[q], counts[row, first : first + LANES]
                 admit(chosen, seen, mask)
                 p = same[q] if one_to_one else REJECTED
                 while p >= 0:
@@ -95,7 +94,7 @@ def update_fastslam1(
                 if new_slots[b] == REJECTED:
                     open_slot(b, new_slots, new_rows, row_of, map_of, values, counts, free_rows, free_slots, tops)
                 new_landmark(
-                    work, tile_of(values, padded, new_rows[b], block), points, noises, b, given, camera, mask,
+                    work, values[tile_of(padded, new_rows[b], block)], points, noises, b, given, camera, mask,
                     counts[new_rows[b], first : first + LANES], walk,
                 )  # fmt: skip
                 for i in range(LANES):
@@ -106,9 +105,5 @@ def update_fastslam1(
             )  # fmt: skip
         for i in range(LANES):
             log_likelihood[first + i] += total_log_likelihood(work, i)
-        for i in range(LANES):
-            for c in range(3):
-                means[c, first + i] = poses[c, first + i]
-            for c in range(6):
-                covariances[c, first + i] = 0.0
+    take_as_exact(poses, means, covariances)
     name_new(new_slots, descriptors, names, named, ids, identities, stored, heads, tops)

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from slam_backend._jit import lanes
+from slam_backend._jit import fused, room
 from slam_backend._kernels.candidates import find_candidates
 from slam_backend._kernels.choices import (
     begin_choice,
@@ -48,7 +48,7 @@ from slam_backend._kernels.recovery import acquit, any_suspect, begin_judging, c
 from slam_backend.errors import Float32Array, FloatArray, Int32Array, IntArray
 
 
-@lanes
+@fused
 def update_fastslam2(
     poses: FloatArray, means: FloatArray, covariances: FloatArray, blind: bool,
     odometry: FloatArray, sigmas: FloatArray, normals: FloatArray,
@@ -93,7 +93,7 @@ def update_fastslam2(
     new_rows = np.empty(num, dtype=np.int64)
     log_clutter = np.empty(num)
     match = np.empty((num, LANES))
-    mask, young, before, draws = np.empty(LANES), np.empty(LANES), np.empty(TILE), np.zeros(3 * LANES)
+    mask, young, before = room(LANES), room(LANES), room(TILE)
     reach, cap = (FARTHEST, position_gate) if named else (position_gate, FARTHEST)
     for b in range(num):
         new_slots[b] = REJECTED
@@ -117,7 +117,7 @@ def update_fastslam2(
             for b in range(num):
                 for q in range(starts[b], starts[b + 1]):
                     row = row_of[slots[q]]
-                    tile = tile_of(values, padded, row, block)
+                    tile = values[tile_of(padded, row, block)]
                     if starts[b + 1] - starts[b] > 1 or not (same[q] < 0 or not one_to_one):
                         keep_distance(records[q])
                     mark_held(records[q], counts[row, first : first + LANES])
@@ -139,7 +139,7 @@ def update_fastslam2(
                 for b in range(num):
                     for q in range(starts[b], starts[b + 1]):
                         if mask_of(match[b], float(q), mask) > 0:
-                            tile = tile_of(values, padded, row_of[slots[q]], block)
+                            tile = values[tile_of(padded, row_of[slots[q]], block)]
                             innovate(work, tile, points, noises, b, given, camera)
                             evaluate(work, tile, records[q], True)
                             robust_weights(records[q], match[b], float(q), position_gate, mask)
@@ -153,7 +153,7 @@ def update_fastslam2(
             low, high = starts[b], starts[b + 1]
             if high - low == 1:
                 row = row_of[slots[low]]
-                tile = tile_of(values, padded, row, block)
+                tile = values[tile_of(padded, row, block)]
                 p = same[low] if one_to_one else REJECTED
                 clear_taken(work)
                 while p >= 0:
@@ -172,7 +172,7 @@ def update_fastslam2(
                     while p >= 0:
                         mark_taken(work, match[owners[p]], float(p))
                         p = same[p]
-                    tile = tile_of(values, padded, row_of[slots[q]], block)
+                    tile = values[tile_of(padded, row_of[slots[q]], block)]
                     innovate(work, tile, points, noises, b, given, camera)
                     evaluate(work, tile, records[q], True)
                     consider_again(work, records[q], float(q), looks[q], cap, position_gate, dead_zone, dead_radius)
@@ -185,8 +185,8 @@ def update_fastslam2(
                 match[b, i] = -1.0
 
         # The pose: N(x^, P^) from all matches; weigh by the predictive likelihood; sample once.
-        take_draws(draws, normals, first, real)
-        posterior(work, draws, log_likelihood[first : first + LANES])
+        take_draws(work, normals, first)
+        posterior(work, log_likelihood[first : first + LANES])
         store_rows(work, X0, means, first)
         store_rows(work, SPREAD00, covariances, first)
         store_rows(work, X, poses, first)
@@ -196,7 +196,7 @@ def update_fastslam2(
             for q in range(starts[b], starts[b + 1]):
                 if mask_of(match[b], float(q), mask) > 0:
                     row = row_of[slots[q]]
-                    tile = tile_of(values, padded, row, block)
+                    tile = values[tile_of(padded, row, block)]
                     seen = counts[row, first : first + LANES]
                     num_young = find_young(seen, mask, young)
                     count_matches(seen, mask)
@@ -211,7 +211,7 @@ def update_fastslam2(
                 if new_slots[b] == REJECTED:
                     open_slot(b, new_slots, new_rows, row_of, map_of, values, counts, free_rows, free_slots, tops)
                 new_landmark(
-                    work, tile_of(values, padded, new_rows[b], block), points, noises, b, given, camera, mask,
+                    work, values[tile_of(padded, new_rows[b], block)], points, noises, b, given, camera, mask,
                     counts[new_rows[b], first : first + LANES], walk,
                 )  # fmt: skip
             write_found(

@@ -42,7 +42,7 @@ def match_first(
         low, high = starts[b], starts[b + 1]
         if high - low == 1 and (same[low] < 0 or not one_to_one):
             row = row_of[slots[low]]
-            tile = tile_of(values, padded, row, block)
+            tile = values[tile_of(padded, row, block)]
             innovate(work, tile, points, noises, b, given, camera)
             _match_alone(
                 work, tile, records[low], counts[row, first : first + LANES], match[b], float(low), reach, position_gate
@@ -51,7 +51,7 @@ def match_first(
         begin_choice(work)
         for q in range(low, high):
             row = row_of[slots[q]]
-            tile = tile_of(values, padded, row, block)
+            tile = values[tile_of(padded, row, block)]
             mark_held(records[q], counts[row, first : first + LANES])
             innovate(work, tile, points, noises, b, given, camera)
             evaluate(work, tile, records[q], False)

@@ -28,7 +28,8 @@ BEST, SECOND, CHOSEN, DEAD, LOG_BEST = (LANES * k for k in range(49, 54))  # of 
 LOST, SURE, CONTRADICT, WIDE = (LANES * k for k in range(54, 58))
 TAKEN, C01 = LANES * 58, LANES * 59
 KEPT00, KEPT10, KEPT11, KEPT20, KEPT21, KEPT22, KEPT01, KEPT_WIDE = (LANES * k for k in range(60, 68))  # of C
-WORK_ROWS = 68
+DRAW0, DRAW1, DRAW2 = (LANES * k for k in range(68, 71))  # standard normal
+WORK_SIZE, SPREAD_SIZE = LANES * 71, LANES * 6
 
 # Rows of one candidate's record.
 QJ00, QJ01, QJ02, QJ11, QJ12, QJ22, QG0, QG1, QG2 = (LANES * k for k in range(9))

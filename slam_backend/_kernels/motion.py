@@ -2,8 +2,6 @@
 
 import math
 
-import numpy as np
-
 from slam_backend._jit import lanes, lanes_inlined
 from slam_backend._kernels.lane_math import sine_cosine, wrapped
 from slam_backend._kernels.layout import (
@@ -15,6 +13,9 @@ from slam_backend._kernels.layout import (
     C21,
     C22,
     COS,
+    DRAW0,
+    DRAW1,
+    DRAW2,
     LANES,
     N00,
     N01,
@@ -155,26 +156,37 @@ def enter_pose(work: FloatArray, poses: FloatArray, first: int) -> None:
 
 
 @lanes
-def take_draws(draws: FloatArray, normals: FloatArray, first: int, real: int) -> None:
-    """Write a block's rows of normal draws (M, 3) as (3 LANES,); surplus lanes keep theirs."""
-    for i in range(real):
+def take_draws(work: FloatArray, normals: FloatArray, first: int) -> None:
+    """Write a block's normal draws (M, 3) into the rows DRAW0 .. DRAW2, zeros for surplus lanes."""
+    for i in range(LANES):
+        m = first + i
         for c in range(3):
-            draws[c * LANES + i] = normals[first + i, c]
+            work[DRAW0 + c * LANES + i] = normals[m, c] if m < len(normals) else 0.0
 
 
 @lanes
 def sample_motion(
-    work: FloatArray, poses: FloatArray, first: int, odometry: FloatArray, sigmas: FloatArray, draws: FloatArray
+    work: FloatArray, poses: FloatArray, first: int, odometry: FloatArray, sigmas: FloatArray, normals: FloatArray
 ) -> None:
     """Replace poses by draws from p(x_t | x_{t-1}, u_t), each particle from its own past (Eq. 4)."""
+    take_draws(work, normals, first)
     enter_pose(work, poses, first)
     for i in range(LANES):
-        dx = odometry[0] + draws[i] * sigmas[0]
-        dy = odometry[1] + draws[LANES + i] * sigmas[1]
+        dx = odometry[0] + work[DRAW0 + i] * sigmas[0]
+        dy = odometry[1] + work[DRAW1 + i] * sigmas[1]
         c, s = work[COS + i], work[SIN + i]
         poses[0, first + i] = work[X + i] + (c * dx - s * dy)
         poses[1, first + i] = work[Y + i] + (s * dx + c * dy)
-        poses[2, first + i] = wrapped(work[T + i] + odometry[2] + draws[2 * LANES + i] * sigmas[2])
+        poses[2, first + i] = wrapped(work[T + i] + odometry[2] + work[DRAW2 + i] * sigmas[2])
+
+
+@lanes
+def take_as_exact(poses: FloatArray, means: FloatArray, covariances: FloatArray) -> None:
+    """Write N(x^, P^), (3, P) and (6, P), of poses (3, P) that are exactly where their particles have them."""
+    for c in range(3):
+        for m in range(poses.shape[1]):
+            means[c, m] = poses[c, m]
+    covariances[:] = 0.0
 
 
 @lanes
@@ -190,15 +202,11 @@ def move_blind(
         odometry, sigmas, normals: As in `update_fastslam1`.
         work: Working space.
     """
-    num_particles = normals.shape[0]
-    draws = np.zeros(3 * LANES)
     for block in range(poses.shape[1] // LANES):
         first = block * LANES
-        real = min(LANES, num_particles - first)
         prior(work, poses, means, covariances, blind, first)
         predict(work, odometry, sigmas)
         _to_map_axes(work)
         store_rows(work, X0, means, first)
         store_rows(work, N00, covariances, first)
-        take_draws(draws, normals, first, real)
-        sample_motion(work, poses, first, odometry, sigmas, draws)
+        sample_motion(work, poses, first, odometry, sigmas, normals)

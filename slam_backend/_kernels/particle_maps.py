@@ -1,25 +1,23 @@
 """The map of one particle, gathered whole or as an outline: an environment asks for it at every step."""
 
-from typing import Any
-
 import numpy as np
 
-from slam_backend._jit import inlined, jit
+from slam_backend._jit import in_place, inlined, jit
 from slam_backend._kernels.layout import BLOCK, IDS, LANES, MAP_OF, ROW_OF, TILE
 from slam_backend.errors import FloatArray, Int32Array, IntArray
 
 
 @inlined
-def _place_in(maps: Int32Array, ancestors: int, m: int) -> Any:
+def _place_in(maps: Int32Array, ancestors: int, m: int) -> int:
     """Return where particle m's share of a landmark lies, whose `map_of` this is."""
-    return maps[ancestors, m] if ancestors > 0 else m
+    return int(maps[ancestors, m]) if ancestors > 0 else m
 
 
 @inlined
-def _values_at(padded: int, row: int, place: int) -> Any:
+def _values_at(padded: int, row: int, place: int) -> int:
     """Return where the values of a landmark's row begin that lie at a place; the next is a number of lanes on."""
     own = np.uint32(place)
-    return row * 9 * padded + np.int64(own // BLOCK) * TILE + np.int64(own % BLOCK)
+    return row * 9 * padded + int(own // BLOCK) * TILE + int(own % BLOCK)
 
 
 @jit
@@ -67,7 +65,7 @@ def gather(
     return means, covariances, times, names
 
 
-@jit
+@in_place
 def outline(
     table: IntArray, maps: Int32Array, values: FloatArray, counts: Int32Array, m: int, min_count: int,
     places: FloatArray, names: IntArray, first: int,

@@ -2,16 +2,16 @@
 
 import numpy as np
 
-from slam_backend._jit import jit, lanes, lanes_inlined
+from slam_backend._jit import in_place, jit, lanes, lanes_inlined
 from slam_backend._kernels.layout import BLOCK, LANES, TILE
 from slam_backend.errors import Float32Array, FloatArray, Int32Array, IntArray
 
 
 @lanes_inlined
-def tile_of(values: FloatArray, padded: int, row: int, block: int) -> FloatArray:
-    """Return a block of a landmark that is up to date: a view."""
+def tile_of(padded: int, row: int, block: int) -> slice:
+    """Return where a block of a landmark that is up to date lies in the values."""
     start = row * 9 * padded + block * TILE
-    return values[start : start + TILE]
+    return slice(start, start + TILE)
 
 
 @lanes
@@ -86,7 +86,7 @@ def carry_odds(slots: IntArray, odds: FloatArray, map_of: IntArray, maps: Int32A
             odds[slot, m] = before[m]
 
 
-@jit
+@in_place
 def open_slot(
     b: int, new_slots: IntArray, new_rows: IntArray, row_of: IntArray, map_of: IntArray, values: FloatArray,
     counts: Int32Array, free_rows: IntArray, free_slots: IntArray, tops: IntArray,
@@ -103,7 +103,7 @@ def open_slot(
     map_of[new_slots[b]] = 0
 
 
-@jit
+@in_place
 def name_new(
     new_slots: IntArray, measured: Float32Array, names: IntArray, named: bool, ids: IntArray,
     identities: IntArray, stored: Float32Array, heads: Float32Array, tops: IntArray,

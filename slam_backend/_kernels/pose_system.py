@@ -13,6 +13,9 @@ from slam_backend._kernels.layout import (
     C21,
     C22,
     COS,
+    DRAW0,
+    DRAW1,
+    DRAW2,
     G0,
     G1,
     G2,
@@ -162,13 +165,13 @@ def step_pose(work: FloatArray, only_wide: bool) -> None:
 
 
 @lanes
-def posterior(work: FloatArray, normals: FloatArray, log_likelihood: FloatArray) -> None:
+def posterior(work: FloatArray, log_likelihood: FloatArray) -> None:
     """Weigh by the predictive likelihood and sample the pose, from the sums of pass B (Laplace's formula).
 
-    Rows X0 .. T0 then hold the mean x^, SPREAD00 .. SPREAD22 the covariance P^, X .. SIN the sample, theta wrapped.
+    Rows DRAW0 .. DRAW2 hold what is drawn. Rows X0 .. T0 then hold the mean x^, SPREAD00 .. SPREAD22 the covariance
+    P^, X .. SIN the sample, theta wrapped.
 
     Args:
-        normals: (3 LANES,) standard normal draws.
         log_likelihood: (LANES,) is added to.
     """
     for i in range(LANES):
@@ -202,7 +205,7 @@ def posterior(work: FloatArray, normals: FloatArray, log_likelihood: FloatArray)
         work[SPREAD11 + i] = h10 * c10 + h11 * c11
         work[SPREAD12 + i] = h20 * c10 + h21 * c11
         work[SPREAD22 + i] = h20 * c20 + h21 * c21 + h22 * c22
-        n0, n1, n2 = normals[i], normals[LANES + i], normals[2 * LANES + i]
+        n0, n1, n2 = work[DRAW0 + i], work[DRAW1 + i], work[DRAW2 + i]
         l00 = math.sqrt(i00)
         l10, l20 = i01 / l00, i02 / l00
         l11 = math.sqrt(i11 - l10 * l10)

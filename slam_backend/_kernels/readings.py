@@ -4,13 +4,13 @@ import math
 
 import numpy as np
 
-from slam_backend._jit import jit
+from slam_backend._jit import in_place
 from slam_backend._kernels.layout import ACT, BEGIN, COUNT, END, GIVEN, MIN_DEPTH, NAMED
 from slam_backend._kernels.turns import MOVED
 from slam_backend.errors import FloatArray, IntArray
 
 
-@jit
+@in_place
 def extent(points: FloatArray) -> tuple[float, float]:
     """Return the smallest depth Z and the largest coordinate, by magnitude, of points (n, 3), camera frame.
 
@@ -26,7 +26,7 @@ def extent(points: FloatArray) -> tuple[float, float]:
     return nearest, farthest
 
 
-@jit
+@in_place
 def to_robot_axes(points: FloatArray, sightings: FloatArray) -> None:
     """Turn measured points (n, 3) from camera axes to the robot's: x ahead, y left, z up.
 
@@ -38,7 +38,7 @@ def to_robot_axes(points: FloatArray, sightings: FloatArray) -> None:
             sightings[i, c] = 0.0
 
 
-@jit
+@in_place
 def noises_to_robot_axes(covariances: FloatArray, sightings: FloatArray) -> None:
     """Turn covariances (n, 3, 3) of measured points likewise, into the last six columns, upper triangles by rows."""
     for i in range(len(covariances)):
@@ -47,7 +47,7 @@ def noises_to_robot_axes(covariances: FloatArray, sightings: FloatArray) -> None
         noise[3], noise[4], noise[5] = own[0, 0], own[0, 1], own[1, 1]
 
 
-@jit
+@in_place
 def read_team(
     moves: FloatArray, points: FloatArray, ends: IntArray, farthest_move: float, farthest_point: float,
     table: IntArray, sightings: FloatArray,

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from slam_backend._jit import inlined, jit
+from slam_backend._jit import in_place, inlined, jit
 from slam_backend._kernels.layout import COVARIANCES, MEANS, STARTS
 from slam_backend._kernels.weights import mixture
 from slam_backend.errors import FloatArray, IntArray
@@ -13,7 +13,7 @@ from slam_backend.standpoints import COVARIANCE, ESS, OWN, SIGMAS, START
 AT_ORIGIN, KNOWN, SPREAD = 0, 1, 2  # what starts of particles can be
 
 
-@jit
+@in_place
 def start_kind(starts: FloatArray, count: int) -> int:
     """Tell whether the starts (3, P) of `count` particles are all the origin, all the same, or differ."""
     at_origin = same = True
@@ -40,7 +40,7 @@ def _see(start: FloatArray, pose: FloatArray, spread: FloatArray, seen: FloatArr
     seen_spread[5] = spread[5]
 
 
-@jit
+@in_place
 def see_from_starts(
     starts: FloatArray, means: FloatArray, covariances: FloatArray, count: int, seen: FloatArray, spread: FloatArray
 ) -> None:
@@ -57,7 +57,7 @@ def see_from_starts(
         _see(starts[:, m], means[:, m], covariances[:, m], seen[:, m], spread[:, m])
 
 
-@inlined
+@jit
 def _see_own(
     starts: FloatArray, means: FloatArray, covariances: FloatArray, weights: FloatArray, best: int, kind: int,
     pose: FloatArray, spread: FloatArray,
@@ -83,7 +83,7 @@ def _see_own(
                 entry += 1
 
 
-@jit
+@in_place
 def stand(
     robots: FloatArray, weights: FloatArray, best: int, at_origin: bool, estimates: FloatArray, spreads: FloatArray,
     seats: IntArray, ess: float, poses: FloatArray, beliefs: FloatArray,
@@ -119,11 +119,15 @@ def stand(
         c, s = math.cos(theta), math.sin(theta)
         frame[0], frame[1] = -c * x - s * y, s * x - c * y
         frame[2] = (math.pi - theta) % (2.0 * math.pi) - math.pi
-        pose[:], spread[:], belief[ESS] = estimates[i], spreads[i], ess
+        belief[ESS] = ess
+        for j in range(3):
+            pose[j] = estimates[i, j]
+            for k in range(3):
+                spread[j, k] = spreads[i, j, k]
         if not at_origin:
             kind = start_kind(starts[i], len(weights))
             _see_own(starts[i], means[i], covariances[i], weights, best, kind, pose, spread)
-        seen[own] = pose
+        seen[own, 0], seen[own, 1], seen[own, 2] = pose[0], pose[1], pose[2]
         sigmas[own] = math.sqrt(0.5 * (spread[0, 0] + spread[1, 1]))
         c, s = math.cos(frame[2]), math.sin(frame[2])
         for j in range(count):

@@ -2,9 +2,7 @@
 
 import math
 
-import numpy as np
-
-from slam_backend._jit import jit
+from slam_backend._jit import in_place, room
 from slam_backend._kernels.fastslam1 import update_fastslam1
 from slam_backend._kernels.fastslam2 import update_fastslam2
 from slam_backend._kernels.layout import (
@@ -25,7 +23,6 @@ from slam_backend._kernels.layout import (
     IDS,
     IS_ONE_TO_ONE,
     IS_SIGHTING,
-    LANES,
     LAST_SEEN,
     LOG_LIKELIHOOD,
     LOG_P0,
@@ -40,16 +37,16 @@ from slam_backend._kernels.layout import (
     RESAMPLE_THRESHOLD,
     ROW_OF,
     WALK,
-    WORK_ROWS,
+    WORK_SIZE,
 )
-from slam_backend._kernels.motion import move_blind
+from slam_backend._kernels.motion import move_blind, take_as_exact
 from slam_backend._kernels.weights import conclude
 from slam_backend.errors import Float32Array, FloatArray, Int32Array, IntArray
 
 IDLE, STOOD, MOVED, PLACED = 0, 1, 2, 3  # what a robot did: nothing at all, stood and looked, moved, was told its pose
 
 
-@jit
+@in_place
 def write_sigmas(noise: FloatArray, move: FloatArray, sigmas: FloatArray) -> None:
     """Write the standard deviations (3,) [m, m, rad] of an odometry reading (3,), as `OdometryModel.sigmas` says."""
     distance = math.hypot(move[0], move[1])
@@ -58,7 +55,7 @@ def write_sigmas(noise: FloatArray, move: FloatArray, sigmas: FloatArray) -> Non
     sigmas[2] = math.hypot(math.hypot(noise[2] * distance, noise[3] * move[2]), noise[5])
 
 
-@jit
+@in_place
 def take_turns(
     low: int, high: int, is_over: bool, now: int, assumed: FloatArray,
     rows: IntArray, turns: IntArray, moves: FloatArray, normals: FloatArray,
@@ -107,8 +104,8 @@ def take_turns(
     row_of, map_of, ids, identities = table[ROW_OF], table[MAP_OF], table[IDS], table[IDENTITIES]
     free_slots = table[FREE_SLOTS]
     points, noises = sightings[:, :3], sightings[:, 3:]
-    work = np.empty(WORK_ROWS * LANES)
-    still, move, sigmas, drawn = np.zeros(3), np.zeros(3), np.zeros(3), -1
+    work, still, move, sigmas, drawn = room(WORK_SIZE), room(3), room(3), room(3), -1
+    still[:] = 0.0
     if low == 0:
         log_likelihood[:] = 0.0
     for robot in range(high):
@@ -123,7 +120,7 @@ def take_turns(
         move[:] = 0.0
         sigmas[:] = 0.0
         if act == MOVED:
-            move[:] = moves[row]
+            move[0], move[1], move[2] = moves[row, 0], moves[row, 1], moves[row, 2]
             write_sigmas(assumed[NOISE : NOISE + 6], move, sigmas)
         own_poses, own_means, own_covariances = poses[robot], means[robot], covariances[robot]
         was_blind = blind[robot] > 0 and not placed
@@ -148,8 +145,7 @@ def take_turns(
             )  # fmt: skip
             was_blind = False
         elif placed:
-            own_means[:] = own_poses
-            own_covariances[:] = 0.0
+            take_as_exact(own_poses, own_means, own_covariances)
         else:
             move_blind(own_poses, own_means, own_covariances, was_blind, move, sigmas, normals[drawn], work)
             was_blind = True

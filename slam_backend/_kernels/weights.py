@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from slam_backend._jit import jit, lanes
+from slam_backend._jit import in_place, lanes, lanes_inlined, room
 from slam_backend._kernels.lane_math import sine_cosine, wrapped
 from slam_backend._kernels.layout import (
     ASSOCIATED,
@@ -17,12 +17,13 @@ from slam_backend._kernels.layout import (
     LOG_WEIGHTS,
     PATH_LOG_WEIGHTS,
     REJECTED,
+    SPREAD_SIZE,
     WEIGHTS,
 )
 from slam_backend.errors import FloatArray, Int32Array, IntArray
 
 
-@jit
+@in_place
 def weigh(
     log_likelihood: FloatArray, log_weights: FloatArray, path_log_weights: FloatArray, weights: FloatArray
 ) -> float:
@@ -55,6 +56,22 @@ def weigh(
     return 1.0 / squares
 
 
+@lanes_inlined
+def _load_weights(weights: FloatArray, first: int, block: FloatArray) -> None:
+    """Write the weights (M,) of a block (LANES,) from `first` on, zeros for surplus lanes."""
+    for i in range(LANES):
+        block[i] = weights[first + i] if first + i < len(weights) else 0.0
+
+
+@lanes_inlined
+def _add_up(lanes_of: FloatArray, sums: FloatArray) -> None:
+    """Write the sums (n,) of rows of lanes (n LANES,): each in order, one beside the other."""
+    sums[:] = 0.0
+    for i in range(LANES):
+        for c in range(len(sums)):
+            sums[c] += lanes_of[c * LANES + i]
+
+
 @lanes
 def mixture(
     means: FloatArray, covariances: FloatArray, weights: FloatArray, mean: FloatArray, covariance: FloatArray
@@ -66,44 +83,39 @@ def mixture(
         covariances: (6, P), upper triangles.
         weights: (M,), summing to 1.
     """
-    m = len(weights)
-    sums = np.zeros((4, LANES))
-    w = np.empty(LANES)
-    for first in range(0, m, LANES):
-        real = min(LANES, m - first)
-        for i in range(LANES):
-            w[i] = weights[first + i] if i < real else 0.0
+    w, sums, share = room(LANES), room(6), room(SPREAD_SIZE)
+    share[:] = 0.0
+    for first in range(0, len(weights), LANES):
+        _load_weights(weights, first, w)
         for i in range(LANES):
             sine, cosine = sine_cosine(means[2, first + i])
-            sums[0, i] += w[i] * means[0, first + i]
-            sums[1, i] += w[i] * means[1, first + i]
-            sums[2, i] += w[i] * sine
-            sums[3, i] += w[i] * cosine
-    mean[0], mean[1] = sums[0].sum(), sums[1].sum()
-    mean[2] = wrapped(math.atan2(sums[2].sum(), sums[3].sum()))
-    spread = np.zeros((6, LANES))
-    for first in range(0, m, LANES):
-        real = min(LANES, m - first)
+            share[i] += w[i] * means[0, first + i]
+            share[LANES + i] += w[i] * means[1, first + i]
+            share[2 * LANES + i] += w[i] * sine
+            share[3 * LANES + i] += w[i] * cosine
+    _add_up(share, sums)
+    mean_x, mean_y, mean_theta = sums[0], sums[1], wrapped(math.atan2(sums[2], sums[3]))
+    mean[0], mean[1], mean[2] = mean_x, mean_y, mean_theta
+    share[:] = 0.0
+    for first in range(0, len(weights), LANES):
+        _load_weights(weights, first, w)
         for i in range(LANES):
-            w[i] = weights[first + i] if i < real else 0.0
-        for i in range(LANES):
-            x, y = means[0, first + i] - mean[0], means[1, first + i] - mean[1]
-            t = wrapped(means[2, first + i] - mean[2])
-            spread[0, i] += w[i] * (x * x + covariances[0, first + i])
-            spread[1, i] += w[i] * (x * y + covariances[1, first + i])
-            spread[2, i] += w[i] * (x * t + covariances[2, first + i])
-            spread[3, i] += w[i] * (y * y + covariances[3, first + i])
-            spread[4, i] += w[i] * (y * t + covariances[4, first + i])
-            spread[5, i] += w[i] * (t * t + covariances[5, first + i])
-    covariance[0, 0] = spread[0].sum()
-    covariance[0, 1] = covariance[1, 0] = spread[1].sum()
-    covariance[0, 2] = covariance[2, 0] = spread[2].sum()
-    covariance[1, 1] = spread[3].sum()
-    covariance[1, 2] = covariance[2, 1] = spread[4].sum()
-    covariance[2, 2] = spread[5].sum()
+            x, y = means[0, first + i] - mean_x, means[1, first + i] - mean_y
+            t = wrapped(means[2, first + i] - mean_theta)
+            share[i] += w[i] * (x * x + covariances[0, first + i])
+            share[LANES + i] += w[i] * (x * y + covariances[1, first + i])
+            share[2 * LANES + i] += w[i] * (x * t + covariances[2, first + i])
+            share[3 * LANES + i] += w[i] * (y * y + covariances[3, first + i])
+            share[4 * LANES + i] += w[i] * (y * t + covariances[4, first + i])
+            share[5 * LANES + i] += w[i] * (t * t + covariances[5, first + i])
+    _add_up(share, sums)
+    covariance[0, 0], covariance[1, 1], covariance[2, 2] = sums[0], sums[3], sums[5]
+    covariance[0, 1] = covariance[1, 0] = sums[1]
+    covariance[0, 2] = covariance[2, 0] = sums[2]
+    covariance[1, 2] = covariance[2, 1] = sums[4]
 
 
-@jit
+@in_place
 def add_share(scatter: FloatArray, poses: FloatArray, covariances: FloatArray) -> None:
     """Add to the covariances of poses, in place, what a scattered motion of the whole map adds, to first order.
 
@@ -127,7 +139,7 @@ def add_share(scatter: FloatArray, poses: FloatArray, covariances: FloatArray) -
         c[2, 2] += scatter[2, 2]
 
 
-@jit
+@in_place
 def summarise(
     rows: IntArray, turns: IntArray, found: Int32Array, distances: FloatArray, told: IntArray, best: int, ids: IntArray,
     last_seen: IntArray, now: int, long: float,
@@ -181,7 +193,7 @@ def summarise(
     return num_long_unseen, num_created, num_new, num_matched, num_rejected, squares / judged if judged > 0 else np.nan
 
 
-@jit
+@in_place
 def conclude(
     weights: FloatArray, count: int, means: FloatArray, covariances: FloatArray, frame: FloatArray,
     mean: FloatArray, covariance: FloatArray, rows: IntArray, turns: IntArray, found: Int32Array, distances: FloatArray,

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from slam_backend._jit import jit, lanes
+from slam_backend._jit import fused, jit, lanes
 from slam_backend.errors import BoolArray, Float32Array, FloatArray, IntArray
 from slam_backend.frontend.images import Image
 
@@ -179,7 +179,7 @@ def _lay_over(
     return px, py, correlation
 
 
-@lanes
+@fused
 def refine(
     left_image: Image, right_image: Image, left: FloatArray, right: FloatArray, half: int, iterations: int
 ) -> FloatArray:

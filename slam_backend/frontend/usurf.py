@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend._jit import lanes
+from slam_backend._jit import fused
 from slam_backend.errors import Float32Array, FloatArray, bad_argument, check_array
 from slam_backend.frontend.images import Image, check_image
 
@@ -66,7 +66,7 @@ def describe(integral: NDArray[np.int32], points: FloatArray, scales: FloatArray
     return descriptors
 
 
-@lanes
+@fused
 def _describe(
     integral: NDArray[np.int32],
     points: FloatArray,

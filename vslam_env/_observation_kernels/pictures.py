@@ -31,7 +31,7 @@ def paint(cells: Any, belief: Any, places: Any, local: Any) -> None:
     x, y = belief[OWN], belief[OWN + 1]
     c, s = math.cos(belief[OWN + 2]), math.sin(belief[OWN + 2])
     middle = 0.5 * SIZE
-    flat = cells.ravel()
+    flat = cells.reshape(cells.size)
     low, high = REACH - 0.5 * GRID_SIZE, 0.5 * GRID_SIZE - REACH
     surely_inside = low < x / CELL < high and low < y / CELL < high
     place, seen = np.empty(SIZE, np.int32), np.empty(SIZE, np.uint8)

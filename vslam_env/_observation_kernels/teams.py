@@ -2,12 +2,12 @@
 
 from typing import Any
 
-from slam_backend._jit import jit
+from slam_backend._jit import in_place
 from vslam_env._observation_kernels.numbers import clip_candidates, write_map_stats, write_pose, write_teammates
 from vslam_env._observation_kernels.pictures import paint
 
 
-@jit
+@in_place
 def observe_team(
     robots: Any, poses: Any, beliefs: Any, places: Any, names: Any, parts: Any, cells: Any, scans: Any,
     clipped: Any, deviations: Any, stats: Any, ranges: Any, candidates: Any, teammates: Any, present: Any,
@@ -29,8 +29,9 @@ def observe_team(
         present: (n, 7) int8: `teammates_mask`.
         pictures: (n, 3, 48, 48) uint8: `local_grid`.
     """
-    ranges[:] = scans
     for k in range(len(robots)):
+        for r in range(scans.shape[1]):
+            ranges[k, r] = scans[k, r]
         held = slice(parts[k, 0], parts[k, 1])
         known = write_teammates(robots[k], poses[k], beliefs[k], teammates[k], present[k])
         write_pose(beliefs[k], clipped[k], deviations[k])

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import linear_sum_assignment
 
-from slam_backend._jit import jit
+from slam_backend._jit import in_place, jit
 from slam_backend.errors import BoolArray, FloatArray
 from vslam_env.navigation._arguments import check_cells, pose_floats, positions_array
 from vslam_env.navigation._painting_kernels import CELL, GRID_SIZE, HALF_WIDTH, known_bounds
@@ -28,7 +28,7 @@ GIVEN_UP = 0.8  # [m] radius of what is then left out
 NO_TEAMMATE = 60.0  # [m] stands for the distance of a teammate when there is none
 
 
-@jit
+@in_place
 def _weigh_pairs(goals: Any, places: Any, costs: Any) -> None:
     """Write the distances (m, n), at most `SAME_GOAL`, between goals (m, 2 or more) and places (n, 2 or more).
 
@@ -40,7 +40,7 @@ def _weigh_pairs(goals: Any, places: Any, costs: Any) -> None:
             costs[i, j] = distance if distance < SAME_GOAL else SAME_GOAL
 
 
-@jit
+@in_place
 def _visit(slots: Any, poses: Any, robot: int, visits: Any) -> bool:
     """Add to the visits (16,) of the slots what a robot and its teammates count; tell if patience ran out.
 
@@ -83,7 +83,7 @@ def _refill(costs: Any, slots: Any, sources: Any, found: Any, rows: Any, visits:
             rows[slot, column] = found[source, column]
 
 
-@jit
+@in_place
 def _describe(slots: Any, poses: Any, features: Any) -> None:
     """Write `CandidateSlots.features` (K, 16, 5) of the rows of all slots (K, 16, ...).
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from slam_backend._jit import jit
+from slam_backend._jit import in_place
 from slam_backend.errors import FloatArray, bad_argument, check_float
 from vslam_env.navigation._arguments import check_cells, point_floats, pose_floats
 from vslam_env.navigation._painting_kernels import CELL, HALF_WIDTH, known_bounds
@@ -130,7 +130,7 @@ def plan_path(
     return np.vstack([start, between, goal if end_cell == goal_cell else centres[-1]])
 
 
-@jit
+@in_place
 def _pursue(x: float, y: float, path: FloatArray) -> tuple[float, float, float]:
     """Return the point `LOOKAHEAD` beyond a path's nearest point to (x, y), and the length that is left [m]."""
     best, segment, along = math.inf, 0, 0.0

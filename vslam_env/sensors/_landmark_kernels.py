@@ -3,13 +3,13 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend._jit import jit
+from slam_backend._jit import in_place, jit
 from slam_backend.errors import FloatArray, IntArray
 
 NEAREST_FALSE_POINT = 0.5  # [m]
 
 
-@jit
+@in_place
 def _bring_to(length: float, vector: FloatArray) -> None:
     """Scale a vector (n,) that is not 0 to a length."""
     square = 0.0
@@ -20,7 +20,7 @@ def _bring_to(length: float, vector: FloatArray) -> None:
         vector[i] *= scale
 
 
-@jit
+@in_place
 def make_up(
     places: FloatArray, looks: FloatArray, common: FloatArray, own_share: float, view: FloatArray, points: FloatArray
 ) -> None:
@@ -41,13 +41,15 @@ def make_up(
         ahead = max(min(NEAREST_FALSE_POINT, max_range), places[2, j] * farthest)
         points[j, 0], points[j, 1], points[j, 2] = right * ahead, down * ahead, ahead
         look = points[j, 3:]
-        look[:] = looks[j]
+        for i in range(len(look)):
+            look[i] = looks[j, i]
         _bring_to(own_share, look)
-        look += common
+        for i in range(len(look)):
+            look[i] += common[i]
         _bring_to(1.0, look)
 
 
-@jit
+@in_place
 def mix_in(num_false: IntArray, keys: FloatArray, ids: IntArray, counts: IntArray) -> None:
     """Put the false points of each robot among its landmarks, in random order.
 

@@ -8,7 +8,7 @@ sub-columns, each of which meets one wall.
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend._jit import jit, lanes
+from slam_backend._jit import fused, in_place, jit, lanes
 from slam_backend.errors import Float32Array, FloatArray, IntArray
 
 NOTHING, ROBOT = -1, -2  # instead of a wall
@@ -20,7 +20,7 @@ ULP = 1e-9
 BYTES_MEAN, BYTES_SIGMA = 510.0, 147.8005  # of the sum of four uniform bytes
 
 
-@jit
+@in_place
 def _nearest(slope: float, local: FloatArray, robots: FloatArray, radius: float) -> tuple[int, float, float]:
     """Follow the ray (1, slope) from the origin of the camera's frame.
 
@@ -133,7 +133,7 @@ def _up_to(y: float, rows: int, width: np.float32, cumulative: Float32Array) -> 
     return np.float32(cumulative[k] + np.float32(y - k) * (cumulative[k + 1] - cumulative[k]))
 
 
-@lanes
+@fused
 def render(
     local: FloatArray,
     indices: IntArray,

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slam_backend._jit import jit
+from slam_backend._jit import in_place
 from slam_backend.errors import FloatArray, check_float
 
 
@@ -76,7 +76,7 @@ def read_odometry(
     return read
 
 
-@jit
+@in_place
 def _read(
     before: FloatArray,
     after: FloatArray,

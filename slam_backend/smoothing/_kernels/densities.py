@@ -2,11 +2,11 @@
 
 import math
 
-from slam_backend._jit import lanes
+from slam_backend._jit import fused
 from slam_backend.errors import FloatArray
 
 
-@lanes
+@fused
 def weigh_deviations(covariance: FloatArray, off: FloatArray, log_densities: FloatArray) -> None:
     """Write the logarithms of a Gaussian's density, up to a constant: 0 at its mean.
 

@@ -2,12 +2,12 @@
 
 import numpy as np
 
-from slam_backend._jit import lanes
+from slam_backend._jit import fused
 from slam_backend.errors import FloatArray, IntArray
 from slam_backend.smoothing._kernels.forms import _inverse
 
 
-@lanes
+@fused
 def draw(
     draws: FloatArray, poses: FloatArray, columns: IntArray, keys: IntArray, starts: IntArray, blocks: FloatArray,
     cross: FloatArray, pivots: FloatArray, values: FloatArray, order: IntArray, ranks: IntArray, tops: IntArray,

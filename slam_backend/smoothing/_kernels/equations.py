@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from slam_backend._jit import jit
+from slam_backend._jit import in_place, jit
 from slam_backend.errors import FloatArray, IntArray
 from slam_backend.smoothing._kernels.forms import FREE, _inverse, _spun
 
@@ -18,7 +18,7 @@ from slam_backend.smoothing._kernels.forms import FREE, _inverse, _spun
 WEAK = 1e-6
 
 
-@jit
+@in_place
 def _wrapped(angle: float) -> float:
     """Return an angle [rad] in [-pi, pi)."""
     return angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
@@ -143,7 +143,7 @@ def form(
     return cost, eased
 
 
-@jit
+@in_place
 def advance(
     change: FloatArray, vector: FloatArray, columns: IntArray, poses: FloatArray, landmarks: FloatArray,
     new_poses: FloatArray, new_landmarks: FloatArray,

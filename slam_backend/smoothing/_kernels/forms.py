@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from slam_backend._jit import inlined, jit
+from slam_backend._jit import in_place, inlined, jit
 from slam_backend.errors import BoolArray, FloatArray, IntArray
 
 FREE = -1  # column of a pose that is given, not sought
@@ -29,7 +29,7 @@ def _spun(c: float, s: float, a: FloatArray, out: FloatArray) -> None:
     out[5] = a22
 
 
-@jit
+@in_place
 def _inverse(a: FloatArray, out: FloatArray) -> float:
     """Write the inverse of a symmetric matrix (6); return its determinant."""
     p = a[3] * a[5] - a[4] * a[4]
@@ -45,7 +45,7 @@ def _inverse(a: FloatArray, out: FloatArray) -> float:
     return det
 
 
-@jit
+@in_place
 def seek(previous: IntArray, columns: IntArray) -> int:
     """Give each pose that is sought the rows after those of the one before.
 
@@ -109,7 +109,7 @@ def linearise(
     """
     if given:
         _inverse(noise, info)
-        y[:] = point
+        y[0], y[1], y[2] = point[0], point[1], point[2]
         return
     ahead = e[0] >= MIN_DEPTH
     x0, x1, x2 = (e[0], e[1], e[2]) if ahead else (point[0], point[1], point[2])

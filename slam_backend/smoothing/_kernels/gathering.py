@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from slam_backend._jit import inlined, jit
+from slam_backend._jit import jit
 from slam_backend.errors import BoolArray, FloatArray, IntArray
 
 
-@inlined
+@jit
 def _sorted_by(codes: IntArray, order: IntArray, num_codes: int) -> IntArray:
     """Return an order (n,) by codes in [0, num_codes), that of equal ones as it was."""
     tops, result = np.zeros(num_codes + 1, dtype=np.int64), np.empty(len(order), dtype=np.int64)

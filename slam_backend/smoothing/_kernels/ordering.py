@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend._jit import inlined, jit
+from slam_backend._jit import in_place, inlined, jit
 from slam_backend.errors import IntArray
 
 Bits = NDArray[np.uint64]
@@ -15,12 +15,12 @@ WORD = 64
 
 
 @inlined
-def _num_bits(word: Any) -> Any:
+def _num_bits(word: Any) -> int:
     """Return how many bits are set in 64 (the compiler makes one instruction of it)."""
     word = word - ((word >> np.uint64(1)) & np.uint64(0x5555555555555555))
     word = (word & np.uint64(0x3333333333333333)) + ((word >> np.uint64(2)) & np.uint64(0x3333333333333333))
     word = (word + (word >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
-    return np.int64((word * np.uint64(0x0101010101010101)) >> np.uint64(56))
+    return int((word * np.uint64(0x0101010101010101)) >> np.uint64(56))
 
 
 @inlined
@@ -86,7 +86,7 @@ def minimum_degree(near: Bits, order: IntArray) -> int:
     return filled
 
 
-@jit
+@in_place
 def neighbours(columns: IntArray, previous: IntArray, keys: IntArray, starts: IntArray, near: Bits) -> None:
     """Set the bits of the nodes that share a block of the normal equations.
 

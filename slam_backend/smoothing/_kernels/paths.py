@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from slam_backend._jit import jit, lanes
+from slam_backend._jit import fused, in_place, lanes
 from slam_backend.errors import FloatArray, IntArray
 from slam_backend.smoothing._kernels.equations import WEAK
 
@@ -17,7 +17,7 @@ A00, A01, A02, A11, A12, A22, B0, B1, B2, ENERGY = (LANES * k for k in range(10)
 WORK_ROWS = 10
 
 
-@jit
+@in_place
 def to_lanes(poses: FloatArray, rows: FloatArray) -> None:
     """Write paths in blocks of lanes; surplus lanes are copies of the first path.
 
@@ -118,7 +118,7 @@ def replay(
                 out[i] += work[ENERGY + i] - 0.5 * math.log(work[A00 + i])  # (6)
 
 
-@lanes
+@fused
 def odometry_of_paths(
     poses: FloatArray, num_keys: int, num_blocks: int, num_paths: int, previous: IntArray, mode: FloatArray,
     motions: FloatArray, infos: FloatArray, lever: float, log_density: FloatArray, spreads: FloatArray,

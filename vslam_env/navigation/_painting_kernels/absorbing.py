@@ -3,7 +3,7 @@
 import math
 from typing import Any
 
-from slam_backend._jit import jit
+from slam_backend._jit import in_place
 from vslam_env.navigation._painting_kernels.evidence import (
     CELL,
     FREE,
@@ -16,7 +16,7 @@ from vslam_env.navigation._painting_kernels.evidence import (
 )
 
 
-@jit
+@in_place
 def _bounds_in_frame(other: Any, x: float, y: float, c: float, s: float) -> tuple[float, float, float, float]:
     """Return low x, high x, low y and high y [m] of what a grid knows, seen from pose (x, y) turned by (c, s)."""
     low_row, high_row, low_col, high_col = GRID_SIZE, -1, GRID_SIZE, -1
@@ -35,7 +35,7 @@ def _bounds_in_frame(other: Any, x: float, y: float, c: float, s: float) -> tupl
     return low_x, high_x, low_y, high_y
 
 
-@jit
+@in_place
 def paint_grid(
     evidence: Any, cells: Any, changes: Any, bounds: Any, other: Any, x: float, y: float, theta: float
 ) -> None:

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend._jit import inlined, jit
+from slam_backend._jit import in_place, inlined
 from slam_backend.errors import FloatArray
 from vslam_env.navigation._painting_kernels.evidence import CELL
 from vslam_env.navigation._painting_kernels.surveys import ALONG_X, ALONG_Y, TELLING
@@ -17,7 +17,7 @@ SLOPE, TOP, CROSSING, NUM_SEEN_ROWS = 4, 5, 6, 7
 ASIDE = 1e12  # [cells] per row: how far off a ray crosses rows that it leads away from
 
 
-@jit
+@in_place
 def good_ranges(ranges: FloatArray) -> bool:
     """Tell whether ranges (n,) [m] are at least 0."""
     good = True
@@ -26,7 +26,7 @@ def good_ranges(ranges: FloatArray) -> bool:
     return good
 
 
-@jit
+@in_place
 def good_angles(angles: FloatArray) -> bool:
     """Tell whether the angles (n,) [rad] of rays ascend and span less than pi."""
     for i in range(len(angles)):
@@ -35,7 +35,7 @@ def good_angles(angles: FloatArray) -> bool:
     return bool(angles[-1] - angles[0] < math.pi)
 
 
-@jit
+@in_place
 def look_to_side(told: Any, side: float, seen: Any) -> None:
     """Write how rays lead to the rows above the robot, or to those below.
 

@@ -3,7 +3,7 @@
 import math
 from typing import Any
 
-from slam_backend._jit import jit
+from slam_backend._jit import in_place, jit
 from slam_backend.errors import BoolArray, FloatArray
 from vslam_env.navigation._painting_kernels.evidence import (
     CELL,
@@ -20,7 +20,7 @@ from vslam_env.navigation._painting_kernels.scans import paint_survey, room_to_p
 from vslam_env.navigation._painting_kernels.surveys import survey
 
 
-@jit
+@in_place
 def paint_disc(evidence: Any, cells: Any, changes: Any, bounds: Any, x: float, y: float, radius: float) -> None:
     """Free what a robot covers: unknown cells centred in its disc, and occupied ones that lie wholly inside."""
     first_row, last_row = cell_range(y - radius, y + radius)
@@ -38,7 +38,7 @@ def paint_disc(evidence: Any, cells: Any, changes: Any, bounds: Any, x: float, y
                 judge(cells, changes, bounds, row, col, FREE)
 
 
-@jit
+@in_place
 def paint_bump(
     evidence: Any, cells: Any, changes: Any, bounds: Any, x: float, y: float, theta: float, radius: float
 ) -> None:
@@ -51,7 +51,7 @@ def paint_bump(
         judge(cells, changes, bounds, row, col, OCCUPIED)
 
 
-@jit
+@in_place
 def _find_bad(shared: Any, poses: FloatArray, scans: FloatArray) -> tuple[int, int]:
     """Return what `paint_readings` returns."""
     for robot in range(len(scans)):

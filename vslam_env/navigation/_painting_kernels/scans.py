@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend._jit import inlined, jit
+from slam_backend._jit import in_place, inlined, jit
 from slam_backend.errors import FloatArray
 from vslam_env.navigation._painting_kernels.evidence import (
     CELL,
@@ -40,12 +40,13 @@ LEAST_HEIGHT = 1e-9  # [m] that a row is taken to be from the robot, so that no 
 
 
 @inlined
-def _before(told: Any, seen: Any, k: Any, u: float, v: float) -> Any:
+def _before(told: Any, seen: Any, k: Any, u: float, v: float) -> float:
     """Return how far before the surface of a pair of rays a point lies [m]."""
-    return seen[NORMAL_X, k] * u + seen[NORMAL_Y, k] * v + told[OFFSET, k]
+    before: float = seen[NORMAL_X, k] * u + seen[NORMAL_Y, k] * v + told[OFFSET, k]
+    return before
 
 
-@jit
+@in_place
 def _told_at_jump(told: Any, seen: Any, k: Any, u: float, v: float, change: int) -> int:
     """Return the evidence for a cell between two rays at whose ends the range jumps; seen from the robot at (u, v) [m].
 
@@ -70,7 +71,7 @@ def room_to_paint(num_rays: int) -> Any:
     return np.empty((NUM_ROWS, num_rays + 1)), (seen, passed)
 
 
-@jit
+@in_place
 def paint_survey(
     evidence: Any, cells: Any, changes: Any, bounds: Any, x: float, y: float, theta: float, told: Any, room: Any
 ) -> None:

@@ -4,14 +4,14 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend._jit import jit
+from slam_backend._jit import in_place, jit
 from vslam_env.navigation._painting_kernels import GRID_SIZE
 
 PAD = 2  # cells around the known box, so that loops over frontiers and neighbours need no bounds
 OUTSIDE = 3  # beyond the 60 x 60 m: neither known nor worth exploring
 
 
-@jit
+@in_place
 def any_above_zero(numbers: Any) -> bool:
     """Tell whether any of some small numbers (n,), >= 0, is above 0."""
     seen = np.uint8(0)

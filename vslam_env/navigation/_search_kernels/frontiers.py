@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend._jit import jit
+from slam_backend._jit import in_place, jit
 from vslam_env.navigation._painting_kernels import CELL, FREE, GRID_SIZE, HALF_WIDTH, UNKNOWN
 from vslam_env.navigation._search_kernels.boxes import any_above_zero
 from vslam_env.navigation._search_kernels.ways import UNREACHED, ways_over
@@ -18,7 +18,7 @@ SIGHT_CELLS = 3  # the unknown this near to a goal tells where to look from it
 XY, HEADING, SIZE, LENGTH, NUM_COLUMNS = slice(0, 2), 2, 3, 4, 5  # columns of the rows that describe frontiers
 
 
-@jit
+@in_place
 def _flood(mark: Any, level: int, into: int, row: int, col: int, limit: int, queue: Any) -> int:
     """Move up to `limit` connected cells from one level of marks to another, nearest first; return how many.
 
@@ -75,11 +75,11 @@ def _goal_near(members: Any, box: Any, cost: Any, visited: Any, stamp: int) -> t
     return -1, -1
 
 
-@jit
+@in_place
 def _path_length(parent: Any, row: int, col: int) -> float:
     """Measure the way to a reached cell [m]."""
     width = parent.shape[1]
-    before = parent.ravel()
+    before = parent.reshape(parent.size)
     cell, length = row * width + col, 0.0
     while before[cell] >= 0:
         step = abs(cell - before[cell])
@@ -88,7 +88,7 @@ def _path_length(parent: Any, row: int, col: int) -> float:
     return length
 
 
-@jit
+@in_place
 def _heading_to_unknown(box: Any, row: int, col: int) -> float:
     """Return the direction from a cell to the unknown cells around it [rad]."""
     up = right = 0

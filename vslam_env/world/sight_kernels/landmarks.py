@@ -5,14 +5,14 @@ A camera at (x, y) with axis theta looks along its own x axis; `ahead` and `left
 
 import numpy as np
 
-from slam_backend._jit import jit
+from slam_backend._jit import in_place, jit
 from slam_backend.errors import BoolArray, FloatArray, IntArray
 from vslam_env.world.sight_kernels.rays import EPSILON, ray_to_disc, ray_to_wall, those, walls_in_wedge
 
 TOUCH = 1e-6  # [m] what a ray meets this close to its target does not hide the target
 
 
-@jit
+@in_place
 def _hidden(x: float, y: float, dx: float, dy: float, own_wall: int, walls: FloatArray, indices: IntArray) -> bool:
     """Tell whether a wall other than `own_wall` crosses the sight line from (x, y) to (x + dx, y + dy)."""
     length = np.sqrt(dx * dx + dy * dy)
@@ -24,7 +24,7 @@ def _hidden(x: float, y: float, dx: float, dy: float, own_wall: int, walls: Floa
     return False
 
 
-@jit
+@in_place
 def _find_visible(
     robot: int,
     poses: FloatArray,
@@ -123,7 +123,7 @@ def see(
             seen[k, n] = True
 
 
-@jit
+@in_place
 def choose(visible: IntArray, keys: FloatArray, detection_probability: float, places: int, chosen: IntArray) -> int:
     """Detect landmarks and choose among the detected ones.
 

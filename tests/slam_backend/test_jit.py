@@ -1,0 +1,86 @@
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from numba.core.errors import NumbaError
+
+from slam_backend import _jit
+
+
+def test_this_version_of_numba_can_leave_references_uncounted() -> None:
+    """The option is numba's own: where it has gone, all works as before, but slower."""
+    assert _jit.CAN_LEAVE_UNCOUNTED
+
+
+@pytest.mark.parametrize("compiled", [_jit.in_place, _jit.inlined, _jit.lanes, _jit.lanes_inlined, _jit.any_order])
+def test_kernels_that_work_in_place_can_make_no_array(compiled: Callable[[Any], Any]) -> None:
+    """Its counter would be missing: numba refuses to compile them."""
+
+    def makes_one(x: float) -> float:
+        row = np.zeros(3)
+        row[0] = x
+        return float(row[0])
+
+    with pytest.raises(NumbaError, match=r"zeros|NRT"):
+        compiled(makes_one)(1.0)
+
+
+def test_kernels_that_count_may_call_those_that_do_not_and_the_other_way_round() -> None:
+    """What is not counted by one is none of the other's business."""
+
+    def add_one(row: Any) -> None:
+        for i in range(len(row)):
+            row[i] += 1.0
+
+    def total_of_new(size: int) -> float:
+        row = np.zeros(size)
+        in_place(row[1:])
+        return float(row.sum())
+
+    def twice(size: int, row: Any) -> None:
+        row[:] = 2.0 * counted(size)
+
+    in_place, counted = _jit.in_place(add_one), _jit.jit(total_of_new)
+    row = np.zeros(2)
+    _jit.in_place(twice)(5, row)
+    assert row.tolist() == [8.0, 8.0]
+
+
+def test_references_are_counted_everywhere_where_numba_does_not_know_better(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Kernels then work as before, and may do more."""
+    monkeypatch.setattr(_jit, "CAN_LEAVE_UNCOUNTED", False)
+
+    def makes_one(x: float) -> float:
+        return float(np.full(3, x).sum())
+
+    assert _jit.in_place(makes_one)(2.0) == 6.0
+
+
+def test_rooms_of_a_kernel_are_apart_and_stay_through_its_loops() -> None:
+    """A loop does not take room anew in each turn, and what it wrote last time is still there."""
+
+    def fill(out: Any) -> None:
+        one, other = _jit.room(5), _jit.room(3)
+        for turn in range(4):
+            if turn == 0:
+                one[:] = 0.0
+            other[:] = float(turn)
+            for i in range(len(one)):
+                one[i] += other[i % len(other)] + 10.0 * i
+        for i in range(5):
+            out[i] = one[i]
+
+    out = np.empty(5)
+    _jit.in_place(fill)(out)
+    assert out.tolist() == [6.0 + 40.0 * i for i in range(5)]
+
+
+def test_the_size_of_a_room_is_a_constant() -> None:
+    """The stack has no room for what nobody has foreseen."""
+
+    def fill(size: int) -> float:
+        return float(_jit.room(size)[0])
+
+    with pytest.raises(NumbaError):
+        _jit.in_place(fill)(3)

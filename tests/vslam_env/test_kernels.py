@@ -1,0 +1,77 @@
+import importlib
+import inspect
+import pkgutil
+import subprocess
+import sys
+from collections.abc import Iterator
+
+from numba.core.dispatcher import Dispatcher
+
+import slam_backend
+import vslam_env
+
+# Steps of a filter, a team and an environment; then how many arrays numba has made for them and how many it has freed.
+COUNT_ARRAYS = """
+import gc
+from numba.core.runtime import _nrt_python, rtsys
+from slam_backend.warming import warm_up
+from vslam_env import vslam_v0
+
+def play():
+    warm_up()
+    env = vslam_v0.parallel_env()
+    env.reset(seed=100)
+    for _ in range(60):
+        env.step({agent: env.action_space(agent).sample() for agent in env.agents})
+    env.close()
+
+play()
+_nrt_python.memsys_enable_stats()
+before = rtsys.get_allocation_stats()
+play()
+gc.collect()
+after = rtsys.get_allocation_stats()
+print(after.mi_alloc - before.mi_alloc, after.mi_free - before.mi_free)
+"""
+
+
+def kernels() -> Iterator[Dispatcher]:
+    """All kernels of both packages, by whatever name they are imported."""
+    for package in (slam_backend, vslam_env):
+        for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
+            found = vars(importlib.import_module(module.name)).values()
+            yield from (thing for thing in found if isinstance(thing, Dispatcher))
+
+
+def is_in_place(kernel: Dispatcher) -> bool:
+    """Whether it is compiled without counters."""
+    return kernel.targetoptions.get("_nrt") is False
+
+
+def may_return_arrays(kernel: Dispatcher) -> bool:
+    """Whether its annotation leaves that open."""
+    annotation = str(inspect.signature(kernel.py_func).return_annotation)
+    return "Array" in annotation or "ndarray" in annotation or "Any" in annotation
+
+
+def called_by(kernel: Dispatcher) -> Iterator[Dispatcher]:
+    """The kernels that one names in its code."""
+    code, names = kernel.py_func.__code__, kernel.py_func.__globals__
+    yield from (names[name] for name in code.co_names if isinstance(names.get(name), Dispatcher))
+
+
+def test_kernels_that_work_in_place_neither_return_arrays_nor_call_kernels_that_do() -> None:
+    """Nobody would free such an array: its counter would never come to zero."""
+    those = [kernel for kernel in kernels() if is_in_place(kernel)]
+    assert len(those) > 100
+    for kernel in those:
+        assert not may_return_arrays(kernel), kernel
+        assert not any(may_return_arrays(callee) for callee in called_by(kernel)), kernel
+
+
+def test_every_array_that_kernels_make_is_freed() -> None:
+    """References that are not counted are missing nowhere."""
+    done = subprocess.run([sys.executable, "-c", COUNT_ARRAYS], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    made, freed = map(int, done.stdout.split())
+    assert made == freed > 1000
