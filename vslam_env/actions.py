@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from slam_backend.errors import bad_argument
+from slam_backend.errors import FloatArray, bad_argument
 from vslam_env.observation import NUM_ACTIONS
 
 MAX_SPEED, MAX_REVERSE, MAX_TURN = 1.0, 0.3, 1.5  # [m/s], [m/s], [rad/s]
@@ -21,7 +21,7 @@ def action_space(action_type: str) -> spaces.Space[Any]:
     return spaces.Discrete(len(DISCRETE_COMMANDS) if action_type == "discrete" else NUM_ACTIONS)
 
 
-def checked_actions(actions: Any, agents: Sequence[str], action_type: str) -> list[Any]:
+def checked_actions(actions: Any, agents: Sequence[str], action_type: str) -> FloatArray | list[int]:
     """Return what each agent's robot is to do, in their order.
 
     Args:
@@ -30,7 +30,7 @@ def checked_actions(actions: Any, agents: Sequence[str], action_type: str) -> li
         action_type: Of all of them.
 
     Returns:
-        Velocity commands [m/s, rad/s], pairs of floats, of continuous and discrete actions; ints of `goal` actions.
+        Velocity commands (K, 2) float64 [m/s, rad/s] of continuous and discrete actions; ints of `goal` actions.
 
     Raises:
         ValueError: If an agent is unknown or missing, or an action is outside its space.
@@ -47,17 +47,17 @@ def checked_actions(actions: Any, agents: Sequence[str], action_type: str) -> li
         return _continuous_commands(actions, agents)
     if action_type == "discrete":
         limit = len(DISCRETE_COMMANDS)
-        return [DISCRETE_COMMANDS[_checked_index(agent, actions[agent], limit)] for agent in agents]
+        return np.array([DISCRETE_COMMANDS[_checked_index(agent, actions[agent], limit)] for agent in agents])
     return [_checked_index(agent, actions[agent], NUM_ACTIONS) for agent in agents]
 
 
-def _continuous_commands(actions: Mapping[str, Any], agents: Sequence[str]) -> list[tuple[float, float]]:
-    """Return the velocity commands [m/s, rad/s] of pairs in [-1, 1], or raise.
+def _continuous_commands(actions: Mapping[str, Any], agents: Sequence[str]) -> FloatArray:
+    """Return the velocity commands (K, 2) [m/s, rad/s] of pairs in [-1, 1], or raise.
 
     They are scaled to the limits of either direction, so that zeros stand still.
     """
-    commands = []
-    for agent in agents:
+    commands = np.empty((len(agents), 2))
+    for robot, agent in enumerate(agents):
         action = actions[agent]
         try:
             speed, turn = action.tolist()  # what nearly all send
@@ -67,7 +67,8 @@ def _continuous_commands(actions: Mapping[str, Any], agents: Sequence[str]) -> l
             speed, turn = _pair(agent, action)
         if not (-1.0 <= speed <= 1.0 and -1.0 <= turn <= 1.0):  # false for NaN
             raise bad_argument(f"actions[{agent!r}]", "two numbers in [-1, 1]", [speed, turn], PAIR_CURE)
-        commands.append((speed * (MAX_SPEED if speed > 0.0 else MAX_REVERSE), turn * MAX_TURN))
+        commands[robot, 0] = speed * (MAX_SPEED if speed > 0.0 else MAX_REVERSE)
+        commands[robot, 1] = turn * MAX_TURN
     return commands
 
 

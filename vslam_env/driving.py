@@ -73,7 +73,7 @@ class Drivers:
         self._action_type, self._ticks = config.action_type, config.ticks_per_step
         self._drivers = [GoalDriver() for _ in range(config.num_robots)]
 
-    def carry_out(self, episode: Episode, chosen: Sequence[Any]) -> list[int]:
+    def carry_out(self, episode: Episode, chosen: Any) -> list[int]:
         """Let an episode advance by the ticks of a step.
 
         Args:
@@ -84,9 +84,8 @@ class Drivers:
             Per robot 1 if its action was masked, else 0.
         """
         if self._action_type != "goal":
-            commands = np.array(chosen)
             for _ in range(self._ticks):
-                episode.advance(commands)
+                episode.advance(chosen)
             return [0] * len(chosen)
         beliefs = episode.belief
         candidates = [beliefs.candidate(robot, action - 1) if action else None for robot, action in enumerate(chosen)]

@@ -188,6 +188,14 @@ CASES: dict[str, tuple[Callable[[], Any], str]] = {
         _step({"robot_0": np.zeros(2, complex), "robot_1": [0, 0]}),
         r"actions\['robot_0'\]: expected an array of shape \(2,\) of real numbers",
     ),
+    "action of truth values": (
+        _step({"robot_0": np.array([True, False]), "robot_1": [0, 0]}),
+        r"actions\['robot_0'\]: expected an array of shape \(2,\) of real numbers",
+    ),
+    "action with an axis too many": (
+        _step({"robot_0": np.zeros((2, 1)), "robot_1": [0, 0]}),
+        r"actions\['robot_0'\]: expected an array of shape \(2,\), got shape \(2, 1\)",
+    ),
     "discrete action out of range": (
         _step({"robot_0": 4, "robot_1": 0}, action_type="discrete"),
         r"actions\['robot_0'\]: expected an int from 0 to 3, got 4",
