@@ -142,7 +142,7 @@ class MapStore:
         if slots < new:
             self._grow_slots(max(64, len(self.ids), new - slots), descriptor_size)
         if rows < new + 1:
-            self._grow_rows(max(64, len(self.counts) // 2, new + 1))
+            self._grow_rows(max(64, len(self.counts), new + 1))
 
     def _begin(self, new: int, descriptor_size: int) -> None:
         """Begin with `new` landmarks in the lowest slots and rows, yet to be written; arrays with room are used again.

@@ -62,11 +62,8 @@ def holding(
     targets, points, squares = landmarks[seen, :2], np.empty((n, 2, m)), np.empty((n, m))
     look_at(tiles, seen, targets, points, squares)
     motions = _fitted(points, targets, 1.0 / np.maximum(squares @ weights, 1e-300))
-    moved, off, off_moved = np.empty_like(poses), np.empty(m), np.empty(m)
-    move(poses, motions, moved)
-    measure_off(poses, means, LEVER, off)
-    measure_off(moved, means, LEVER, off_moved)
-    if not (off_moved * weights).sum() < (off * weights).sum():
+    moved = np.empty_like(poses)
+    if not bring_nearer(poses, motions, means, LEVER, weights, moved):
         return None
     back = inverse(motions)
     return Held(moved, motions, np.asarray(np.einsum("m,mi,mj->ij", weights, back, back)))  # (9)
@@ -135,6 +132,21 @@ def measure_off(poses: FloatArray, means: FloatArray, lever: float, squares: Flo
             dx, dy = poses[robot, 0, i] - means[robot, 0], poses[robot, 1, i] - means[robot, 1]
             turn = lever * ((poses[robot, 2, i] - means[robot, 2] + math.pi) % (2.0 * math.pi) - math.pi)
             squares[i] = squares[i] + dx * dx + dy * dy + turn * turn
+
+
+@jit
+def bring_nearer(
+    poses: FloatArray, motions: FloatArray, means: FloatArray, lever: float, weights: FloatArray, moved: FloatArray
+) -> bool:
+    """Move particles as `move` does; return whether they are then less far off, see `measure_off`, weighed by (M,)."""
+    before, after = np.empty(len(weights)), np.empty(len(weights))
+    move(poses, motions, moved)
+    measure_off(poses, means, lever, before)
+    measure_off(moved, means, lever, after)
+    gained = 0.0
+    for i in range(len(weights)):
+        gained += weights[i] * (before[i] - after[i])
+    return gained > 0.0
 
 
 def move_tiles(tiles: FloatArray, motions: FloatArray) -> None:

@@ -105,8 +105,7 @@ def find_mode(
         looseness: Times the tolerance of the options.
     """
     columns, informations = np.empty(graph.num_keys, dtype=np.int64), np.empty(graph.noises.shape)
-    size = _kernels.seek(graph.previous, columns)
-    is_noisy = _kernels.invert(graph.noises, columns, informations)
+    size, is_noisy = _kernels.seek_poses(graph.previous, graph.noises, columns, informations)
     sightings = Sightings.of(graph)
     poses, landmarks = graph.poses.copy(), graph.landmarks.copy()
     tolerance = looseness * options.tolerance
@@ -128,9 +127,7 @@ def find_mode(
         if not system.factor(damping):
             return given_up("a singular system", iteration)
         trial_poses, trial_landmarks = np.empty_like(poses), np.empty_like(landmarks)
-        rise, largest = _kernels.advance(
-            system.solve(), system.vector, columns, poses, landmarks, trial_poses, trial_landmarks
-        )
+        rise, largest = system.step(poses, landmarks, trial_poses, trial_landmarks)
         if not largest < LARGEST_STEP:
             return given_up("a descent that leaves the world", iteration)
         expected = -0.5 * rise - system.eased  # if the cost were a parabola
@@ -218,10 +215,20 @@ class _System:
             p.cross_places, p.row_tops, p.row_columns, p.row_places, self.pivots, self.values,
         )  # fmt: skip
 
-    def solve(self) -> FloatArray:
-        """Return the change (n + l, 3) of poses and landmarks that the equations ask for."""
+    def step(
+        self, poses: FloatArray, landmarks: FloatArray, new_poses: FloatArray, new_landmarks: FloatArray
+    ) -> tuple[float, float]:
+        """Write where the factored equations lead; return how the cost rises along its slope, and the largest change.
+
+        Args:
+            poses, landmarks: (k, 3), (l, 3) where they were formed.
+            new_poses, new_landmarks: (k, 3), (l, 3), results.
+        """
         p = self.pattern
-        return _kernels.solve(self.pivots, self.values, p.order, p.tops, p.rows, -self.vector)
+        return _kernels.step(
+            self.pivots, self.values, p.order, p.tops, p.rows, self.vector, self.columns, poses, landmarks, new_poses,
+            new_landmarks,
+        )  # fmt: skip
 
     def draw(self, poses: FloatArray, num_paths: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
         """Return paths about poses (k, 3) and their log densities, see `Mode.paths`."""

@@ -89,6 +89,24 @@ def invert(matrices: FloatArray, columns: IntArray, out: FloatArray) -> bool:
     return True
 
 
+@jit
+def seek_poses(
+    previous: IntArray, noises: FloatArray, columns: IntArray, informations: FloatArray
+) -> tuple[int, bool]:  # fmt: skip
+    """Say which poses are sought, and what the odometry that leads to these tells.
+
+    Args:
+        previous, columns: As of `seek`.
+        noises: (k, 3, 3) of that odometry.
+        informations: (k, 3, 3), result: their inverses, zeros where a pose is given.
+
+    Returns:
+        How many are sought, and whether all of their odometry has noise.
+    """
+    size = seek(previous, columns)
+    return size, invert(noises, columns, informations)
+
+
 @inlined
 def linearise(
     point: FloatArray, noise: FloatArray, given: bool, camera: FloatArray, e: FloatArray, y: FloatArray,

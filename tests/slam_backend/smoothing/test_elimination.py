@@ -11,6 +11,7 @@ from slam_backend.geometry import between
 from slam_backend.motion import OdometryModel
 from slam_backend.run_log import RobotLog
 from slam_backend.smoothing import _kernels
+from slam_backend.smoothing._kernels.factoring import solve
 from slam_backend.smoothing.coarsening import at_mode, coarsened
 from slam_backend.smoothing.extending import extended
 from slam_backend.smoothing.graph import LEVER, PathGraph
@@ -105,7 +106,16 @@ def test_the_solution_is_the_dense_one(posed, damping):
     each = np.arange(3 * system.num_poses)
     whole[each, each] *= 1.0 + damping
     assert system.factor(damping)
-    found = system.solve()
+    p = system.pattern
+    found = solve(system.pivots, system.values, p.order, p.tops, p.rows, -system.vector)
+    poses, landmarks = posed.mode.poses, posed.mode.landmarks
+    new_poses, new_landmarks = np.empty_like(poses), np.empty_like(landmarks)
+    rise, largest = system.step(poses, landmarks, new_poses, new_landmarks)
+    assert rise == pytest.approx((found * system.vector).sum())
+    assert largest == np.abs(found[: system.num_poses]).max()
+    sought = system.columns >= 0
+    np.testing.assert_array_equal(new_poses[sought], poses[sought] + found[system.columns[sought] // 3])
+    np.testing.assert_array_equal(new_landmarks, landmarks + found[system.num_poses :])
     assert system.factor(0.0)
     np.testing.assert_allclose(found.ravel(), -np.linalg.solve(whole, system.vector.ravel()), rtol=1e-6, atol=1e-12)
 
@@ -137,7 +147,7 @@ def test_blocks_of_the_inverse_are_the_solutions_for_unit_vectors(posed):
     for column in range(6):
         unit = np.zeros(system.vector.shape)
         unit[nodes[column // 3], column % 3] = 1.0
-        solved = _kernels.solve(system.pivots, system.values, p.order, p.tops, p.rows, unit)
+        solved = solve(system.pivots, system.values, p.order, p.tops, p.rows, unit)
         np.testing.assert_array_equal(found[:, column], solved[nodes].ravel())
 
 

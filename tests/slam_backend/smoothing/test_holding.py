@@ -14,7 +14,7 @@ from slam_backend.geometry import between, compose, inverse, rotation, transform
 from slam_backend.smoothing import rejuvenation
 from slam_backend.smoothing._kernels import LANES
 from slam_backend.smoothing.graph import RIGID, PathGraph
-from slam_backend.smoothing.holding import holding, look_at, measure_off, move, move_tiles
+from slam_backend.smoothing.holding import bring_nearer, holding, look_at, measure_off, move, move_tiles
 from training.stereo_runs import RunSpec, simulate_run
 
 SCATTER = np.array([[0.04, 0.01, -0.02], [0.01, 0.09, 0.03], [-0.02, 0.03, 0.05]])
@@ -79,6 +79,13 @@ def test_landmarks_are_moved_as_one_by_one():
     np.testing.assert_array_equal(tiles[:, 1, :, 70 - LANES :], before[:, 1, :, 70 - LANES :])
 
 
+def off_by(poses: FloatArray, means: FloatArray) -> FloatArray:
+    """Return how far off (M,) [m^2] poses (K, 3, M) are from means (K, 3), headings felt at 3 m."""
+    off = poses - means[:, :, None]
+    off[:, 2] = 3.0 * wrap_angle(off[:, 2])
+    return np.asarray((off**2).sum(axis=(0, 1)))
+
+
 def test_what_holding_looks_at_is_as_by_arrays():
     """Where landmarks are in the plane and how far off, poses moved, and how far off these: of each particle."""
     rng = np.random.default_rng(4)
@@ -92,9 +99,12 @@ def test_what_holding_looks_at_is_as_by_arrays():
     move(poses, motions, moved := np.empty_like(poses))
     np.testing.assert_allclose(moved, compose(motions, poses.transpose(0, 2, 1)).transpose(0, 2, 1), atol=1e-12)
     measure_off(poses, means, 3.0, squares := np.empty(count))
-    off = poses - means[:, :, None]
-    off[:, 2] = 3.0 * wrap_angle(off[:, 2])
-    np.testing.assert_allclose(squares, (off**2).sum(axis=(0, 1)), rtol=1e-12)
+    np.testing.assert_allclose(squares, off_by(poses, means), rtol=1e-12)
+    weights, again = rng.random(count), np.empty_like(poses)
+    for by, gained in ((motions, squares @ weights - off_by(moved, means) @ weights), (0.0 * motions, 0.0)):
+        assert bring_nearer(poses, by, means, 3.0, weights, again) == (gained > 0.0)
+    bring_nearer(poses, motions, means, 3.0, weights, again)
+    np.testing.assert_array_equal(again, moved)
     move(poses, motions, poses)
     np.testing.assert_array_equal(poses, moved)
 

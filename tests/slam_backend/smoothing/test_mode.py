@@ -15,7 +15,9 @@ from small_problems import (
 from slam_backend.camera import StereoCamera
 from slam_backend.motion import OdometryModel
 from slam_backend.run_log import RobotLog
-from slam_backend.smoothing._kernels import FREE, advance, invert, seek
+from slam_backend.smoothing._kernels import FREE
+from slam_backend.smoothing._kernels.equations import advance
+from slam_backend.smoothing._kernels.forms import invert, seek, seek_poses
 from slam_backend.smoothing.extending import extended
 from slam_backend.smoothing.graph import PathGraph
 from slam_backend.smoothing.options import SmoothingOptions
@@ -196,6 +198,11 @@ def test_only_poses_with_odometry_from_another_are_sought():
     columns = np.empty(5, dtype=np.int64)
     assert seek(np.array([-1, 0, -1, 1, 2]), columns) == 3
     assert columns.tolist() == [FREE, 0, FREE, 3, 6]
+    noises, informations = np.zeros((5, 3, 3)), np.empty((5, 3, 3))
+    assert seek_poses(np.array([-1, 0, -1, 1, 2]), noises, columns, informations) == (3, False)
+    noises[[1, 3, 4]] = 0.5 * np.eye(3)
+    assert seek_poses(np.array([-1, 0, -1, 1, 2]), noises, columns, informations) == (3, True)
+    np.testing.assert_array_equal(informations, 4.0 * noises)
 
 
 def test_a_change_leads_where_it_says():
