@@ -39,6 +39,8 @@ class TeamBelief:
 
     Attributes:
         points: Where the robots stand; written to in the next step.
+        known_groups: Per robot those that share a map with it, as far as it knows, itself included.
+        exchange: Counts the bytes that they send; to be looked at.
         grids: The robots' seen grids; to be looked at.
     """
 
@@ -58,6 +60,7 @@ class TeamBelief:
         rhythm = config.attempts if attempts else replace(config.attempts, enabled=False)
         merging = config.merging if attempts else replace(config.merging, watch_steps=0)
         self._team = TeamSlam(num_robots, config.alignment, seed, rhythm, merging, **options)
+        self.exchange = self._team.exchange
         self._grids = SharedGrids(num_robots, body)
         self.grids = self._grids.team
         self._candidates = TeamSlots(num_robots)
@@ -88,11 +91,6 @@ class TeamBelief:
     def events(self) -> tuple[MergeEvent, ...]:
         """All attempts, merges and undos so far, in order."""
         return self._team.events
-
-    @property
-    def bytes_sent(self) -> tuple[int, ...]:
-        """Bytes that each robot has sent."""
-        return tuple(self._team.exchange.sent)
 
     @property
     def poses(self) -> FloatArray:
@@ -138,11 +136,6 @@ class TeamBelief:
         self._grids.keep(self._tick + 1, renaming)
         self._grids.meet(self._lineup.mates, self.points.starts)
         return renaming
-
-    @property
-    def known_groups(self) -> Sequence[tuple[int, ...]]:
-        """Per robot those that share a map with it, as far as it knows, itself included."""
-        return self._lineup.members
 
     def speaker(self, group: tuple[int, ...]) -> int:
         """Return the first robot of a group that goes by its joint filter, and so can merge it with another."""
@@ -211,6 +204,7 @@ class TeamBelief:
     def _look_up_poses(self) -> None:
         """Take note of the groups and poses after a step or a merge, and forget what was derived from those before."""
         self._lineup = self._team.lineup
+        self.known_groups = self._lineup.members
         self._team.standpoints(self.points)
         self._beliefs.clear()
         self._maps.clear()

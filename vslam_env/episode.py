@@ -130,7 +130,7 @@ class Episode:
         belief, poses = self.belief, self._simulator.poses
         self.ledger.score(belief.outlines, belief.points, self.true_starts, poses, self._figures)
         coverage = self._coverage.update(belief.grids, poses, self._found)
-        counts = self._collisions, belief.bytes_sent
+        counts = self._collisions, tuple(belief.exchange.sent)
         return Standing(self._figures.tolist(), counts, coverage, len(self.merge_ticks), self.tick * TICK)
 
     # ------------------------------------------------------------------ snapshots

@@ -112,28 +112,28 @@ def stand(
             continue
         own = seats[0, i]
         seen, belief = poses[own], beliefs[own]
-        pose, frame, sigmas = belief[OWN : OWN + 3], belief[START : START + 3], belief[SIGMAS:]
-        spread = belief[COVARIANCE:SIGMAS].reshape((3, 3))
-        seen[:], sigmas[:] = np.nan, np.nan
         x, y, theta = starts[i, 0, best], starts[i, 1, best], starts[i, 2, best]
         c, s = math.cos(theta), math.sin(theta)
-        frame[0], frame[1] = -c * x - s * y, s * x - c * y
-        frame[2] = (math.pi - theta) % (2.0 * math.pi) - math.pi
-        belief[ESS] = ess
+        to_x, to_y, turn = -c * x - s * y, s * x - c * y, (math.pi - theta) % (2.0 * math.pi) - math.pi
+        belief[START], belief[START + 1], belief[START + 2], belief[ESS] = to_x, to_y, turn, ess
         for j in range(3):
-            pose[j] = estimates[i, j]
+            belief[OWN + j] = estimates[i, j]
             for k in range(3):
-                spread[j, k] = spreads[i, j, k]
+                belief[COVARIANCE + 3 * j + k] = spreads[i, j, k]
         if not at_origin:
             kind = start_kind(starts[i], len(weights))
+            pose, spread = belief[OWN : OWN + 3], belief[COVARIANCE:SIGMAS].reshape((3, 3))
             _see_own(starts[i], means[i], covariances[i], weights, best, kind, pose, spread)
-        seen[own, 0], seen[own, 1], seen[own, 2] = pose[0], pose[1], pose[2]
-        sigmas[own] = math.sqrt(0.5 * (spread[0, 0] + spread[1, 1]))
-        c, s = math.cos(frame[2]), math.sin(frame[2])
+        for mate in range(len(seen)):
+            for j in range(3):
+                seen[mate, j] = belief[OWN + j] if mate == own else np.nan
+            belief[SIGMAS + mate] = np.nan
+        belief[SIGMAS + own] = math.sqrt(0.5 * (belief[COVARIANCE] + belief[COVARIANCE + 4]))
+        c, s = math.cos(turn), math.sin(turn)
         for j in range(count):
             if j != i:
                 mate = seats[0, j]
-                seen[mate, 0] = frame[0] + c * estimates[j, 0] - s * estimates[j, 1]
-                seen[mate, 1] = frame[1] + s * estimates[j, 0] + c * estimates[j, 1]
-                seen[mate, 2] = (frame[2] + estimates[j, 2] + math.pi) % (2.0 * math.pi) - math.pi
-                sigmas[mate] = math.sqrt(0.5 * (spreads[j, 0, 0] + spreads[j, 1, 1]))
+                seen[mate, 0] = to_x + c * estimates[j, 0] - s * estimates[j, 1]
+                seen[mate, 1] = to_y + s * estimates[j, 0] + c * estimates[j, 1]
+                seen[mate, 2] = (turn + estimates[j, 2] + math.pi) % (2.0 * math.pi) - math.pi
+                belief[SIGMAS + mate] = math.sqrt(0.5 * (spreads[j, 0, 0] + spreads[j, 1, 1]))
