@@ -169,8 +169,8 @@ class FreeSpace:
     def _draw_heading(self, position: FloatArray, rng: np.random.Generator) -> float:
         """Draw a heading [rad] with some free way ahead, or, after a few draws, any."""
         headings = rng.uniform(-np.pi, np.pi, 8)
-        poses = np.column_stack([np.broadcast_to(position, (len(headings), 2)), headings])
-        free = np.zeros((len(headings), 1))
+        poses, free = np.empty((len(headings), 3)), np.zeros((len(headings), 1))
+        poses[:, :2], poses[:, 2] = position, headings
         cast_scans(poses, *rays_at(np.zeros(1)), self.world.walls.T.copy(), 0.0, VIEW_AHEAD, 0.0, free)
         return float(headings[int(np.argmax(free[:, 0] >= VIEW_AHEAD))])
 
