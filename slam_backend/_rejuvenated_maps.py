@@ -3,7 +3,7 @@
 import numpy as np
 
 from slam_backend._best_map import slots_held
-from slam_backend._jit import jit
+from slam_backend._jit import in_place
 from slam_backend._particle_maps import ParticleMaps
 from slam_backend.errors import FloatArray, IntArray
 from slam_backend.smoothing.rejuvenation import Particles
@@ -42,7 +42,7 @@ def write_maps(maps: ParticleMaps, best: int, particles: Particles, walk: float)
     write_tiles(particles.tiles, rows, walk, maps.blocks)
 
 
-@jit
+@in_place
 def find_rows(names: IntArray, ids: IntArray, order: IntArray, rows: IntArray) -> None:
     """Write where the landmarks of some names lie among others.
 
@@ -58,7 +58,7 @@ def find_rows(names: IntArray, ids: IntArray, order: IntArray, rows: IntArray) -
         rows[n] = order[at] if at < len(order) and ids[order[at]] == names[n] else NONE
 
 
-@jit
+@in_place
 def write_tiles(tiles: FloatArray, rows: IntArray, walk: float, blocks: FloatArray) -> None:
     """Write some landmarks of new particles, with a variance [m^2] along each axis added to theirs.
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slam_backend._jit import jit
+from slam_backend._jit import in_place
 from slam_backend.errors import FloatArray, check_float
 from slam_backend.geometry import compose
 
@@ -76,7 +76,7 @@ class OdometryModel:
         return compose(poses, odometry + noise)  # Eq. 4
 
 
-@jit
+@in_place
 def _write_variances(
     odometry: FloatArray, along: float, across: float, heading: float, sigma_turn: float, floor_position: float,
     floor_heading: float, result: FloatArray,

@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend._jit import inlined, jit
+from slam_backend._jit import in_place, inlined, jit
 from slam_backend.errors import BoolArray, FloatArray, IntArray
 from slam_backend.log_arrays import ODOMETRY, REJECTED
 
@@ -147,7 +147,7 @@ def choose(
     return num
 
 
-@jit
+@in_place
 def rename(names: IntArray, aliases: IntArray) -> None:
     """Give landmarks the names by which they go, in place: (n,) int64, and rows (name, name it goes by) in order."""
     for row in range(len(aliases)):
@@ -157,7 +157,7 @@ def rename(names: IntArray, aliases: IntArray) -> None:
                 names[n] = new
 
 
-@jit
+@in_place
 def number(names: IntArray, order: IntArray, ids: IntArray, first: IntArray) -> int:
     """Number the landmarks of measurements; those that are new come after the known ones.
 
@@ -190,7 +190,7 @@ def number(names: IntArray, order: IntArray, ids: IntArray, first: IntArray) -> 
     return num
 
 
-@jit
+@in_place
 def place(
     poses: FloatArray, frame_keys: IntArray, offsets: FloatArray, frames: IntArray, points: FloatArray,
     chosen: IntArray, mount: FloatArray, places: FloatArray,

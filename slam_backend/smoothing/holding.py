@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slam_backend._jit import jit, lanes
+from slam_backend._jit import in_place, jit, lanes
 from slam_backend.errors import FloatArray, IntArray
 from slam_backend.geometry import inverse
 from slam_backend.smoothing._kernels import LANES
@@ -81,7 +81,7 @@ def _fitted(points: FloatArray, targets: FloatArray, weights: FloatArray) -> Flo
     return np.stack([ahead, target[1] - (s * centres[0] + c * centres[1]), turns], axis=1)
 
 
-@jit
+@in_place
 def look_at(
     tiles: FloatArray, seen: IntArray, targets: FloatArray, points: FloatArray, squares: FloatArray
 ) -> None:  # fmt: skip
@@ -104,7 +104,7 @@ def look_at(
                 squares[n, first + lane] = dx * dx + dy * dy + tile[XX, lane] + tile[YY, lane]
 
 
-@jit
+@in_place
 def move(poses: FloatArray, motions: FloatArray, moved: FloatArray) -> None:
     """Write poses (K, 3, M) of each particle moved by its motion (M, 3); `moved` may be `poses`."""
     for robot in range(len(poses)):
@@ -116,7 +116,7 @@ def move(poses: FloatArray, motions: FloatArray, moved: FloatArray) -> None:
             moved[robot, 2, i] = (motions[i, 2] + heading + math.pi) % (2.0 * math.pi) - math.pi
 
 
-@jit
+@in_place
 def measure_off(poses: FloatArray, means: FloatArray, lever: float, squares: FloatArray) -> None:
     """Write how far off particles are.
 
