@@ -12,7 +12,6 @@ from slam_backend.measurements import Measurements, TeamMeasurements
 
 NO_SIGHTINGS = np.zeros((0, 9))
 NO_DESCRIPTORS = np.zeros((0, 0), dtype=np.float32)
-NO_DESCRIPTORS.setflags(write=False)
 NO_NAMES = np.zeros(0, dtype=np.int64)
 
 Span = tuple[int, int, bool, bool, int]  # of one robot: its row of the table without what it did
@@ -37,10 +36,11 @@ def read_by_team(
     count, own_size = descriptors.shape
     if len(ends) != k or len(points) != count or (size and own_size != size):
         return None
-    moves, table, sightings = odometry.copy(), np.empty((k, 6), np.int64), np.empty((count, 9))
+    moves, looks = odometry.copy(), descriptors.copy()
+    table, sightings = np.empty((k, 6), np.int64), np.empty((count, 9))
     if not _kernels.read_team(moves, points, ends, farthest_move, farthest_point, table, sightings):
         return None
-    return StepInput(table.tolist(), table, moves, {}, sightings, descriptors, NO_NAMES, frozenset())
+    return StepInput(table.tolist(), table, moves, {}, sightings, looks, NO_NAMES, frozenset())
 
 
 def in_one_table(
@@ -105,26 +105,22 @@ def _masked(
 
 
 def _joined(used: Sequence[Used]) -> tuple[FloatArray, Float32Array, IntArray]:
-    """Return sightings, descriptors and names of all measurements, one robot's after the other's.
-
-    What was measured may not be written, whatever came in: kernels are compiled for one kind of array.
-    """
+    """Return sightings, descriptors and names of all measurements, one robot's after the other's."""
     if not used:
         return NO_SIGHTINGS, NO_DESCRIPTORS, NO_NAMES
-    points, covariances, descriptors, names = used[0]
+    points, covariances, _, names = used[0]
+    descriptors = np.concatenate([own[2] for own in used])
     if len(used) > 1:
         given = named = False
         for _, spreads, _, called in used:
             given |= spreads is not None
             named |= called is not None
         points = np.concatenate([own[0] for own in used])
-        descriptors = np.concatenate([own[2] for own in used])
         if given:
             covariances = np.concatenate([np.zeros((len(own[0]), 3, 3)) if own[1] is None else own[1] for own in used])
         if named:
             names = np.concatenate([np.zeros(len(own[0]), np.int64) if own[3] is None else own[3] for own in used])
-    points.setflags(write=False)
-    descriptors.setflags(write=False)
+    points.setflags(write=False)  # as those of a frame: the kernel is compiled for one kind of array
     sightings = np.empty((len(points), 9))
     _kernels.to_robot_axes(points, sightings)
     if covariances is not None:

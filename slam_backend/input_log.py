@@ -27,7 +27,7 @@ class StepInput(NamedTuple):
             -1, which are not.
         sightings: (n, 9) [m, m^2] all robots' measurements, one robot's after the other's, in robot axes: points (3)
             relative to the camera centre, and their covariances (6), upper triangles by rows, where they have any.
-        descriptors: (n, d), read-only as those of the frames.
+        descriptors: (n, d), its own: kernels are compiled for arrays that can be written.
         names: (n,) the caller's names, or (0,) where no robot has any.
         silent: Robots of which there is nothing to take in. An empty frame is something: it says that nothing was there
             to see.
@@ -41,17 +41,6 @@ class StepInput(NamedTuple):
     descriptors: Float32Array
     names: IntArray
     silent: frozenset[int]
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        """Let copies' descriptors be read-only, too: else kernels would be compiled anew for them."""
-        return _restored, tuple(self)
-
-
-def _restored(*columns: Any) -> StepInput:
-    """Return a copy of an input of which these are the attributes."""
-    inputs = StepInput(*columns)
-    inputs.descriptors.setflags(write=False)
-    return inputs
 
 
 class Seats(NamedTuple):

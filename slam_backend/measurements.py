@@ -1,10 +1,10 @@
 """What one robot's camera reports in one step: points, descriptors and, if the sensor knows them, covariances."""
 
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from slam_backend import _kernels
 from slam_backend.errors import FloatArray, IntArray, bad_argument, check_array
@@ -68,11 +68,11 @@ class Measurements:
 
 
 class TeamMeasurements(NamedTuple):
-    """The frames of several robots in one piece, without covariances; each is cut out for who wants to look at it.
+    """The frames of several robots in one piece, unchecked, without covariances; cut out for who wants to look at one.
 
     Attributes:
-        points: (n, 3) float64 [m], read-only. Each in the frame of its camera, robot by robot.
-        descriptors: (n, d) float32, read-only. Likewise.
+        points: (n, 3) float64 [m]. Each in the frame of its camera, robot by robot.
+        descriptors: (n, d) float32. Likewise.
         ends: (K,) int64. Per robot where its points end; they begin where those before it end.
     """
 
@@ -80,21 +80,12 @@ class TeamMeasurements(NamedTuple):
     descriptors: NDArray[np.float32]
     ends: IntArray
 
-    @classmethod
-    def trusted(cls, points: FloatArray, descriptors: NDArray[np.float32], ends: ArrayLike) -> Self:
-        """Build them in a hot loop: no copies, no checks. The caller must not write to the arrays afterwards."""
-        points.setflags(write=False)
-        descriptors.setflags(write=False)
-        return cls(points, descriptors, np.asarray(ends, np.int64))
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        """Let copies and what was pickled be read-only, too."""
-        return TeamMeasurements.trusted, tuple(self)
-
     def of_each(self) -> list[Measurements]:
-        """Return the frame of each robot. They share memory with this."""
+        """Return the frame of each robot. They are read-only, and share memory with this, not to be written to then."""
         ends = self.ends.tolist()
         cut = [(self.points[a:b], self.descriptors[a:b]) for a, b in zip([0, *ends[:-1]], ends, strict=True)]
+        for points, _ in cut:
+            points.setflags(write=False)
         return [_restored(points, looks, None, _kernels.extent(points)) for points, looks in cut]
 
 

@@ -63,7 +63,7 @@ def warm_up() -> float:
         for _ in range(STEPS):
             team.step([None, None], [plain, plain])
         both = np.tile(points, (2, 1)), np.tile(descriptors, (2, 1))
-        team.step(np.zeros((2, 3)), TeamMeasurements.trusted(*both, [LANDMARKS, 2 * LANDMARKS]))
+        team.step(np.zeros((2, 3)), TeamMeasurements(*both, np.array([LANDMARKS, 2 * LANDMARKS])))
         team.standpoints(), team.outlines()
         own = team.map(0)
         map_error(own.means, names, points)

@@ -196,7 +196,7 @@ class StereoFrontEnd:
             descriptors = describe_points(left, pixels[:, :2], scales, self.options.descriptor)
             known = descriptors.any(axis=1)
             pixels, points, descriptors, kept = pixels[known], points[known], descriptors[known], kept[known]
-        (frame,) = TeamMeasurements.trusted(points, descriptors, [len(points)]).of_each()
+        (frame,) = TeamMeasurements(points, descriptors, np.array([len(points)])).of_each()
         return StereoFrame(frame, pixels, matches.responses[kept], matches)
 
     def match(self, left: Image, right: Image) -> StereoMatches:

@@ -46,7 +46,8 @@ def test_a_team_that_cannot_be_built_says_why(arguments: dict[str, Any], message
 
 def in_one_piece(points: list[np.ndarray], ends: list[int], descriptors: int = 3) -> TeamMeasurements:
     """A team's frames, unchecked."""
-    return TeamMeasurements.trusted(np.concatenate(points), np.tile(GOOD.descriptors, (descriptors, 1)), ends)
+    looks = np.tile(GOOD.descriptors, (descriptors, 1))
+    return TeamMeasurements(np.concatenate(points), looks, np.array(ends, np.int64))
 
 
 ONE_BEHIND = in_one_piece([GOOD.points, GOOD.points, -GOOD.points], [1, 2, 3]).of_each()

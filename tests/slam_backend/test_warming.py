@@ -65,7 +65,7 @@ assert (slam.num_landmarks < 30, slam.num_particles < 40) == (True, True)  # lan
 team = TeamSlam(2, num_particles=7, attempts=AttemptOptions(every=1))
 for size in (1, 3, 9, 30, 30, 30):
     team.step([None, None], [Measurements(points[:size], looks[:size])] * 2)
-team.step(np.zeros((2, 3)), TeamMeasurements.trusted(np.tile(points, (2, 1)), np.tile(looks, (2, 1)), [30, 60]))
+team.step(np.zeros((2, 3)), TeamMeasurements(np.tile(points, (2, 1)), np.tile(looks, (2, 1)), np.array([30, 60])))
 assert len(team.groups) == 1
 team.standpoints(), team.outlines()
 slices = SmoothingOptions(slice_steps=20, rigid_within=0.01, max_keys=12, further_keys=4, fresh_keys=6)

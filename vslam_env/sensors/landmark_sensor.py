@@ -145,7 +145,7 @@ class LandmarkSensor:
         kept = measure(*truth, noise, self._optics, config.descriptor_noise, points, looks)
         if kept < total:
             points, looks = points[:kept], looks[:kept]
-        return Frames(TeamMeasurements.trusted(points, looks, ends), ids)
+        return Frames(TeamMeasurements(points, looks, ends), ids)
 
     def _made_up(self, count: int, rng: np.random.Generator) -> FloatArray:
         """Draw points that are no landmarks, and descriptors of them (count, 3 + d)."""
