@@ -41,9 +41,9 @@ def decide_alone(
         j00, j01, j02, j11, j12, j22, g0, g1, g2, square, det, _, depth, metres2, distance = match_terms(
             work, tile, i, True
         )
-        front = seen[i] > 0 and distance < np.inf
-        near = front and (distance <= dead_zone or metres2 <= radius2)
-        ok = front and distance <= reach and work[TAKEN + i] == 0.0
+        front = (seen[i] > 0) & (distance < np.inf)  # "and" would make a branch of it, and of all that follows
+        near = front & ((distance <= dead_zone) | (metres2 <= radius2))
+        ok = front & (distance <= reach) & (work[TAKEN + i] == 0.0)
         match[i] = q if ok else (-1.0 if near else -2.0)
         work[CLUTTER + i] += 0.0 if ok else log_clutter
         add_terms(work, i, ok, 1.0, j00, j01, j02, j11, j12, j22, g0, g1, g2)
@@ -84,10 +84,10 @@ def consider_again(
     radius2 = dead_radius * dead_radius
     for i in range(LANES):
         distance = record[Q_D + i]
-        front = record[Q_HELD + i] > 0.0 and distance < np.inf
+        front = (record[Q_HELD + i] > 0.0) & (distance < np.inf)
         distance = cap if distance > cap else distance
-        near = front and (distance <= dead_zone or record[Q_METRES2 + i] <= radius2)
-        ok = front and distance <= gate and work[TAKEN + i] == 0.0
+        near = front & ((distance <= dead_zone) | (record[Q_METRES2 + i] <= radius2))
+        ok = front & (distance <= gate) & (work[TAKEN + i] == 0.0)
         work[DEAD + i] = 1.0 if near else work[DEAD + i]
         depth = record[Q_DEPTH + i]
         log_det = log_of(record[Q_DET_POSE + i] if ok else 1.0) - 8.0 * log_of(depth if ok else 1.0)
@@ -143,17 +143,28 @@ def bar_taken(earlier: FloatArray, p: float, mask: FloatArray) -> None:
 
 
 @lanes
+def start_none_beyond(match: FloatArray, real: int) -> None:
+    """Let the surplus lanes of the last block start no landmark."""
+    for b in range(len(match)):
+        for i in range(real, LANES):
+            match[b, i] = -1.0
+
+
+@lanes
 def write_found(
-    found: Int32Array, distances: FloatArray, chosen: FloatArray, low: int, high: int, slots: IntArray,
-    records: FloatArray, row: int, new_slot: int,
+    found: Int32Array, distances: FloatArray, first: int, match: FloatArray, starts: IntArray, slots: IntArray,
+    records: FloatArray, row: int, new_slots: IntArray,
 ) -> None:  # fmt: skip
-    """Write the slot (or -1) and the squared distance (or NaN) of one measurement: it is in that row of the records."""
-    for i in range(len(found)):
-        found[i] = new_slot if chosen[i] == -2.0 else REJECTED
-        distances[i] = np.nan
-    for q in range(low, high):
-        of_candidate, slot, code = records[q, row : row + LANES], slots[q], float(q)
-        for i in range(len(found)):
-            on = chosen[i] == code
-            found[i] = slot if on else found[i]
-            distances[i] = of_candidate[i] if on else distances[i]
+    """Write a block's slots (or -1) and squared distances (or NaN): these are in that row of the records."""
+    for b in range(len(match)):
+        own, chosen, new_slot = found[b, first : first + LANES], match[b], new_slots[b]
+        squares = distances[b, first : first + LANES]
+        for i in range(LANES):
+            own[i] = new_slot if chosen[i] == -2.0 else REJECTED
+            squares[i] = np.nan
+        for q in range(starts[b], starts[b + 1]):
+            of_candidate, slot, code = records[q, row : row + LANES], slots[q], float(q)
+            for i in range(LANES):
+                on = chosen[i] == code
+                own[i] = slot if on else own[i]
+                squares[i] = of_candidate[i] if on else squares[i]

@@ -94,15 +94,11 @@ def update_fastslam1(
                 if new_slots[b] == REJECTED:
                     open_slot(b, new_slots, new_rows, row_of, map_of, values, counts, free_rows, free_slots, tops)
                 new_landmark(
-                    work, values[tile_of(padded, new_rows[b], block)], points, noises, b, given, camera, mask,
-                    counts[new_rows[b], first : first + LANES], walk,
+                    work, values, counts, new_rows[b], block, points, noises, b, given, camera, mask, walk
                 )  # fmt: skip
                 for i in range(LANES):
                     work[CLUTTER + i] += log_clutter if mask[i] > 0.0 else 0.0
-            write_found(
-                found[b, first : first + LANES], distances[b, first : first + LANES], chosen, starts[b], starts[b + 1],
-                slots, records, Q_D, new_slots[b],
-            )  # fmt: skip
+        write_found(found, distances, first, match, starts, slots, records, Q_D, new_slots)
         for i in range(LANES):
             log_likelihood[first + i] += total_log_likelihood(work, i)
     take_as_exact(poses, means, covariances)

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from slam_backend._jit import lanes, lanes_inlined
+from slam_backend._jit import lanes, lanes_inlined, room
+from slam_backend._kernels.choices import mask_of
 from slam_backend._kernels.innovations import innovate
 from slam_backend._kernels.lane_math import inverted, quadratic_form
 from slam_backend._kernels.layout import (
@@ -26,7 +27,8 @@ from slam_backend._kernels.layout import (
     Y,
 )
 from slam_backend._kernels.likelihoods import count_likelihood
-from slam_backend.errors import FloatArray, Int32Array
+from slam_backend._kernels.places import tile_of
+from slam_backend.errors import FloatArray, Int32Array, IntArray
 
 YOUNG = 4  # a landmark seen up to so many times is updated by the iterated EKF: its depth is still vague
 
@@ -145,14 +147,43 @@ def count_matches(seen: Int32Array, mask: FloatArray) -> None:
 
 
 @lanes
+def update_matched(
+    work: FloatArray, match: FloatArray, mask: FloatArray, values: FloatArray, counts: Int32Array, row_of: IntArray,
+    block: int, points: FloatArray, noises: FloatArray, given: bool, camera: FloatArray, starts: IntArray,
+    slots: IntArray, walk: float,
+) -> None:  # fmt: skip
+    """At a known pose: update the landmarks that the lanes of one block matched, young ones by the iterated EKF."""
+    padded, first = counts.shape[1], block * LANES
+    young, before = room(LANES), room(TILE)
+    for b in range(len(starts) - 1):
+        for q in range(starts[b], starts[b + 1]):
+            if mask_of(match[b], float(q), mask) == 0:
+                continue
+            row = row_of[slots[q]]
+            tile, seen = values[tile_of(padded, row, block)], counts[row, first : first + LANES]
+            num_young = find_young(seen, mask, young)
+            count_matches(seen, mask)
+            innovate(work, tile, points, noises, b, given, camera)
+            if num_young > 0:
+                for j in range(TILE):
+                    before[j] = tile[j]
+                update(work, tile, young, 0.0)
+                innovate(work, tile, points, noises, b, given, camera)
+                relinearise(work, tile, before)
+            update(work, tile, mask, walk)
+
+
+@lanes
 def new_landmark(
-    work: FloatArray, tile: FloatArray, points: FloatArray, noises: FloatArray, n: int, given: bool, camera: FloatArray,
-    mask: FloatArray, seen: Int32Array, walk: float,
+    work: FloatArray, values: FloatArray, counts: Int32Array, row: int, block: int, points: FloatArray,
+    noises: FloatArray, n: int, given: bool, camera: FloatArray, mask: FloatArray, walk: float,
 ) -> None:  # fmt: skip
     """Write mean and covariance of a landmark first seen from a known pose (Algorithm 1, l. 30-31 corrected).
 
-    All lanes of the block are written; `seen` becomes 1 where `mask` is, and 0 elsewhere: those do not hold it.
+    All lanes of the block are written; counts become 1 where `mask` is, and 0 elsewhere: those do not hold it.
     """
+    tile = values[tile_of(counts.shape[1], row, block)]
+    seen = counts[row, block * LANES : (block + 1) * LANES]
     ahead, left, up = camera[4] + points[n, 0], camera[5] + points[n, 1], camera[6] + points[n, 2]
     for i in range(LANES):
         c, s = work[COS + i], work[SIN + i]

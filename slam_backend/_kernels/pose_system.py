@@ -165,15 +165,16 @@ def step_pose(work: FloatArray, only_wide: bool) -> None:
 
 
 @lanes
-def posterior(work: FloatArray, log_likelihood: FloatArray) -> None:
+def posterior(work: FloatArray, log_likelihood: FloatArray, first: int) -> None:
     """Weigh by the predictive likelihood and sample the pose, from the sums of pass B (Laplace's formula).
 
     Rows DRAW0 .. DRAW2 hold what is drawn. Rows X0 .. T0 then hold the mean x^, SPREAD00 .. SPREAD22 the covariance
     P^, X .. SIN the sample, theta wrapped.
 
     Args:
-        log_likelihood: (LANES,) is added to.
+        log_likelihood: (P,), added to from lane `first` on.
     """
+    own = log_likelihood[first : first + LANES]
     for i in range(LANES):
         i00, i01, i02, i11, i12, i22, det = inverted(
             work[J00 + i], work[J01 + i], work[J02 + i], work[J11 + i], work[J12 + i], work[J22 + i]
@@ -181,9 +182,7 @@ def posterior(work: FloatArray, log_likelihood: FloatArray) -> None:
         g0, g1, g2 = work[G0 + i], work[G1 + i], work[G2 + i]
         xi0, xi1, xi2 = work[XI0 + i], work[XI1 + i], work[XI2 + i]
         gain = quadratic_form(i00, i01, i02, i11, i12, i22, g0, g1, g2)
-        log_likelihood[i] += total_log_likelihood(work, i) - 0.5 * (
-            xi0 * xi0 + xi1 * xi1 + xi2 * xi2 - gain + log_of(det)
-        )
+        own[i] += total_log_likelihood(work, i) - 0.5 * (xi0 * xi0 + xi1 * xi1 + xi2 * xi2 - gain + log_of(det))
         xi0 -= i00 * g0 + i01 * g1 + i02 * g2
         xi1 -= i01 * g0 + i11 * g1 + i12 * g2
         xi2 -= i02 * g0 + i12 * g1 + i22 * g2
