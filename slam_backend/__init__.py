@@ -12,6 +12,7 @@ from slam_backend.duplicates import DuplicateOptions, find_duplicates, fuse_dupl
 from slam_backend.existence import ExistenceModel
 from slam_backend.filter import FastSlam
 from slam_backend.filter_options import FilterOptions
+from slam_backend.findings import Findings
 from slam_backend.fusion import fuse_landmarks, fuse_maps
 from slam_backend.landmark_map import LandmarkMap
 from slam_backend.measurements import Measurements
@@ -32,6 +33,7 @@ __all__ = [
     "ExistenceModel",
     "FastSlam",
     "FilterOptions",
+    "Findings",
     "LandmarkMap",
     "Measurements",
     "MergeEvent",

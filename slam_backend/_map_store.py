@@ -7,15 +7,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend import _kernels
+from slam_backend._jit import LINE
 from slam_backend._kernels import LANES
 from slam_backend._kernels.layout import FREE_SLOTS, IDENTITIES, IDS, LAST_SEEN, MAP_OF, ROW_OF
 from slam_backend.errors import FloatArray, IntArray
 
-LINE = 64  # [bytes]; vectors that straddle cache lines are slow
-
 
 def aligned(shape: tuple[int, ...], dtype: Any) -> Any:
-    """Return an array of a shape and a numpy type, yet to be written, that starts at a cache line."""
+    """Return an array, yet to be written, that starts at a cache line: vectors that straddle two are slow."""
     kind = np.dtype(dtype)
     size = math.prod(shape) * kind.itemsize
     raw = np.empty(size + LINE, dtype=np.uint8)

@@ -8,7 +8,7 @@ from slam_backend._particle_maps import ParticleMaps
 from slam_backend.errors import FloatArray, IntArray
 from slam_backend.smoothing.rejuvenation import Particles
 
-NONE = -1
+NONE = -1  # no row of the new particles' landmarks
 XX, YY, ZZ = 3, 6, 8  # the diagonal of a landmark's covariance, in the rows of a tile
 
 

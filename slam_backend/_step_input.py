@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from slam_backend import _kernels
-from slam_backend._step_table import in_one_table, read_by_team, seen_by_each
+from slam_backend._step_table import are_kinds, in_one_table, read_by_team, seen_by_each
 from slam_backend.camera import StereoCamera
 from slam_backend.errors import FloatArray, IntArray, bad_argument, check_array
 from slam_backend.input_log import StepInput
@@ -53,7 +53,11 @@ def check_step(
 
 
 def _cut_out(frames: TeamMeasurements) -> list[Measurements]:
-    """Return each robot's frame of those of a team, or raise unless their ends rise up to the last point."""
+    """Return each robot's frame of those of a team, or raise unless they fit together."""
+    if not are_kinds(frames) or frames.points.shape[1] != 3:
+        expected = "points (n, 3) float64, descriptors (n, d) float32 and ends (K,) int64"
+        got = ", ".join(f"{np.shape(array)} {getattr(array, 'dtype', type(array).__name__)}" for array in frames)
+        raise bad_argument("measurements", expected, got, "Give arrays of these types, or a frame per robot.")
     ends, count = frames.ends.tolist(), len(frames.points)
     if not ends or ends[0] < 0 or ends[-1] != count or len(frames.descriptors) != count or ends != sorted(ends):
         got = f"ends {ends} of {count} points and {len(frames.descriptors)} descriptors"

@@ -13,12 +13,20 @@ from slam_backend.measurements import Measurements, TeamMeasurements
 NO_SIGHTINGS = np.zeros((0, 9))
 NO_DESCRIPTORS = np.zeros((0, 0), dtype=np.float32)
 NO_NAMES = np.zeros(0, dtype=np.int64)
+KINDS = *map(np.dtype, (np.float64, np.float32, np.int64)), 2, 2, 1  # of `TeamMeasurements`
 
 Span = tuple[int, int, bool, bool, int]  # of one robot: its row of the table without what it did
 # One robot's points, covariances or None, descriptors, names or None.
 Used = tuple[FloatArray, FloatArray | None, Float32Array, IntArray | None]
 # Of all robots their spans; masks, sightings, descriptors and names as in `StepInput`.
 Seen = tuple[list[Span], dict[int, BoolArray], FloatArray, Float32Array, IntArray]
+
+
+def are_kinds(frames: TeamMeasurements) -> bool:
+    """Return whether the frames of a team are arrays of the numbers of axes and the types that kernels take."""
+    points, looks, ends = frames
+    are_arrays = type(points) is type(looks) is type(ends) is np.ndarray
+    return are_arrays and (points.dtype, looks.dtype, ends.dtype, points.ndim, looks.ndim, ends.ndim) == KINDS
 
 
 def read_by_team(
@@ -33,8 +41,10 @@ def read_by_team(
     if type(odometry) is not np.ndarray or odometry.dtype != np.float64 or odometry.shape != (k, 3):
         return None
     points, descriptors, ends = frames
+    if not are_kinds(frames):
+        return None
     count, own_size = descriptors.shape
-    if len(ends) != k or len(points) != count or (size and own_size != size):
+    if len(ends) != k or points.shape != (count, 3) or (size and own_size != size):
         return None
     moves, looks = odometry.copy(), descriptors.copy()
     table, sightings = np.empty((k, 6), np.int64), np.empty((count, 9))

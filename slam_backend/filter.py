@@ -159,7 +159,10 @@ class FastSlam(FilterKnowledge):
         """
         count, size = self.num_robots, self.descriptor_size
         inputs = check_step(count, size, self.options.camera, odometry, measurements, identities, poses)
-        return self._step_checked(inputs, seats_of(tuple(range(count))), Findings.none_yet(inputs))
+        findings = Findings.none_yet(inputs)
+        report = self._step_checked(inputs, seats_of(tuple(range(count))), findings)
+        findings.close()
+        return report
 
     def _step_checked(self, inputs: StepInput, seats: Seats, findings: Findings) -> StepReport:
         """Do what `step` does with readings that `check_step` returned.

@@ -42,6 +42,10 @@ class Findings(NamedTuple):
             begin += len(own)
         return cls(told, turns, {})
 
+    def close(self) -> None:
+        """Let nobody write to it any more: reports and journals share it."""
+        self.told.setflags(write=False)
+
     def num_given(self, row: int) -> int:
         """Return how many measurements a robot was given, used or not."""
         return max(self.turns[row][COUNT], 0)

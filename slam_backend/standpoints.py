@@ -34,13 +34,20 @@ class Standpoints:
 
     def __init__(self, num_rows: int, num_robots: int | None = None) -> None:
         known = num_rows if num_robots is None else num_robots
-        self.poses: FloatArray = np.empty((num_rows, known, 3))
-        self.beliefs: FloatArray = np.empty((num_rows, SIGMAS + known))
-        self.own: FloatArray = self.beliefs[:, OWN : OWN + 3]
-        self.starts: FloatArray = self.beliefs[:, START : START + 3]
-        self.ess: FloatArray = self.beliefs[:, ESS]
-        self.covariances: FloatArray = self.beliefs[:, COVARIANCE:SIGMAS].reshape(num_rows, 3, 3)
-        self.sigmas: FloatArray = self.beliefs[:, SIGMAS:]
+        self.__setstate__((np.empty((num_rows, known, 3)), np.empty((num_rows, SIGMAS + known))))
+
+    def __getstate__(self) -> tuple[FloatArray, FloatArray]:
+        """Return what copies begin with; their views are of their own beliefs."""
+        return self.poses, self.beliefs
+
+    def __setstate__(self, state: tuple[FloatArray, FloatArray]) -> None:
+        """Hold poses and beliefs, and all views of these."""
+        self.poses, self.beliefs = poses, beliefs = state
+        self.own: FloatArray = beliefs[:, OWN : OWN + 3]
+        self.starts: FloatArray = beliefs[:, START : START + 3]
+        self.ess: FloatArray = beliefs[:, ESS]
+        self.covariances: FloatArray = beliefs[:, COVARIANCE:SIGMAS].reshape(len(poses), 3, 3)
+        self.sigmas: FloatArray = beliefs[:, SIGMAS:]
 
 
 @lru_cache(maxsize=256)

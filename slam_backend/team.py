@@ -127,6 +127,7 @@ class TeamSlam(TeamKnowledge):
                 records.exchange.record_step(report, branch.filter.descriptor_size)
             if report.rejuvenation is not None:
                 rejuvenations += ((intake.robots, report.rejuvenation),)
+        findings.close()
         return findings, rejuvenations
 
     def merge(self, robot_a: int, robot_b: int, alignment: Alignment, known: bool = False) -> Renaming:

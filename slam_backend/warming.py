@@ -14,6 +14,7 @@ from slam_backend.frontend import StereoFrontEnd
 from slam_backend.measurements import Measurements, TeamMeasurements
 from slam_backend.merge_options import MergeOptions
 from slam_backend.metrics.maps import map_error
+from slam_backend.smoothing import holding
 from slam_backend.smoothing.bending import bend
 from slam_backend.smoothing.options import SmoothingOptions
 from slam_backend.team import TeamSlam
@@ -59,6 +60,7 @@ def warm_up() -> float:
         root = np.array([-1])
         root.setflags(write=False)
         bend(np.zeros((1, 3)), root, np.zeros((1, 3, 1)))
+        holding.move(np.zeros((1, 3, 1)), np.zeros((1, 3)), np.zeros((1, 3, 1)))  # of starts that are sought
         team = TeamSlam(2, num_particles=4, attempts=AttemptOptions(every=1), merging=MergeOptions(watch_every=1))
         for _ in range(STEPS):
             team.step([None, None], [plain, plain])

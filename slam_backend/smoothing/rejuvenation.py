@@ -227,7 +227,8 @@ def _particles(graph: PathGraph, mode: Mode, draws: Draws) -> Particles:
     off, densities = (poses - means[:, :, None])[sought].reshape(-1, poses.shape[2]), np.empty(len(weights))
     for place, robot in enumerate(sought):
         covariances[robot] = joint[3 * place : 3 * place + 3, 3 * place : 3 * place + 3]
-    _kernels.weigh_deviations(joint, off, densities)
+    if not _kernels.weigh_deviations(joint, off, densities):
+        raise np.linalg.LinAlgError("the joint covariance of the robots' poses is not positive definite")
     frame = np.zeros((3, 3))
     in_view = np.zeros(len(seen), dtype=np.bool_)
     in_view[graph.point_landmarks] = True

@@ -1,12 +1,16 @@
 """What became of all robots' measurements in one step lies in one piece, and is cut out for who asks."""
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from test_step_input import checked, reading
 
+from slam_backend.filter import FastSlam
 from slam_backend.findings import Findings
+from slam_backend.measurements import Measurements
 from slam_backend.reports import StepReport
+from slam_backend.team import TeamSlam
 
 rows_of_ids = st.lists(st.lists(st.integers(-1, 9), max_size=4), min_size=1, max_size=4)
 
@@ -41,3 +45,13 @@ def test_measurements_that_were_not_used_are_rejected(seeds: list[int]) -> None:
         for kind, cut in enumerate((findings.associated(robot), findings.created(robot))):
             np.testing.assert_array_equal(cut[mask], findings.told[kind, begin:end])
             np.testing.assert_array_equal(cut[~mask], -1)
+
+
+def test_nobody_writes_into_what_reports_and_journals_share() -> None:
+    """Whoever could would change what a smoother makes of the run."""
+    frame = Measurements(np.array([[0.0, 0.0, 3.0]]), np.eye(1, 8))
+    for slam in (FastSlam(num_particles=3), TeamSlam(1, num_particles=3)):
+        report = slam.step([None], [frame])
+        assert report.associations[0].tolist() == [0]
+        with pytest.raises(ValueError, match="read-only"):
+            report.findings.told[:] = 77

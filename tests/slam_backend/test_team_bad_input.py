@@ -95,6 +95,19 @@ BAD_STEPS: list[tuple[dict[str, Any], str]] = [
         for moves in (STILL, np.zeros((3, 3)))
         for ends, count in (([1, 2, 9], 3), ([1, 2, 2], 3), ([2, 1, 3], 3), ([-1, 2, 3], 3), ([1, 2, 3], 2), ([], 3))
     ),
+    *(
+        (
+            {"measurements": TOGETHER._replace(**changed), "odometry": np.zeros((3, 3))},
+            r"measurements: expected points \(n, 3\) float64, descriptors \(n, d\) float32 and ends \(K,\) int64, got",
+        )
+        for changed in (
+            {"points": TOGETHER.points[:, :2]},
+            {"points": TOGETHER.points.astype(np.float32)},
+            {"ends": [1, 2, 3]},
+            {"descriptors": TOGETHER.descriptors.astype(np.float64)},
+            {"ends": np.array([1.0, 2.0, 3.0])},
+        )
+    ),
     ({"identities": [[1], [1]]}, r"identities: expected a sequence with one entry per robot \(3\)"),
     ({"identities": [[1], [1], [1, 2]]}, r"identities\[2\]: expected an array of shape"),
     ({"poses": [None, None, [0.0, np.inf, 0.0]]}, r"poses\[2\]: expected finite numbers, got NaN or infinity at"),

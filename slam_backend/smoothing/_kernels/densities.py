@@ -7,7 +7,7 @@ from slam_backend.errors import FloatArray
 
 
 @fused
-def weigh_deviations(covariance: FloatArray, off: FloatArray, log_densities: FloatArray) -> None:
+def weigh_deviations(covariance: FloatArray, off: FloatArray, log_densities: FloatArray) -> bool:
     """Write the logarithms of a Gaussian's density, up to a constant: 0 at its mean.
 
     Of L L^T the covariance, the squares of L^-1 d add up to the squared distance of a deviation d.
@@ -16,6 +16,9 @@ def weigh_deviations(covariance: FloatArray, off: FloatArray, log_densities: Flo
         covariance: (n, n), positive definite.
         off: (n, M) deviations from the mean; changed: L^-1 times these.
         log_densities: (M,), result.
+
+    Returns:
+        Whether the covariance is positive definite; if not, what is written means nothing.
     """
     lower, m = covariance.copy(), off.shape[1]
     log_densities[:] = 0.0
@@ -28,8 +31,11 @@ def weigh_deviations(covariance: FloatArray, off: FloatArray, log_densities: Flo
             row[i] -= row[j] * row[j]
             for p in range(m):
                 off[i, p] -= row[j] * off[j, p]
+        if not row[i] > 0.0:
+            return False
         row[i] = math.sqrt(row[i])
         scale = 1.0 / row[i]
         for p in range(m):
             off[i, p] *= scale
             log_densities[p] -= 0.5 * off[i, p] * off[i, p]
+    return True

@@ -130,10 +130,16 @@ def test_deviations_have_their_gaussian_density(size):
     covariance, found = root @ root.T, np.empty(70)
     expected = -0.5 * (off * np.linalg.solve(covariance, off)).sum(axis=0)
     before = covariance.copy()
-    weigh_deviations(covariance, off, found)
+    assert weigh_deviations(covariance, off, found)
     np.testing.assert_allclose(found, expected, rtol=1e-9)
     assert found[0] == 0.0
     np.testing.assert_array_equal(covariance, before)
+
+
+@pytest.mark.parametrize("least", [0.0, -1.0, np.nan])
+def test_what_is_no_covariance_has_no_density(least):
+    """It is told, not made into numbers."""
+    assert not weigh_deviations(np.diag([1.0, 2.0, least]), np.ones((3, 4)), np.empty(4))
 
 
 def test_odometry_of_paths_has_its_gaussian_density():
