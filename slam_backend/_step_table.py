@@ -25,8 +25,9 @@ Seen = tuple[list[Span], dict[int, BoolArray], FloatArray, Float32Array, IntArra
 def are_kinds(frames: TeamMeasurements) -> bool:
     """Return whether the frames of a team are arrays of the numbers of axes and the types that kernels take."""
     points, looks, ends = frames
-    are_arrays = type(points) is type(looks) is type(ends) is np.ndarray
-    return are_arrays and (points.dtype, looks.dtype, ends.dtype, points.ndim, looks.ndim, ends.ndim) == KINDS
+    if not (type(points) is np.ndarray and type(looks) is np.ndarray and type(ends) is np.ndarray):
+        return False
+    return (points.dtype, looks.dtype, ends.dtype, points.ndim, looks.ndim, ends.ndim) == KINDS
 
 
 def read_by_team(
