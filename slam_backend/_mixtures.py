@@ -32,12 +32,36 @@ def pose_mixtures(means: FloatArray, covariances: FloatArray, weights: FloatArra
 
 
 @any_order
-def _sum(weights: FloatArray, one: FloatArray, two: FloatArray, count: int) -> float:
-    """Return the weighted sum of the products of two rows, up to `count`."""
-    total = 0.0
-    for i in range(count):
-        total += weights[i] * one[i] * two[i]
-    return total
+def _shared_mean(shares: FloatArray, tile: FloatArray) -> tuple[float, float, float]:
+    """Return the weighted sums of the means in a block of lanes (9, lanes); what has no share may be anything."""
+    x, y, z = 0.0, 0.0, 0.0
+    for i in range(len(shares)):
+        share, own_x, own_y, own_z = shares[i], tile[0, i], tile[1, i], tile[2, i]
+        x += share * own_x if share > 0.0 else 0.0
+        y += share * own_y if share > 0.0 else 0.0
+        z += share * own_z if share > 0.0 else 0.0
+    return x, y, z
+
+
+@any_order
+def _shared_spread(
+    shares: FloatArray, tile: FloatArray, x: float, y: float, z: float
+) -> tuple[float, float, float, float, float, float]:
+    """Return the weighted sums (6) of covariances, and of products of what means are off (x, y, z), likewise."""
+    xx, xy, xz, yy, yz, zz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for i in range(len(shares)):
+        share, dx, dy, dz = shares[i], tile[0, i] - x, tile[1, i] - y, tile[2, i] - z
+        own_xx, own_xy, own_xz, own_yy, own_yz, own_zz = (
+            tile[3, i] + dx * dx, tile[4, i] + dx * dy, tile[5, i] + dx * dz,
+            tile[6, i] + dy * dy, tile[7, i] + dy * dz, tile[8, i] + dz * dz,
+        )  # fmt: skip
+        xx += share * own_xx if share > 0.0 else 0.0
+        xy += share * own_xy if share > 0.0 else 0.0
+        xz += share * own_xz if share > 0.0 else 0.0
+        yy += share * own_yy if share > 0.0 else 0.0
+        yz += share * own_yz if share > 0.0 else 0.0
+        zz += share * own_zz if share > 0.0 else 0.0
+    return xx, xy, xz, yy, yz, zz
 
 
 @lanes_inlined
@@ -55,49 +79,58 @@ def widen(scatter: FloatArray, x: float, y: float, covariance: FloatArray) -> No
 
 
 @jit
+def _weigh_places(ancestors: Any, weights: FloatArray, places: FloatArray) -> None:
+    """Write the weight of each place (P,) of a row: that of all particles that read there by a map of ancestors."""
+    places[:] = 0.0
+    for m in range(len(weights)):
+        places[ancestors[m]] += weights[m]
+
+
+@jit
 def _mix(
     slots: Any, table: Any, maps: Any, values: Any, counts: Any, best: int, weights: FloatArray, scatter: FloatArray,
     lanes: int,
 ) -> tuple[FloatArray, FloatArray, IntArray, IntArray]:  # fmt: skip
     """Return means (n, 3), covariances (n, 3, 3), counts (n,) and ids (n,) of landmarks, see `map_mixture`.
 
-    The number of lanes is an argument, for a compiled kernel would not notice that it changed in another file.
+    Values are read where they lie, each weighed once for all particles whose ancestor left it there. The number of
+    lanes is an argument, for a compiled kernel would not notice that it changed in another file.
     """
     row_of, map_of, ids = table[ROW_OF], table[MAP_OF], table[IDS]
-    padded, size = counts.shape[1], len(weights)
-    means, covariances = np.empty((len(slots), 3)), np.empty((len(slots), 3, 3))
+    padded, identity = counts.shape[1], np.arange(counts.shape[1]).astype(np.int32)
+    means, covariances = np.empty((len(slots), 3)), np.zeros((len(slots), 3, 3))
     times, names = np.empty(len(slots), np.int64), np.empty(len(slots), np.int64)
-    shares, own, ones = np.empty(size), np.empty((9, size)), np.ones(size)
-    at = np.empty(size, np.int64)
-    offsets = np.empty(padded, np.int64)  # of each particle's values in a row: a table, as divisions are dear
-    for place in range(padded):
-        offsets[place] = place // lanes * 9 * lanes + place % lanes
+    of_maps, is_weighed = np.empty((len(maps), padded)), np.zeros(len(maps), np.bool_)
+    shares = np.empty(padded)
     for i in range(len(slots)):
-        row, ancestors = row_of[slots[i]], map_of[slots[i]]
-        times[i], names[i] = counts[row, maps[ancestors, best] if ancestors > 0 else best], ids[slots[i]]
-        holders = 0
-        for m in range(size):
-            place = maps[ancestors, m] if ancestors > 0 else m
-            if counts[row, place] > 0:
-                at[holders], shares[holders] = row * 9 * padded + offsets[place], weights[m]
-                holders += 1
-        for c in range(9):
-            for h in range(holders):
-                own[c, h] = values[at[h] + c * lanes]
-        whole = max(_sum(shares, ones, ones, holders), 1e-300)
-        for h in range(holders):
-            shares[h] /= whole
-        for axis in range(3):
-            means[i, axis] = _sum(shares, own[axis], ones, holders)
-            for h in range(holders):
-                own[axis, h] -= means[i, axis]
-        entry = 3
-        for j in range(3):
-            for k in range(j, 3):
-                mixed = _sum(shares, own[entry], ones, holders) + _sum(shares, own[j], own[k], holders)
-                covariances[i, j, k] = covariances[i, k, j] = mixed
-                entry += 1
-        widen(scatter, means[i, 0], means[i, 1], covariances[i])
+        row, e = row_of[slots[i]], map_of[slots[i]]
+        names[i], times[i] = ids[slots[i]], counts[row, maps[e, best] if e > 0 else best]
+        if not is_weighed[e]:
+            is_weighed[e] = True
+            _weigh_places(maps[e] if e > 0 else identity, weights, of_maps[e])
+        whole = 0.0
+        for place in range(padded):
+            shares[place] = of_maps[e, place] if counts[row, place] > 0 else 0.0
+            whole += shares[place]
+        scale = 1.0 / max(whole, 1e-300)
+        tiles = values[9 * row * padded : 9 * (row + 1) * padded].reshape((-1, 9, lanes))
+        x, y, z = 0.0, 0.0, 0.0
+        for block in range(len(tiles)):
+            sums = _shared_mean(shares[block * lanes : (block + 1) * lanes], tiles[block])
+            x, y, z = x + scale * sums[0], y + scale * sums[1], z + scale * sums[2]
+        means[i, 0], means[i, 1], means[i, 2] = x, y, z
+        covariance = covariances[i]
+        for block in range(len(tiles)):
+            spread = _shared_spread(shares[block * lanes : (block + 1) * lanes], tiles[block], x, y, z)
+            xx, xy, xz, yy, yz, zz = spread
+            covariance[0, 0] += scale * xx
+            covariance[1, 1] += scale * yy
+            covariance[2, 2] += scale * zz
+            covariance[0, 1] += scale * xy
+            covariance[0, 2] += scale * xz
+            covariance[1, 2] += scale * yz
+        covariance[1, 0], covariance[2, 0], covariance[2, 1] = covariance[0, 1], covariance[0, 2], covariance[1, 2]
+        widen(scatter, x, y, covariance)
     return means, covariances, times, names
 
 

@@ -4,6 +4,8 @@ import numpy as np
 from gappy_filter import filter_with_gaps
 
 from slam_backend import FastSlam
+from slam_backend._kernels import LANES
+from slam_backend._kernels.layout import ROW_OF
 from slam_backend._mixtures import map_mixture
 from slam_backend.landmark_map import LandmarkMap
 
@@ -59,3 +61,17 @@ def test_to_ask_for_a_mixture_changes_nothing() -> None:
     after = slam._maps.get_state()
     for name in ("map_of", "maps", "values", "counts"):
         np.testing.assert_array_equal(after[name], before[name])
+
+
+def test_what_no_particle_holds_is_not_read() -> None:
+    """Places that no count vouches for may hold anything at all."""
+    slam = filter_with_gaps(33, 9)
+    asked = slam._maps, slam.best_particle, slam._log_weights, SCATTER, 1
+    before = map_mixture(*asked)
+    counts = slam._maps.counts
+    tiles = slam._maps.values.reshape(len(counts), -1, 9, LANES)
+    unheld = np.broadcast_to(counts.reshape(len(counts), -1, 1, LANES) == 0, tiles.shape)
+    assert unheld[slam._maps.table[ROW_OF, slam._maps.used_slots()]].any()
+    tiles[unheld] = np.nan
+    for one, other in zip(before, map_mixture(*asked), strict=True):
+        np.testing.assert_array_equal(one, other)
