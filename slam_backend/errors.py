@@ -146,6 +146,8 @@ def check_array(
     """
     if np.issubdtype(dtype, np.integer):
         _check_whole(name, value, cure)
+    if isinstance(value, np.ndarray) and value.dtype.kind == "c":  # numpy would only warn that it drops what is not real
+        raise bad_argument(name, "real numbers", f"an array of {value.dtype}", cure)
     try:
         array = np.array(value, dtype=dtype, order="C")
     except (TypeError, ValueError) as error:

@@ -14,7 +14,7 @@ from slam_backend.geometry import between
 from slam_backend.landmark_map import LandmarkMap, MapOutline, OutlineRows
 from slam_backend.reports import PoseEstimate
 from slam_backend.run_log import RobotLog
-from slam_backend.standpoints import Standpoints, seats
+from slam_backend.standpoints import Standpoints, members_of
 
 NO_WEIGHTS = np.empty(0)  # nobody asks for them where all particles start at the same place
 
@@ -89,7 +89,7 @@ class FilterKnowledge(FilterState):
         weights = NO_WEIGHTS if self._from_origin else np.exp(self._log_weights)
         _kernels.stand(
             self._of_robots, weights, self._best, self._from_origin, *self._estimates,
-            seats(names, live), ess, points.poses, points.beliefs,
+            members_of(names, live), ess, points.poses, points.beliefs,
         )  # fmt: skip
 
     def particles_from_start(self, robot: int = 0) -> FloatArray:

@@ -51,6 +51,6 @@ class Standpoints:
 
 
 @lru_cache(maxsize=256)
-def seats(robots: tuple[int, ...], live: tuple[int, ...]) -> IntArray:
+def members_of(robots: tuple[int, ...], live: tuple[int, ...]) -> IntArray:
     """Return the robots (n,) of a filter, and below each 1 if it goes by it, as kernels take them; only looked at."""
     return np.array([robots, [robot in live for robot in robots]], np.int64)

@@ -148,7 +148,7 @@ def time_simulator(config: EnvConfig, seed: int, steps: int, warm_up: int) -> St
 
     def tick(commands: FloatArray) -> None:
         before = simulator.poses
-        simulator.drive(commands)
+        simulator.step(commands)
         after = simulator.poses
         read_odometry(before, after, setting.bias, config.odometry, odometry)
         setting.sensor.measure(after, sensor)

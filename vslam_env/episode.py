@@ -112,11 +112,12 @@ class Episode:
     def advance(self, commands: FloatArray) -> None:
         """Drive all robots with velocity commands (K, 2) [m/s, rad/s] for a tick, and let them perceive and believe.
 
-        Commands are not checked.
+        Raises:
+            ValueError: If the shape is wrong or a number is not finite; nothing has changed then.
         """
         simulator, noise, stream = self._simulator, self._config.odometry, self._streams["odometry"]
         before = simulator.poses
-        if simulator.drive(commands):
+        if simulator.step(commands):
             self._collisions = tuple(map(add, self._collisions, simulator.bumped.tolist()))
         self.tick += 1
         self._perceive(read_odometry(before, simulator.poses, self.setting.bias, noise, stream, self._distances))

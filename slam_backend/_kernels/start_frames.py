@@ -86,7 +86,7 @@ def _see_own(
 @in_place
 def stand(
     robots: FloatArray, weights: FloatArray, best: int, at_origin: bool, estimates: FloatArray, spreads: FloatArray,
-    seats: IntArray, ess: float, poses: FloatArray, beliefs: FloatArray,
+    members: IntArray, ess: float, poses: FloatArray, beliefs: FloatArray,
 ) -> None:  # fmt: skip
     """Write where the robots of a filter stand, and where they see each other, in their own start frames.
 
@@ -99,18 +99,18 @@ def stand(
         best: The most probable particle.
         at_origin: Whether all robots started at the origin in all particles.
         estimates, spreads: (n, 3), (n, 3, 3) [m, m, rad] the robots' poses over all particles, map frame.
-        seats: (2, n) int64. Which robots of the team they are, and which of them go by this filter: only these are
+        members: (2, n) int64. Which robots of the team they are, and which of them go by this filter: only these are
             written of.
         ess: Effective sample size of the filter, as a share of M.
         poses, beliefs: Of the `Standpoints` of all robots of the team; written.
     """
-    count = seats.shape[1]
+    count = members.shape[1]
     starts, means = robots[STARTS], robots[MEANS]
     covariances = robots[COVARIANCES:].reshape((count, 6, robots.shape[3]))
     for i in range(count):
-        if not seats[1, i]:
+        if not members[1, i]:
             continue
-        own = seats[0, i]
+        own = members[0, i]
         seen, belief = poses[own], beliefs[own]
         x, y, theta = starts[i, 0, best], starts[i, 1, best], starts[i, 2, best]
         c, s = math.cos(theta), math.sin(theta)
@@ -132,7 +132,7 @@ def stand(
         c, s = math.cos(turn), math.sin(turn)
         for j in range(count):
             if j != i:
-                mate = seats[0, j]
+                mate = members[0, j]
                 seen[mate, 0] = to_x + c * estimates[j, 0] - s * estimates[j, 1]
                 seen[mate, 1] = to_y + s * estimates[j, 0] + c * estimates[j, 1]
                 seen[mate, 2] = (turn + estimates[j, 2] + math.pi) % (2.0 * math.pi) - math.pi

@@ -70,6 +70,8 @@ def test_unknown_names_are_refused_with_the_known_ones(value: Any) -> None:
         ([[1.0, 2.0], [3.0]], r"x: expected an array of shape \(n, 2\), got \[\[1.0, 2.0\], \[3.0\]\]"),
         ([["a", "b"]], r"x: expected an array of shape \(n, 2\), got"),
         (None, r"x: expected an array of shape \(n, 2\), got"),
+        ([[1j, 2.0]], r"x: expected an array of shape \(n, 2\), got"),
+        (np.zeros((1, 2), complex), r"x: expected real numbers, got an array of complex128"),
         ([[1.0, 2.0], [np.inf, 0.0]], r"x: expected finite numbers, got NaN or infinity at index \(1, 0\)"),
     ],
 )

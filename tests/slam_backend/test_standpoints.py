@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from slam_backend.standpoints import SIGMAS, Standpoints, seats
+from slam_backend.standpoints import SIGMAS, Standpoints, members_of
 
 
 @pytest.mark.parametrize(("rows", "robots"), [(3, None), (1, 4)])
@@ -39,6 +39,6 @@ def test_the_views_of_a_copy_are_of_its_own_beliefs(copied: Callable[[Standpoint
         assert (array == 5.0).all()
 
 
-def test_seats_say_who_goes_by_a_filter() -> None:
+def test_members_say_who_goes_by_a_filter() -> None:
     """The robots of the filter, and of each whether it does."""
-    assert seats((1, 2, 4), (4, 1)).tolist() == [[1, 2, 4], [1, 0, 1]]
+    assert members_of((1, 2, 4), (4, 1)).tolist() == [[1, 2, 4], [1, 0, 1]]

@@ -188,6 +188,10 @@ CASES: dict[str, tuple[Callable[[], Any], str]] = {
         _step({"robot_0": np.zeros(2, complex), "robot_1": [0, 0]}),
         r"actions\['robot_0'\]: expected an array of shape \(2,\) of real numbers",
     ),
+    "action of things": (
+        _step({"robot_0": np.array([0.1, "b"], dtype=object), "robot_1": [0, 0]}),
+        r"actions\['robot_0'\]: expected an array of shape \(2,\) of real numbers",
+    ),
     "action of truth values": (
         _step({"robot_0": np.array([True, False]), "robot_1": [0, 0]}),
         r"actions\['robot_0'\]: expected an array of shape \(2,\) of real numbers",

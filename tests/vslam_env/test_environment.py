@@ -89,6 +89,40 @@ def test_robots_do_what_they_are_told() -> None:
         assert np.allclose(moved, [0.1 * speed, 0.0, 0.1 * turn], atol=1e-9)
 
 
+@pytest.mark.parametrize(
+    "action",
+    [
+        np.array([0.5, -0.25]),
+        np.array([0.5, -0.25], dtype=np.float16),
+        np.array([0.5, -0.25], dtype=np.longdouble),
+        np.array([0.5, -0.25], dtype=object),
+        (0.5, -0.25),
+    ],
+)
+def test_any_two_numbers_are_a_continuous_action(action: object) -> None:
+    """The robots do the same for them as for the two numbers of the space."""
+    env, same = small_env(), small_env()
+    for one in (env, same):
+        one.reset(seed=100)
+    env.step(dict.fromkeys(env.agents, action))
+    same.step(dict.fromkeys(same.agents, np.array([0.5, -0.25], dtype=np.float32)))
+    np.testing.assert_array_equal(env.true_poses, same.true_poses)
+
+
+@pytest.mark.parametrize("commands", [[[0.1, 0.0]], np.array([[0.1, 0.0], [np.nan, 0.0]]), np.zeros((2, 2), complex)])
+def test_an_episode_refuses_commands_that_are_none_and_stays_where_it_is(commands: object) -> None:
+    """Of the wrong shape, not finite, not real."""
+    env, same = small_env(), small_env()
+    for one in (env, same):
+        one.reset(seed=100)
+    with pytest.raises(ValueError, match=r"commands: expected .*Give \(v, omega\) for each robot\."):
+        env.episode.advance(commands)
+    for one in (env, same):
+        one.step(dict.fromkeys(one.agents, (0.5, 0.5)))
+    np.testing.assert_array_equal(env.true_poses, same.true_poses)
+    np.testing.assert_array_equal(env.belief("robot_0").pose, same.belief("robot_0").pose)
+
+
 def test_a_step_is_several_ticks() -> None:
     """With `decision_ticks` an action is held for so many ticks, and rewards are those of the ticks summed."""
     coarse, fine = small_env(decision_ticks=4), small_env()

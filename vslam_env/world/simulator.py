@@ -23,7 +23,8 @@ def _drive_freely(
 ) -> bool:
     """Write down where robots end after a tick if nothing stops them; tell whether surely nothing can.
 
-    A robot goes along the chord of its arc, so that it ends where the arc does.
+    A robot goes along the chord of its arc, so that it ends where the arc does. A command that is not finite is never
+    clear.
 
     Args:
         poses: (K, 3) float64 [m, m, rad], world frame.
@@ -43,6 +44,7 @@ def _drive_freely(
         goals[k, 1] = poses[k, 1] + chord * np.sin(poses[k, 2] + half)
         goals[k, 2] = (poses[k, 2] + turn + np.pi) % (2.0 * np.pi) - np.pi
         reach[k] = radius + abs(chord)
+        clear &= np.isfinite(chord + turn)
     for k in range(len(poses)):
         for i in range(len(walls)):
             ex, ey = walls[i, 2] - walls[i, 0], walls[i, 3] - walls[i, 1]
@@ -84,6 +86,7 @@ class Simulator:
         self._space.add(*(pymunk.Segment(ground, (a, b), (c, d), 0.0) for a, b, c, d in world.walls.tolist()))
         self._bodies = []
         self.poses = check_array("start_poses", start_poses, (None, 3), "Give one row x y theta for each robot.")
+        self._shape = len(self.poses), 2  # of commands
         _, _, x_max, y_max = world.bounds
         apart = 4.0 * (radius + SKIN)
         self._parking = [(x_max + apart * (2 + robot), y_max + apart) for robot in range(len(self.poses))]
@@ -99,7 +102,7 @@ class Simulator:
         """Drive all robots for one tick.
 
         Args:
-            commands: (K, 2) float64 [m/s, rad/s]. Speed ahead and rate of turn of each robot.
+            commands: (K, 2) [m/s, rad/s], as numpy can read it. Speed ahead and rate of turn of each robot.
 
         Returns:
             Whether some robot was near enough to something that it may have bumped into it.
@@ -107,15 +110,14 @@ class Simulator:
         Raises:
             ValueError: If the shape is wrong or a number is not finite.
         """
-        return self.drive(check_array("commands", commands, (len(self._bodies), 2), "Give (v, omega) for each robot."))
-
-    def drive(self, commands: FloatArray) -> bool:
-        """Drive all robots as `step` does, by commands that are as they have to be: nothing is checked."""
+        if type(commands) is not np.ndarray or commands.dtype != np.float64 or commands.shape != self._shape:
+            commands = self._checked(commands)
         goals = np.empty((len(self._bodies), 3))
         clear = _drive_freely(self.poses, commands, self.tick, self._walls, self.radius + SKIN, goals)
         if clear:
             self.bumped = self._nobody
         else:
+            self._checked(commands)  # what is not finite is never clear
             way = goals[:, :2] - self.poses[:, :2]
             goals[:, :2] = self._move_in_contact(way)
             achieved = np.sum((goals[:, :2] - self.poses[:, :2]) * way, axis=1)
@@ -123,6 +125,10 @@ class Simulator:
             self.bumped.setflags(write=False)
         self.poses = goals
         return not clear
+
+    def _checked(self, commands: Any) -> FloatArray:
+        """Return commands (K, 2) as `step` needs them, or raise."""
+        return check_array("commands", commands, self._shape, "Give (v, omega) for each robot.")
 
     def _move_in_contact(self, way: FloatArray) -> FloatArray:
         """Move the bodies by `way` (K, 2) [m] as far as contacts allow; return their positions (K, 2) [m].
