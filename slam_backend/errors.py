@@ -146,7 +146,7 @@ def check_array(
     """
     if np.issubdtype(dtype, np.integer):
         _check_whole(name, value, cure)
-    if isinstance(value, np.ndarray) and value.dtype.kind == "c":  # numpy would only warn that it drops what is not real
+    if isinstance(value, np.ndarray) and value.dtype.kind == "c":  # numpy would drop a part
         raise bad_argument(name, "real numbers", f"an array of {value.dtype}", cure)
     try:
         array = np.array(value, dtype=dtype, order="C")
