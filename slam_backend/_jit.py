@@ -7,16 +7,19 @@ from pathlib import Path
 from typing import Any, ParamSpec, TypeVar, cast
 
 import numba
+import numpy as np
 from llvmlite import ir
 from numba.core import cgutils, types
 from numba.core.cpu import CPUTargetOptions
 from numba.extending import intrinsic
 from numba.np import arrayobj
+from numpy.typing import NDArray
 
 from slam_backend.errors import FloatArray
 
 P = ParamSpec("P")
 T = TypeVar("T")
+Scalar = TypeVar("Scalar", bound=np.generic)
 
 LINE = 64  # bytes of a line of the cache
 KERNELS = "_kernels"  # ends the name of a folder whose modules hold kernels that call each other
@@ -129,23 +132,34 @@ alloca_once: Callable[..., Any] = cgutils.alloca_once
 populate_array: Callable[..., Any] = arrayobj.populate_array
 
 
-def _room(typing_context: Any, size: Any) -> Any:
-    """Return an array (size,) of float64, unset, on the stack (inside kernels only)."""
+def _unset(number: Any, size: Any, *others: Any) -> Any:
+    """Return type and code of a function of a constant size, and perhaps more, that returns an array on the stack."""
     if not isinstance(size, types.IntegerLiteral):
         return None
-    row = types.Array(types.float64, 1, "C")
+    row = types.Array(number, 1, "C")
 
     def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        data = alloca_once(builder, ir.DoubleType(), size=size.literal_value)
+        data = alloca_once(builder, context.get_data_type(number), size=size.literal_value)
         data.align = LINE
         array = context.make_array(row)(context, builder)
-        item, length = (context.get_constant(types.intp, number) for number in (8, size.literal_value))
+        item, length = (context.get_constant(types.intp, n) for n in (number.bitwidth // 8, size.literal_value))
         populate_array(array, data=data, shape=[length], strides=[item], itemsize=item, meminfo=None)
         return array._getvalue()
 
-    return row(size), code
+    return row(size, *others), code
 
 
-# An array of as many float64 as a constant says, unset, that lives as long as the call of a kernel: it costs nothing,
+def _room(typing_context: Any, size: Any) -> Any:
+    """Return an array (size,) of float64, unset, on the stack (inside kernels only)."""
+    return _unset(types.float64, size)
+
+
+def _room_of(typing_context: Any, size: Any, dtype: Any) -> Any:
+    """Return an array (size,) of numbers of a type, unset, on the stack (inside kernels only)."""
+    return _unset(dtype.dtype, size, dtype)
+
+
+# An array of as many numbers as a constant says, unset, that lives as long as the call of a kernel: it costs nothing,
 # and even a kernel that works `in_place` may have it, but not return it.
 room = cast(Callable[[int], FloatArray], intrinsic(prefer_literal=True)(_room))
+room_of = cast(Callable[[int, type[Scalar]], NDArray[Scalar]], intrinsic(prefer_literal=True)(_room_of))

@@ -52,6 +52,7 @@ class ClaimLedger:
     def __init__(self, num_robots: int, true_positions: FloatArray, countable: np.ndarray, cutoff: float) -> None:
         self.cutoff = check_float("map_error_cutoff", cutoff, "Give metres.", above=0.0)
         self.true_positions = np.ascontiguousarray(true_positions[countable])
+        self._least = np.empty(len(self.true_positions))  # room to score in
         self._claim_of = np.where(countable, np.cumsum(countable) - 1, UNCOUNTED)
         self._books = np.empty((num_robots, 0), np.int64)  # in each row what the ids of one map claim
         self._row_of = {number: number for number in range(num_robots)}
@@ -119,7 +120,7 @@ class ClaimLedger:
         (places, names), parts = outlines
         score_team(
             places, names, parts, self._books, self._book_of, self.true_positions, self.cutoff, points.beliefs,
-            true_starts, true_poses, scores,
+            true_starts, true_poses, scores, self._least,
         )  # fmt: skip
 
     def get_state(self) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend._jit import inlined, jit
+from slam_backend._jit import in_place, inlined
 from slam_backend.errors import FloatArray, IntArray
 from slam_backend.standpoints import OWN, SIGMAS, START
 
@@ -77,10 +77,10 @@ def _score_map(
     return math.sqrt(total / count), rmse, matched / count, matched / max(estimated, 1), placed / count
 
 
-@jit
+@in_place
 def score_team(
     places: Any, names: Any, parts: Any, books: Any, book_of: Any, truths: Any, cutoff: float, beliefs: Any,
-    true_starts: Any, true_poses: Any, scores: Any,
+    true_starts: Any, true_poses: Any, scores: Any, least: Any,
 ) -> None:  # fmt: skip
     """Write how wrong the robots' maps and poses are, in their own start frames and without fitting.
 
@@ -96,8 +96,8 @@ def score_team(
             matched landmarks, the cutoff where nothing is matched; matched landmarks over the true ones, and over
             those of the map; matched ones nearer than 0.5 m over the true ones; errors of position [m] and heading
             [rad]; and what the robot believes of the former, one sigma [m].
+        least: (N',) room to work in.
     """
-    least = np.empty(len(truths))
     for robot in range(len(beliefs)):
         held, belief = slice(parts[robot, 0], parts[robot, 1]), beliefs[robot]
         x, y, theta = belief[START], belief[START + 1], belief[START + 2]

@@ -76,6 +76,23 @@ def test_rooms_of_a_kernel_are_apart_and_stay_through_its_loops() -> None:
     assert out.tolist() == [6.0 + 40.0 * i for i in range(5)]
 
 
+@pytest.mark.parametrize("dtype", [np.uint8, np.int32, np.int64, np.float32, np.float64])
+def test_rooms_hold_numbers_of_any_type(dtype: Any) -> None:
+    """They are laid out one behind the other, and wrap around as numbers of that type do."""
+
+    def fill(out: Any) -> None:
+        row = _jit.room_of(7, dtype)
+        for i in range(len(row)):
+            row[i] = out[i]
+        for i in range(len(row)):
+            out[i] = row[len(row) - 1 - i] + row[i]
+
+    out = np.arange(7).astype(dtype) * dtype(40)
+    expected = out + out[::-1]
+    _jit.in_place(fill)(out)
+    assert out.tolist() == expected.tolist()
+
+
 def test_the_size_of_a_room_is_a_constant() -> None:
     """The stack has no room for what nobody has foreseen."""
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend._jit import jit
+from slam_backend._jit import in_place, room_of
 from slam_backend.standpoints import OWN, START
 from vslam_env.navigation import CELL, FREE, GRID_SIZE, OCCUPIED, UNKNOWN
 
@@ -15,7 +15,7 @@ MARK = 255
 REACH = 0.75 * SIZE  # [cells] more than from the robot to a corner of its picture
 
 
-@jit
+@in_place
 def paint(cells: Any, belief: Any, places: Any, local: Any) -> None:
     """Sample the seen grid at the centres of the local cells, and mark the cells that hold landmarks.
 
@@ -34,7 +34,7 @@ def paint(cells: Any, belief: Any, places: Any, local: Any) -> None:
     flat = cells.reshape(cells.size)
     low, high = REACH - 0.5 * GRID_SIZE, 0.5 * GRID_SIZE - REACH
     surely_inside = low < x / CELL < high and low < y / CELL < high
-    place, seen = np.empty(SIZE, np.int32), np.empty(SIZE, np.uint8)
+    place, seen = room_of(SIZE, np.int32), room_of(SIZE, np.uint8)
     for row in range(SIZE):
         ahead = middle - 0.5 - row  # [cells], as what follows
         first_i, first_j = y / CELL + s * ahead + 0.5 * GRID_SIZE, x / CELL + c * ahead + 0.5 * GRID_SIZE

@@ -29,6 +29,7 @@ class TeamGrids:
         self._evidence, self.cells = np.zeros(shape, np.int8), np.full(shape, UNKNOWN, np.uint8)
         self.changes = np.full((num_robots, 1 + _painting.MOST_CHANGES), -1, np.int32)
         self.bounds = np.zeros((num_robots, 4), np.int32)
+        self._room = np.empty((0, 0))
         self.grids = list(map(SeenGrid._of, self._evidence, self.cells, self.changes, self.bounds))
 
     def paint_readings(
@@ -55,8 +56,13 @@ class TeamGrids:
         Raises:
             ValueError: If one of these poses is not finite, or ranges are less than 0; then nothing is painted.
         """
-        grids = self._evidence, self.cells, self.changes, self.bounds
-        owner, robot = _painting.paint_readings(*grids, shared, poses, scans, bumps, directions, max_range, radius)
+        num_rays = scans.shape[1]
+        if self._room.shape[1] != num_rays + 1:
+            self._room = _painting.room_to_paint(num_rays)
+        owner, robot = _painting.paint_readings(
+            self._evidence, self.cells, self.changes, self.bounds, shared, poses, scans, bumps, directions, max_range,
+            radius, self._room,
+        )  # fmt: skip
         if owner >= 0:
             pose_floats(poses[owner, robot])
             check_ranges(scans[robot])

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend._jit import in_place, jit
+from slam_backend._jit import in_place
 from slam_backend.errors import FloatArray, IntArray
 
 NEAREST_FALSE_POINT = 0.5  # [m]
@@ -75,7 +75,7 @@ def mix_in(num_false: IntArray, keys: FloatArray, ids: IntArray, counts: IntArra
         begin, false = begin + counts[k], false + num_false[k]
 
 
-@jit
+@in_place
 def measure(
     ids: IntArray,
     counts: IntArray,
@@ -100,7 +100,7 @@ def measure(
         poses: (K, 3) float64 [m, m, rad], world frame. Robots.
         landmarks: (N, 3 + d) float64. Their positions [m], world frame, and descriptors, unit vectors.
         false_points: (m, 3 + d) float64. Likewise, but in the camera frame.
-        noise: (n, 3 + d) float64, standard normal.
+        noise: (n, 3 + d) float64, standard normal. Overwritten.
         optics: (7,) float64. Place of the camera in the robot frame [m], its focal length [px] and baseline [m], and
             its sigmas of image coordinates and disparity [px].
         descriptor_noise: Root mean square length of the noise of a descriptor.
@@ -113,7 +113,6 @@ def measure(
     forward, aside, height, focal, baseline, sigma, sigma_disparity = optics
     size = looks.shape[1]
     each = descriptor_noise / np.sqrt(size)
-    look = np.empty(size)
     i = kept = 0
     for k in range(len(poses)):
         cosine, sine = np.cos(poses[k, 2]), np.sin(poses[k, 2])
@@ -134,9 +133,9 @@ def measure(
                 points[kept, 0] = (right * scale + sigma * noise[i, 0]) * baseline / disparity
                 points[kept, 1] = (down * scale + sigma * noise[i, 1]) * baseline / disparity
                 points[kept, 2] = focal * baseline / disparity
-                square = 0.0
+                look, square = noise[i, 3:], 0.0
                 for j in range(size):
-                    look[j] = row[3 + j] + each * noise[i, 3 + j]
+                    look[j] = row[3 + j] + each * look[j]
                     square += look[j] ** 2
                 length = np.sqrt(square)
                 for j in range(size):

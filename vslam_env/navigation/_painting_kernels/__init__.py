@@ -18,11 +18,11 @@ from vslam_env.navigation._painting_kernels.evidence import (
 )
 from vslam_env.navigation._painting_kernels.rays import good_angles, good_ranges
 from vslam_env.navigation._painting_kernels.readings import paint_bump, paint_disc, paint_readings
-from vslam_env.navigation._painting_kernels.scans import paint_scan
+from vslam_env.navigation._painting_kernels.scans import paint_scan, room_to_paint
 from vslam_env.navigation._painting_kernels.surveys import directions_of
 
 __all__ = [
     "CELL", "FREE", "GRID_SIZE", "HALF_WIDTH", "MOST_CHANGES", "OCCUPIED", "UNKNOWN", "directions_of", "good_angles",
     "good_ranges", "known_bounds", "paint_bump", "paint_disc", "paint_grid", "paint_readings",
-    "paint_scan",
+    "paint_scan", "room_to_paint",
 ]  # fmt: skip

@@ -3,7 +3,7 @@
 import math
 from typing import Any
 
-from slam_backend._jit import in_place, jit
+from slam_backend._jit import in_place
 from slam_backend.errors import BoolArray, FloatArray
 from vslam_env.navigation._painting_kernels.evidence import (
     CELL,
@@ -16,8 +16,8 @@ from vslam_env.navigation._painting_kernels.evidence import (
     judge,
 )
 from vslam_env.navigation._painting_kernels.rays import good_ranges
-from vslam_env.navigation._painting_kernels.scans import paint_survey, room_to_paint
-from vslam_env.navigation._painting_kernels.surveys import survey
+from vslam_env.navigation._painting_kernels.scans import paint_survey
+from vslam_env.navigation._painting_kernels.surveys import NUM_ROWS, survey
 
 
 @in_place
@@ -64,7 +64,7 @@ def _find_bad(shared: Any, poses: FloatArray, scans: FloatArray) -> tuple[int, i
     return -1, -1
 
 
-@jit
+@in_place
 def paint_readings(
     evidence: Any,
     cells: Any,
@@ -77,6 +77,7 @@ def paint_readings(
     directions: FloatArray,
     max_range: float,
     radius: float,
+    room: FloatArray,
 ) -> tuple[int, int]:
     """Write what robots read in a tick: their scans, the floor that they cover, and their bumps.
 
@@ -92,6 +93,7 @@ def paint_readings(
         directions: (2, R) float64.
         max_range: [m].
         radius: [m].
+        room: Of `room_to_paint`.
 
     Returns:
         Whose grid and whose reading do not go together, as its pose or its ranges are bad; nothing was written then.
@@ -100,13 +102,12 @@ def paint_readings(
     bad = _find_bad(shared, poses, scans)
     if bad[0] >= 0:
         return bad
-    told, room = room_to_paint(scans.shape[1])
     for robot in range(len(scans)):
-        survey(scans[robot], directions, max_range, told)
+        survey(scans[robot], directions, max_range, room[:NUM_ROWS])
         for owner in range(len(shared)):
             if shared[owner, robot]:
                 x, y, theta = poses[owner, robot]
-                paint_survey(evidence[owner], cells[owner], changes[owner], bounds[owner], x, y, theta, told, room)
+                paint_survey(evidence[owner], cells[owner], changes[owner], bounds[owner], x, y, theta, room)
                 paint_disc(evidence[owner], cells[owner], changes[owner], bounds[owner], x, y, radius)
                 if bumps[robot]:
                     paint_bump(evidence[owner], cells[owner], changes[owner], bounds[owner], x, y, theta, radius)

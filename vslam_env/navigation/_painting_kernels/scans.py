@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend._jit import in_place, inlined, jit
+from slam_backend._jit import in_place, inlined, jit, room_of
 from slam_backend.errors import FloatArray
 from vslam_env.navigation._painting_kernels.evidence import (
     CELL,
@@ -36,6 +36,7 @@ from vslam_env.navigation._painting_kernels.surveys import (
 )
 
 NONE_PASSED: Any = np.uint32(0)  # unsigned, as are other places of arrays below, so that none counts from the end
+MOST_PLACES = GRID_SIZE + 1  # before the cells of a row, and after the last one
 LEAST_HEIGHT = 1e-9  # [m] that a row is taken to be from the robot, so that no ray crosses it nowhere
 
 
@@ -65,15 +66,14 @@ def _told_at_jump(told: Any, seen: Any, k: Any, u: float, v: float, change: int)
 
 
 @jit
-def room_to_paint(num_rays: int) -> Any:
-    """Return room for a survey (15, n + 1) float64, and for what `paint_survey` works in."""
-    seen, passed = np.empty((NUM_SEEN_ROWS, num_rays + 1)), np.empty(GRID_SIZE + 1, np.uint32)
-    return np.empty((NUM_ROWS, num_rays + 1)), (seen, passed)
+def room_to_paint(num_rays: int) -> FloatArray:
+    """Return room (22, n + 1) for a survey of n rays, and below it for what `paint_survey` makes of it."""
+    return np.empty((NUM_ROWS + NUM_SEEN_ROWS, num_rays + 1))
 
 
 @in_place
 def paint_survey(
-    evidence: Any, cells: Any, changes: Any, bounds: Any, x: float, y: float, theta: float, told: Any, room: Any
+    evidence: Any, cells: Any, changes: Any, bounds: Any, x: float, y: float, theta: float, room: FloatArray
 ) -> None:
     """Write what a scan tells into a grid, visiting each cell between rays that reach its row once.
 
@@ -93,10 +93,10 @@ def paint_survey(
         x: Where the robot was [m].
         y: Likewise.
         theta: Its heading [rad].
-        told: (15, n + 1) float64, of `survey`.
-        room: Of `room_to_paint`.
+        room: Of `room_to_paint`, holding a survey.
     """
-    seen, all_passed, count = room[0], room[1], told.shape[1] - 1
+    told, seen, count = room[:NUM_ROWS], room[NUM_ROWS:], room.shape[1] - 1
+    all_passed = room_of(MOST_PLACES, np.uint32)
     turn(told, theta, seen)
     low_x = high_x = low_y = high_y = 0.0
     for i in range(count):
@@ -157,6 +157,6 @@ def paint_scan(
     max_range: float,
 ) -> None:
     """Write one scan of `good_ranges` into a grid: `survey` and `paint_survey`."""
-    told, room = room_to_paint(len(ranges))
-    survey(ranges, directions, max_range, told)
-    paint_survey(evidence, cells, changes, bounds, x, y, theta, told, room)
+    room = room_to_paint(len(ranges))
+    survey(ranges, directions, max_range, room[:NUM_ROWS])
+    paint_survey(evidence, cells, changes, bounds, x, y, theta, room)
