@@ -24,7 +24,7 @@ from vslam_env.navigation import (
 )
 from vslam_env.navigation._painting_kernels import known_bounds
 from vslam_env.navigation._search_kernels.boxes import OUTSIDE, PAD, known_box
-from vslam_env.navigation._search_kernels.ways import UNREACHED, wavefront
+from vslam_env.navigation._search_kernels.ways import UNREACHED, parents_of, wavefront
 from vslam_env.navigation._search_kernels.weights import CLOSE, NEAR, OPEN, weigh
 
 
@@ -62,7 +62,8 @@ def test_the_wavefront_agrees_with_scipys_dijkstra(inner: np.ndarray, data: st.D
     weights = np.pad(inner, 1)
     width = weights.shape[1]
     start = tuple(int(i) for i in np.argwhere(weights)[data.draw(st.integers(0, int((weights > 0).sum()) - 1))])
-    cost, parent = wavefront(weights, *start)
+    cost, ways = wavefront(weights, *start)
+    parent = parents_of(ways)
 
     edges = {}
     for r, c in np.argwhere(weights):

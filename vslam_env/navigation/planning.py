@@ -20,7 +20,7 @@ from slam_backend._jit import in_place
 from slam_backend.errors import FloatArray, bad_argument, check_float
 from vslam_env.navigation._arguments import check_cells, point_floats, pose_floats
 from vslam_env.navigation._painting_kernels import CELL, HALF_WIDTH, known_bounds
-from vslam_env.navigation._search_kernels import UNREACHED, nearest_open, straight_path, ways_over
+from vslam_env.navigation._search_kernels import UNREACHED, nearest_open, parents_of, straight_path, ways_over
 from vslam_env.navigation.seen_grid import centre_of
 
 ESCAPE_CELLS = 5  # a robot that drift or a bump put into a wall's margin looks this far for open floor
@@ -85,8 +85,8 @@ def distance_map(cells: NDArray[np.uint8], start_xy: ArrayLike, radius: float = 
     """
     check_cells(cells)
     start = checked_start(start_xy, radius)
-    box, weights, cost, parent, row, col = ways_over(cells, known_bounds(cells), *start)
-    return DistanceMap(corner=(row, col), box=box, weights=weights, cost=cost, parent=parent)
+    box, weights, cost, ways, row, col = ways_over(cells, known_bounds(cells), *start)
+    return DistanceMap(corner=(row, col), box=box, weights=weights, cost=cost, parent=parents_of(ways))
 
 
 def checked_start(start_xy: ArrayLike, radius: float) -> tuple[int, int, float, int]:

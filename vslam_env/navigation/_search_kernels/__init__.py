@@ -2,9 +2,9 @@
 
 from vslam_env.navigation._search_kernels.frontiers import HEADING, LENGTH, NUM_COLUMNS, SIZE, XY, frontiers_over
 from vslam_env.navigation._search_kernels.paths import straight_path
-from vslam_env.navigation._search_kernels.ways import UNREACHED, nearest_open, ways_over
+from vslam_env.navigation._search_kernels.ways import UNREACHED, nearest_open, parents_of, ways_over
 
 __all__ = [
-    "HEADING", "LENGTH", "NUM_COLUMNS", "SIZE", "UNREACHED", "XY", "frontiers_over", "nearest_open", "straight_path",
-    "ways_over",
+    "HEADING", "LENGTH", "NUM_COLUMNS", "SIZE", "UNREACHED", "XY", "frontiers_over", "nearest_open", "parents_of",
+    "straight_path", "ways_over",
 ]  # fmt: skip

@@ -8,11 +8,13 @@ import numpy as np
 from slam_backend._jit import in_place, jit
 from vslam_env.navigation._painting_kernels import CELL, FREE, GRID_SIZE, HALF_WIDTH, UNKNOWN
 from vslam_env.navigation._search_kernels.boxes import any_above_zero
-from vslam_env.navigation._search_kernels.ways import UNREACHED, ways_over
+from vslam_env.navigation._search_kernels.ways import NUM_STRAIGHT, UNREACHED, steps_over, ways_over
 
 MIN_CELLS = 3  # a robot needs 0.4 m; what is smaller is a speck or the corner of a wall
 MAX_CELLS = 20  # longer frontiers are cut, as one goal cannot stand for them
 GOAL_STEPS = 5  # a goal is at most this far from its frontier [cells]
+MOST_NEAR = 1 + 2 * GOAL_STEPS * (GOAL_STEPS + 1)  # cells that so many steps lead to, the first one included
+LOOKED_AT = 4  # added to the marks of cells while a goal is looked for
 SIGHT_CELLS = 3  # the unknown this near to a goal tells where to look from it
 
 XY, HEADING, SIZE, LENGTH, NUM_COLUMNS = slice(0, 2), 2, 3, 4, 5  # columns of the rows that describe frontiers
@@ -40,51 +42,54 @@ def _flood(mark: Any, level: int, into: int, row: int, col: int, limit: int, que
 
 
 @jit
-def _goal_near(members: Any, box: Any, cost: Any, visited: Any, stamp: int) -> tuple[int, int]:
+def _goal_near(members: Any, box: Any, cost: Any, mark: Any) -> tuple[int, int]:
     """Return a reached cell as few steps as possible from a frontier and near its middle; (-1, -1) if none is near.
 
     Steps go sideways and not through walls. Most often one is enough; where a wall that is drawn too thick closes a
-    door, the robot has to come near and look again.
+    door, the robot has to come near and look again. Marks are afterwards as they were.
     """
-    ring = members.copy()
-    for k in range(len(ring)):
-        visited[ring[k, 0], ring[k, 1]] = stamp
+    queue = np.empty((MOST_NEAR * len(members), 2), np.int64)
+    first, last, goal_row, goal_col = 0, len(members), -1, -1
+    for k in range(last):
+        queue[k, 0], queue[k, 1] = members[k]
+        mark[members[k, 0], members[k, 1]] |= LOOKED_AT
     for _ in range(GOAL_STEPS):
-        following = np.empty((4 * len(ring), 2), np.int64)
-        num, total, sum_row, sum_col = 0, 0, 0.0, 0.0
-        for k in range(len(ring)):
+        following, total, sum_row, sum_col = last, 0, 0.0, 0.0
+        for k in range(first, last):
             for i, j in ((0, 1), (1, 0), (0, -1), (-1, 0)):
-                r, c = ring[k, 0] + i, ring[k, 1] + j
-                if not (0 <= r < box.shape[0] and 0 <= c < box.shape[1]) or visited[r, c] == stamp:
+                r, c = queue[k, 0] + i, queue[k, 1] + j
+                if not (0 <= r < box.shape[0] and 0 <= c < box.shape[1]) or mark[r, c] & LOOKED_AT:
                     continue
-                visited[r, c] = stamp
                 if box[r, c] in (FREE, UNKNOWN):
-                    following[num, 0], following[num, 1] = r, c
-                    num += 1
+                    mark[r, c] |= LOOKED_AT
+                    queue[following, 0], queue[following, 1] = r, c
+                    following += 1
                     if cost[r, c] != UNREACHED:
                         total, sum_row, sum_col = total + 1, sum_row + r, sum_col + c
-        ring = following[:num]
+        first, last = last, following
         if total > 0:
-            best, goal_row, goal_col = np.inf, -1, -1
-            for k in range(num):
-                r, c = ring[k]
+            best = np.inf
+            for k in range(first, last):
+                r, c = queue[k]
                 distance = (r - sum_row / total) ** 2 + (c - sum_col / total) ** 2
                 if cost[r, c] != UNREACHED and distance < best:
                     best, goal_row, goal_col = distance, r, c
-            return goal_row, goal_col
-    return -1, -1
+            break
+    for k in range(last):
+        mark[queue[k, 0], queue[k, 1]] ^= LOOKED_AT
+    return goal_row, goal_col
 
 
 @in_place
-def _path_length(parent: Any, row: int, col: int) -> float:
+def _path_length(ways: Any, row: int, col: int) -> float:
     """Measure the way to a reached cell [m]."""
-    width = parent.shape[1]
-    before = parent.reshape(parent.size)
+    width = ways.shape[1]
+    directions, steps = ways.reshape(ways.size), steps_over(width)
     cell, length = row * width + col, 0.0
-    while before[cell] >= 0:
-        step = abs(cell - before[cell])
-        length += CELL if step in (1, width) else math.sqrt(2.0) * CELL
-        cell = before[cell]
+    while directions[cell] >= 0:
+        direction = directions[cell]
+        length += CELL if direction < NUM_STRAIGHT else math.sqrt(2.0) * CELL
+        cell -= steps[direction]
     return length
 
 
@@ -117,13 +122,13 @@ def _unseen_edges(box: Any, ignored: Any, row: int, col: int) -> Any:
 
 
 @jit
-def _frontier_rows(box: Any, cost: Any, parent: Any, ignored: Any, row: int, col: int) -> Any:
+def _frontier_rows(box: Any, cost: Any, ways: Any, ignored: Any, row: int, col: int) -> Any:
     """Collect the frontiers of a box.
 
     Args:
         box: (h, w) uint8, of `known_box`.
         cost: (h, w) int32, of `wavefront`.
-        parent: (h, w) int32, likewise.
+        ways: (h, w) int8, likewise.
         ignored: (300, 300) bool. Unknown cells of the grid that do not count.
         row: Of the box's first cell in the grid.
         col: Likewise.
@@ -138,8 +143,6 @@ def _frontier_rows(box: Any, cost: Any, parent: Any, ignored: Any, row: int, col
     count = 0
     whole = np.empty((height * width, 2), np.int64)
     piece = np.empty((MAX_CELLS, 2), np.int64)
-    visited = np.zeros((height, width), np.int16)  # there are fewer than 32,000 tries
-    num_tried = 0
     for r in range(1, height - 1):
         if not any_above_zero(mark[r]):
             continue
@@ -155,11 +158,10 @@ def _frontier_rows(box: Any, cost: Any, parent: Any, ignored: Any, row: int, col
                 num = _flood(mark, 2, 3, whole[k, 0], whole[k, 1], share, piece)
                 if num < MIN_CELLS:
                     continue
-                num_tried += 1
-                goal_row, goal_col = _goal_near(piece[:num], box, cost, visited, num_tried)
+                goal_row, goal_col = _goal_near(piece[:num], box, cost, mark)
                 if goal_row < 0:
                     continue
-                length, at = _path_length(parent, goal_row, goal_col), count
+                length, at = _path_length(ways, goal_row, goal_col), count
                 while at > 0 and found[at - 1, LENGTH] > length:
                     found[at] = found[at - 1]
                     at -= 1
@@ -188,5 +190,5 @@ def frontiers_over(cells: Any, bounds: Any, row: int, col: int, reach: float, es
     Returns:
         (n, 5) float64 rows (x, y, heading, size, length), by increasing length.
     """
-    box, _, cost, parent, first_row, first_col = ways_over(cells, bounds, row, col, reach, escape)
-    return _frontier_rows(box, cost, parent, ignored, first_row, first_col)
+    box, _, cost, ways, first_row, first_col = ways_over(cells, bounds, row, col, reach, escape)
+    return _frontier_rows(box, cost, ways, ignored, first_row, first_col)

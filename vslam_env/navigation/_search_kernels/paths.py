@@ -31,7 +31,7 @@ def straight_path(weights: Any, cost: Any, parent: Any, row: int, col: int) -> A
     Args:
         weights: (h, w) uint8.
         cost: (h, w) int32, of `wavefront`.
-        parent: (h, w) int32, of `wavefront`.
+        parent: (h, w) int32, of `parents_of`.
         row: The goal, a reached cell.
         col: See `row`.
 

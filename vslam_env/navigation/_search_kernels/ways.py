@@ -4,12 +4,13 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend._jit import jit
+from slam_backend._jit import in_place, jit
 from vslam_env.navigation._painting_kernels import OCCUPIED
 from vslam_env.navigation._search_kernels.boxes import PAD, known_box
 from vslam_env.navigation._search_kernels.weights import weigh
 
 STRAIGHT, DIAGONAL = 5, 7  # length of a step in fifths of a cell; 7/5 is 1 % short of the diagonal
+NUM_STRAIGHT = 4  # of the eight directions, the first ones
 NUM_BUCKETS = 64  # a power of two above the dearest step, DIAGONAL * (CLOSE + CLOSE)
 UNREACHED = np.iinfo(np.int32).max
 
@@ -54,6 +55,22 @@ def nearest_open(box: Any, weights: Any, row: int, col: int, reach: int) -> tupl
     return -1, -1
 
 
+@in_place
+def steps_over(width: int) -> tuple[int, ...]:
+    """Return how far a step in each of the eight directions leads in a flat grid of rows as wide as this."""
+    return 1, width, -1, -width, 1 + width, width - 1, -1 - width, 1 - width
+
+
+@jit
+def parents_of(ways: Any) -> Any:
+    """Return of each cell the flat index of the one before it on its way, (h, w) int32; -1 where `ways` has that."""
+    steps = steps_over(ways.shape[1])
+    parents = np.empty(ways.size, np.int32)
+    for cell, direction in enumerate(ways.ravel()):
+        parents[cell] = cell - steps[direction] if direction >= 0 else -1
+    return parents.reshape(ways.shape)
+
+
 @jit
 def wavefront(weights: Any, row: int, col: int) -> tuple[Any, Any]:
     """Find the cheapest ways from one cell to all others (Dijkstra's algorithm with Dial's buckets).
@@ -69,8 +86,8 @@ def wavefront(weights: Any, row: int, col: int) -> tuple[Any, Any]:
         col: See `row`.
 
     Returns:
-        Of each cell, (h, w) int32: the cost, `UNREACHED` if there is no way; and the flat index of the cell before
-        it, -1 at the first cell and where there is no way.
+        Of each cell (h, w): the cost, int32, `UNREACHED` if there is no way; and the direction of the last step to
+        it, int8 as in `steps_over`, -1 at the first cell and where there is no way.
     """
     width = weights.shape[1]
     weight = weights.ravel()
@@ -80,12 +97,11 @@ def wavefront(weights: Any, row: int, col: int) -> tuple[Any, Any]:
         # Closed cells are below all costs, so that one comparison passes over closed and settled cells alike.
         cost[i] = UNREACHED if weight[i] > 0 else -1
         num_open += weight[i] > 0
-    parent = np.full(weight.size, -1, np.int32)
+    ways = np.full(weight.size, -1, np.int8)
     # Cells, and which entry follows each; a cost falls at most once per neighbour.
     entries = np.empty((8 * num_open + 1, 2), np.int32)
     heads = np.full(NUM_BUCKETS, -1, np.int32)
-
-    offsets = np.array([1, width, -1, -width, 1 + width, width - 1, -1 - width, 1 - width])  # four straight ones first
+    steps = np.array(steps_over(width))
 
     used, taken, current = 0, 0, 0
     if row >= 0:
@@ -103,18 +119,18 @@ def wavefront(weights: Any, row: int, col: int) -> tuple[Any, Any]:
                 continue
             here = np.int32(weight[cell])
             for k in range(8):
-                neighbour = np.uint32(np.int64(cell) + offsets[k])
-                step = STRAIGHT if k < 4 else DIAGONAL
-                through = np.int32(current + step * (here + np.int32(weight[neighbour])))
+                neighbour = np.uint32(np.int64(cell) + steps[k])
+                length = STRAIGHT if k < NUM_STRAIGHT else DIAGONAL
+                through = np.int32(current + length * (here + np.int32(weight[neighbour])))
                 if through < cost[neighbour]:
-                    cost[neighbour], parent[neighbour] = through, cell
+                    cost[neighbour], ways[neighbour] = through, k
                     target, place = np.uint32(through & (NUM_BUCKETS - 1)), np.uint32(used)
                     entries[place, 0], entries[place, 1], heads[target] = neighbour, heads[target], used
                     used += 1
         current += 1
     for i in range(weight.size):
         cost[i] &= UNREACHED  # turns -1 into it, and leaves all costs as they are
-    return cost.reshape(weights.shape), parent.reshape(weights.shape)
+    return cost.reshape(weights.shape), ways.reshape(weights.shape)
 
 
 @jit
@@ -132,11 +148,11 @@ def ways_over(
         escape: How far to look for an open cell, in cells.
 
     Returns:
-        The known box, (h, w) uint8; its weights, of `weigh`; costs and parents, of `wavefront`; and the grid's row and
-        column of its first cell.
+        The known box, (h, w) uint8; its weights, of `weigh`; costs and last steps, of `wavefront`; and the grid's row
+        and column of its first cell.
     """
     box, first_row, first_col = known_box(cells, bounds), bounds[0] - PAD, bounds[1] - PAD
     weights = weigh(box, reach)
     start_row, start_col = nearest_open(box, weights, row - first_row, col - first_col, escape)
-    cost, parent = wavefront(weights, start_row, start_col)
-    return box, weights, cost, parent, first_row, first_col
+    cost, ways = wavefront(weights, start_row, start_col)
+    return box, weights, cost, ways, first_row, first_col

@@ -5,22 +5,24 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend._jit import jit
+from slam_backend._jit import in_place, jit
 from vslam_env.navigation._painting_kernels import FREE, OCCUPIED, UNKNOWN
 
 CLOSE, NEAR, OPEN = 4, 2, 1  # weights of cells by their distance from walls
 
 
-@jit
-def _spread(squares: Any, span: int, stride: int) -> Any:
-    """Return the least of each entry and those up to `span` strides before and after it plus the number squared.
+@in_place
+def _spread(squares: Any, span: int, stride: int, least: Any) -> None:
+    """Write the least of each entry and those up to `span` strides before and after it plus the number squared.
 
     Args:
         squares: (n,) uint8, whose sums with span^2 fit.
         span: >= 0.
         stride: >= 1.
+        least: (n,) uint8, result.
     """
-    least = squares.copy()
+    for i in range(len(squares)):
+        least[i] = squares[i]
     for gap in range(1, span + 1):
         square = np.uint8(gap * gap)
         after, later = squares[gap * stride :], least[gap * stride :]
@@ -30,7 +32,6 @@ def _spread(squares: Any, span: int, stride: int) -> Any:
         for i in range(len(later)):
             through = np.uint8(squares[i] + square)
             later[i] = through if through < later[i] else later[i]
-    return least
 
 
 @jit
@@ -42,14 +43,17 @@ def _squared_clearance(box: Any, span: int) -> Any:
         span: At most 10, so that sums of squares fit.
     """
     height, width = box.shape
-    squares = np.empty((height, width + span), np.uint8)  # rows end in what keeps the next one out of reach
+    wide = width + span  # rows end in what keeps the next one out of reach
+    squares, along_rows = np.empty(height * wide, np.uint8), np.empty(height * wide, np.uint8)
     far = np.uint8((span + 1) ** 2)
-    squares[:] = far
     for r in range(height):
+        here = squares[r * wide : (r + 1) * wide]
         for c in range(width):
-            squares[r, c] = 0 if box[r, c] == OCCUPIED else far
-    along_rows = _spread(squares.ravel(), span, 1)
-    return _spread(along_rows, span, width + span).reshape(squares.shape)
+            here[c] = 0 if box[r, c] == OCCUPIED else far
+        here[width:] = far
+    _spread(squares, span, 1, along_rows)
+    _spread(along_rows, span, wide, squares)
+    return squares.reshape((height, wide))
 
 
 @jit
