@@ -29,15 +29,25 @@ NO_TEAMMATE = 60.0  # [m] stands for the distance of a teammate when there is no
 
 
 @in_place
-def _weigh_pairs(goals: Any, places: Any, costs: Any) -> None:
-    """Write the distances (m, n), at most `SAME_GOAL`, between goals (m, 2 or more) and places (n, 2 or more).
+def _weigh_pairs(goals: Any, places: Any, costs: Any) -> bool:
+    """Write the distances (16, n), at most `SAME_GOAL`, between goals (16, 2 or more) and places (n, 2 or more).
 
     They are `SAME_GOAL` for goals that are NaN, of empty slots.
+
+    Returns:
+        Whether none is nearer than that to several: then such pairs are those of the least total distance.
     """
-    for i in range(len(goals)):
-        for j in range(len(places)):
+    is_clear, paired = True, 0
+    for j in range(len(places)):
+        near = 0  # bits of goals
+        for i in range(NUM_SLOTS):
             distance = np.hypot(goals[i, 0] - places[j, 0], goals[i, 1] - places[j, 1])
-            costs[i, j] = distance if distance < SAME_GOAL else SAME_GOAL
+            is_near = distance < SAME_GOAL
+            costs[i, j] = distance if is_near else SAME_GOAL
+            near |= is_near << i
+        is_clear &= near & (near - 1 | paired) == 0
+        paired |= near
+    return is_clear
 
 
 @in_place
@@ -58,14 +68,25 @@ def _visit(slots: Any, poses: Any, robot: int, visits: Any) -> bool:
     return ran_out
 
 
+def _of_least_total(costs: FloatArray) -> FloatArray:
+    """Return costs (m, n) that are `SAME_GOAL` but for the pairs, each of other rows and columns, of least total."""
+    chosen, pairs = np.full_like(costs, SAME_GOAL), linear_sum_assignment(costs)
+    chosen[pairs] = costs[pairs]
+    return chosen
+
+
 @jit
-def _refill(costs: Any, slots: Any, sources: Any, found: Any, rows: Any, visits: Any) -> None:
-    """Write the next rows and visits of the slots: old candidates stay where they were, new ones fill the gaps."""
+def _refill(costs: Any, found: Any, rows: Any, visits: Any) -> None:
+    """Write the next rows and visits of the slots: old candidates stay where they were, new ones fill the gaps.
+
+    Costs (16, n) are below `SAME_GOAL` for what is the same, at most once per row and column.
+    """
     chosen = np.full(NUM_SLOTS, -1, np.int64)
     is_new = np.ones(len(found), np.bool_)
-    for k in range(len(slots)):
-        if costs[slots[k], sources[k]] < SAME_GOAL:
-            chosen[slots[k]], is_new[sources[k]] = sources[k], False
+    for slot in range(NUM_SLOTS):
+        for source in range(len(found)):
+            if costs[slot, source] < SAME_GOAL:
+                chosen[slot], is_new[source] = source, False
 
     rows[:] = np.nan
     new = 0
@@ -194,9 +215,9 @@ class CandidateSlots:
         x, y, _ = poses[robot].tolist()
         found = frontiers_over(cells, bounds, *start_of(x, y, ROBOT_RADIUS), self._given_up)
         costs = np.empty((NUM_SLOTS, len(found)))
-        _weigh_pairs(self._rows, found, costs)
-        slots, sources = linear_sum_assignment(costs)
-        _refill(costs, slots, sources, found, self._rows, self._visits)
+        if not _weigh_pairs(self._rows, found, costs):
+            costs = _of_least_total(costs)
+        _refill(costs, found, self._rows, self._visits)
 
     def _give_up(self) -> None:
         """Give up what is unknown around goals where patience has run out."""
