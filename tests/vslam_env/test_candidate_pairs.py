@@ -3,7 +3,8 @@
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from vslam_env.navigation.candidate_slots import NUM_SLOTS, SAME_GOAL, _of_least_total, _weigh_pairs
+from vslam_env.navigation._search_kernels import SAME_GOAL, weigh_pairs
+from vslam_env.navigation.candidate_slots import NUM_SLOTS, _of_least_total
 
 
 def test_pairs_that_are_clear_are_those_of_the_least_total() -> None:
@@ -16,7 +17,7 @@ def test_pairs_that_are_clear_are_those_of_the_least_total() -> None:
         places[again, :2] = goals[rng.integers(0, NUM_SLOTS, again.sum()), :2] + rng.normal(0.0, 0.3, (again.sum(), 2))
         goals[rng.random(NUM_SLOTS) < 0.5] = np.nan
         costs = np.empty((NUM_SLOTS, len(places)))
-        is_clear = _weigh_pairs(goals, places, costs)
+        is_clear = weigh_pairs(goals, places, costs)
         apart = np.linalg.norm(goals[:, None, :2] - places[None, :, :2], axis=2)
         expected = np.where(apart < SAME_GOAL, apart, SAME_GOAL)  # NaN is no less
         np.testing.assert_allclose(costs, expected, rtol=1e-15)

@@ -7,11 +7,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import linear_sum_assignment
 
-from slam_backend._jit import in_place, jit
+from slam_backend._jit import in_place
 from slam_backend.errors import BoolArray, FloatArray
 from vslam_env.navigation._arguments import check_cells, pose_floats, positions_array
-from vslam_env.navigation._painting_kernels import CELL, GRID_SIZE, HALF_WIDTH, known_bounds
-from vslam_env.navigation._search_kernels import HEADING, LENGTH, NUM_COLUMNS, SIZE, XY, frontiers_over
+from vslam_env.navigation._painting_kernels import GRID_SIZE, known_bounds
+from vslam_env.navigation._search_kernels import HEADING, LENGTH, NUM_COLUMNS, SAME_GOAL, SIZE, XY, refill, renew
 from vslam_env.navigation.planning import start_of
 from vslam_env.navigation.team_grids import TeamGrids
 
@@ -19,89 +19,7 @@ NUM_SLOTS, NUM_FEATURES = 16, 5
 FRONTIER_SIZE = 3  # the feature that is above 0 where there is a candidate
 ROBOT_RADIUS = 0.2  # [m]
 
-SAME_GOAL = 1.0  # [m] between updates the goal of a living candidate moves less than this
-AT_GOAL = 0.5  # [m]
-LOOKING = 0.6  # [rad] a robot whose heading is this near to a candidate's looks at the unknown
-LOOK_COUNTS = 4  # times as much as a visit without a look, for a teammate's direction is not told
-PATIENCE = 16  # visits, after which what is still unseen there never will be seen
-GIVEN_UP = 0.8  # [m] radius of what is then left out
 NO_TEAMMATE = 60.0  # [m] stands for the distance of a teammate when there is none
-
-
-@in_place
-def _weigh_pairs(goals: Any, places: Any, costs: Any) -> bool:
-    """Write the distances (16, n), at most `SAME_GOAL`, between goals (16, 2 or more) and places (n, 2 or more).
-
-    They are `SAME_GOAL` for goals that are NaN, of empty slots.
-
-    Returns:
-        Whether none is nearer than that to several: then such pairs are those of the least total distance.
-    """
-    is_clear, paired = True, 0
-    for j in range(len(places)):
-        near = 0  # bits of goals
-        for i in range(NUM_SLOTS):
-            distance = np.hypot(goals[i, 0] - places[j, 0], goals[i, 1] - places[j, 1])
-            is_near = distance < SAME_GOAL
-            costs[i, j] = distance if is_near else SAME_GOAL
-            near |= is_near << i
-        is_clear &= near & (near - 1 | paired) == 0
-        paired |= near
-    return is_clear
-
-
-@in_place
-def _visit(slots: Any, poses: Any, robot: int, visits: Any) -> bool:
-    """Add to the visits (16,) of the slots what a robot and its teammates count; tell if patience ran out.
-
-    Poses (n, 3), of the robot and of teammates, are as in `TeamSlots.features`.
-    """
-    ran_out = False
-    x, y, theta = poses[robot]
-    for i in range(NUM_SLOTS):
-        at_goal = np.hypot(slots[i, 0] - x, slots[i, 1] - y) <= AT_GOAL
-        looked = at_goal and math.cos(slots[i, HEADING] - theta) > math.cos(LOOKING)
-        for k in range(len(poses)):  # those that are unknown are nowhere near
-            at_goal |= np.hypot(slots[i, 0] - poses[k, 0], slots[i, 1] - poses[k, 1]) <= AT_GOAL
-        visits[i] += (1 if at_goal else 0) + (LOOK_COUNTS - 1 if looked else 0)
-        ran_out |= visits[i] >= PATIENCE
-    return ran_out
-
-
-def _of_least_total(costs: FloatArray) -> FloatArray:
-    """Return costs (m, n) that are `SAME_GOAL` but for the pairs, each of other rows and columns, of least total."""
-    chosen, pairs = np.full_like(costs, SAME_GOAL), linear_sum_assignment(costs)
-    chosen[pairs] = costs[pairs]
-    return chosen
-
-
-@jit
-def _refill(costs: Any, found: Any, rows: Any, visits: Any) -> None:
-    """Write the next rows and visits of the slots: old candidates stay where they were, new ones fill the gaps.
-
-    Costs (16, n) are below `SAME_GOAL` for what is the same, at most once per row and column.
-    """
-    chosen = np.full(NUM_SLOTS, -1, np.int64)
-    is_new = np.ones(len(found), np.bool_)
-    for slot in range(NUM_SLOTS):
-        for source in range(len(found)):
-            if costs[slot, source] < SAME_GOAL:
-                chosen[slot], is_new[source] = source, False
-
-    rows[:] = np.nan
-    new = 0
-    for slot in range(NUM_SLOTS):
-        source = chosen[slot]
-        if source < 0:
-            visits[slot] = 0
-            while new < len(found) and not is_new[new]:
-                new += 1
-            if new == len(found):
-                continue
-            source = new
-            new += 1
-        for column in range(NUM_COLUMNS):
-            rows[slot, column] = found[source, column]
 
 
 @in_place
@@ -210,22 +128,13 @@ class CandidateSlots:
             poses: (n, 3) float64 [m, m, rad], start frame. Its own and those of teammates; NaN: it does not know.
             robot: Its row of them.
         """
-        if _visit(self._rows, poses, robot, self._visits):
-            self._give_up()
         x, y, _ = poses[robot].tolist()
-        found = frontiers_over(cells, bounds, *start_of(x, y, ROBOT_RADIUS), self._given_up)
-        costs = np.empty((NUM_SLOTS, len(found)))
-        if not _weigh_pairs(self._rows, found, costs):
-            costs = _of_least_total(costs)
-        _refill(costs, found, self._rows, self._visits)
-
-    def _give_up(self) -> None:
-        """Give up what is unknown around goals where patience has run out."""
-        for slot in np.flatnonzero(self._visits >= PATIENCE):
-            along = (np.arange(GRID_SIZE) + 0.5) * CELL - HALF_WIDTH
-            goal_x, goal_y = self._rows[slot, XY]
-            self._given_up |= (along - goal_x) ** 2 + (along[:, None] - goal_y) ** 2 <= GIVEN_UP**2
-            self._visits[slot] = 0
+        slots = self._rows, self._visits
+        found, costs, is_clear = renew(
+            cells, bounds, *start_of(x, y, ROBOT_RADIUS), poses, robot, *slots, self._given_up
+        )  # fmt: skip
+        if not is_clear:
+            refill(_of_least_total(costs), found, *slots)
 
     def features(self, pose: ArrayLike, teammates: ArrayLike = ()) -> NDArray[np.float32]:
         """Describe the candidates to a policy.
@@ -299,3 +208,10 @@ def _together(pose: ArrayLike, teammates: ArrayLike) -> FloatArray:
     poses = np.zeros((1 + len(places), 3))
     poses[0], poses[1:, :2] = own, places
     return poses
+
+
+def _of_least_total(costs: FloatArray) -> FloatArray:
+    """Return costs (m, n) that are `SAME_GOAL` but for the pairs, each of other rows and columns, of least total."""
+    chosen, pairs = np.full_like(costs, SAME_GOAL), linear_sum_assignment(costs)
+    chosen[pairs] = costs[pairs]
+    return chosen

@@ -1,10 +1,11 @@
-"""The compiled searches over the known part of a grid: where a disc fits, the cheapest ways, and frontiers."""
+"""The compiled searches over the known part of a grid: where a disc fits, the cheapest ways, frontiers, candidates."""
 
 from vslam_env.navigation._search_kernels.frontiers import HEADING, LENGTH, NUM_COLUMNS, SIZE, XY, frontiers_over
 from vslam_env.navigation._search_kernels.paths import straight_path
+from vslam_env.navigation._search_kernels.slots import SAME_GOAL, refill, renew, weigh_pairs
 from vslam_env.navigation._search_kernels.ways import UNREACHED, nearest_open, parents_of, ways_over
 
 __all__ = [
-    "HEADING", "LENGTH", "NUM_COLUMNS", "SIZE", "UNREACHED", "XY", "frontiers_over", "nearest_open", "parents_of",
-    "straight_path", "ways_over",
+    "HEADING", "LENGTH", "NUM_COLUMNS", "SAME_GOAL", "SIZE", "UNREACHED", "XY", "frontiers_over", "nearest_open",
+    "parents_of", "refill", "renew", "straight_path", "ways_over", "weigh_pairs",
 ]  # fmt: skip
