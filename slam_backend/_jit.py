@@ -23,6 +23,7 @@ Scalar = TypeVar("Scalar", bound=np.generic)
 
 LINE = 64  # bytes of a line of the cache
 KERNELS = "_kernels"  # ends the name of a folder whose modules hold kernels that call each other
+LANE_MATH = Path(__file__).parent / KERNELS / "lane_math.py"  # which those of other folders call, too
 
 
 # numba counts the references to each array: it makes a counter for each one that Python hands over, and each slice in a
@@ -42,7 +43,8 @@ def jit(function: Callable[P, T]) -> Callable[P, T]:
 
     numba's disk cache notices edits of the file that holds `function`, not of other files whose kernels it calls:
     kernels that call each other therefore live in one module, or in one folder whose name ends in `_kernels`, of which
-    an edit of any file is noticed. `parallel=True` is left out on purpose, because it breaks forked workers.
+    an edit of any file is noticed, as is one of `LANE_MATH`. `parallel=True` is left out on purpose, because it breaks
+    forked workers.
     """
     return _compiled(function, counted=True)
 
@@ -98,9 +100,9 @@ def _compiled(function: Callable[P, T], counted: bool, **options: Any) -> Callab
 
 @lru_cache
 def _contents(folder: Path) -> bytes:
-    """Return a digest of all modules of a folder."""
+    """Return a digest of all modules of a folder, and of those which any folder's may call."""
     digest = sha256()
-    for file in sorted(folder.glob("*.py")):
+    for file in sorted({*folder.glob("*.py"), LANE_MATH}):
         digest.update(file.read_bytes())
     return digest.digest()
 

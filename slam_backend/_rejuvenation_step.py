@@ -1,7 +1,6 @@
 """What a filter does to be rejuvenated: when it is due, and what is kept until the next time."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -286,7 +285,7 @@ class RejuvenationStep:
         """Renumber the robots: robot i becomes the one that was `order[i]`."""
         self._graph = None if self._graph is None else self._graph.reordered(order)
         if self._draft is not None:
-            self._draft = replace(self._draft, graph=self._draft.graph.reordered(order))
+            self._draft = self._draft._replace(graph=self._draft.graph.reordered(order))
         self._guesses = [self._guesses[robot] for robot in order]
         self._refused = [self._refused[robot] for robot in order]
 

@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from slam_backend._blas import on_one_thread
 from slam_backend._jit import inlined, jit
 from slam_backend._packed import UNPACK
 from slam_backend.errors import FloatArray, IntArray
@@ -28,17 +29,13 @@ def find_duplicates(
         descriptors: (l, d) by row of `graph.landmark_ids`; NaN for a landmark that is not to be touched.
         descriptor_gate: L2 distance beyond which two do not look alike.
     """
-    order, seen = np.argsort(mode.landmarks[:, 0]), mode.sightings
-    found: list[tuple[float, int, int]] = []
-    for a, b in alike_pairs(
-        order, mode.landmarks, descriptors, seen.keys, seen.starts, REACH, descriptor_gate
-    ).tolist():
-        distance = _distance(_values(draws, a), _values(draws, b))
-        if distance <= GATE:
-            found.append((distance, a, b))
+    order, seen = mode.landmarks[:, 0].argsort(), mode.sightings
+    pairs = alike_pairs(order, mode.landmarks, descriptors, seen.keys, seen.starts, REACH, descriptor_gate)
+    if not len(pairs):
+        return pairs
     taken: set[int] = set()
     rows = []
-    for _, a, b in sorted(found):
+    for _, a, b in sorted(_together(draws, pairs)):
         if a not in taken and b not in taken:
             taken |= {a, b}
             rows.append(sorted((int(graph.landmark_ids[a]), int(graph.landmark_ids[b])), reverse=True))
@@ -102,6 +99,17 @@ def alike_pairs(
                 pairs[num, 0], pairs[num, 1] = a, b
                 num += 1
     return pairs[:num]
+
+
+@on_one_thread
+def _together(draws: Draws, pairs: IntArray) -> list[tuple[float, int, int]]:
+    """Return those of the pairs (n, 2) that may lie in one place: squared distance, and which."""
+    found = []
+    for a, b in pairs.tolist():
+        distance = _distance(_values(draws, a), _values(draws, b))
+        if distance <= GATE:
+            found.append((distance, a, b))
+    return found
 
 
 def _values(draws: Draws, row: int) -> FloatArray:

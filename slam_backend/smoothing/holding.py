@@ -9,13 +9,12 @@ path, and what the motions scattered is kept as one covariance, of which any est
 """
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from slam_backend._jit import in_place, jit, lanes
+from slam_backend._jit import in_place, jit, lanes, room
 from slam_backend.errors import FloatArray, IntArray
-from slam_backend.geometry import inverse
 from slam_backend.smoothing._kernels import LANES
 from slam_backend.smoothing.graph import LEVER
 
@@ -23,8 +22,7 @@ XX, YY = 3, 6  # rows of a tile: variances of a landmark in the plane
 LEAST_SHARED = 2  # landmarks that say how a particle is turned
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Held:
+class Held(NamedTuple):
     """How particles are moved.
 
     Attributes:
@@ -58,27 +56,85 @@ def holding(
     """
     if len(seen) < LEAST_SHARED:
         return None
-    n, m = len(seen), poses.shape[2]
-    targets, points, squares = landmarks[seen, :2], np.empty((n, 2, m)), np.empty((n, m))
-    look_at(tiles, seen, targets, points, squares)
-    motions = _fitted(points, targets, 1.0 / np.maximum(squares @ weights, 1e-300))
-    moved = np.empty_like(poses)
-    if not bring_nearer(poses, motions, means, LEVER, weights, moved):
+    moved, motions, scatter = np.empty_like(poses), np.empty((len(weights), 3)), np.zeros((3, 3))
+    if not hold(tiles, seen, landmarks, poses, means, LEVER, weights, moved, motions, scatter):
         return None
-    back = inverse(motions)
-    return Held(moved, motions, np.asarray(np.einsum("m,mi,mj->ij", weights, back, back)))  # (9)
+    return Held(moved, motions, scatter)
 
 
-def _fitted(points: FloatArray, targets: FloatArray, weights: FloatArray) -> FloatArray:
-    """Return the rigid motions (M, 3) that bring points (n, 2, M) to targets (n, 2) best, weighed by (n,)."""
-    shares = weights / weights.sum()
-    centres, target = np.einsum("n,nim->im", shares, points), shares @ targets
-    from_centre, aim = points - centres, shares[:, None] * (targets - target)
-    x, y = from_centre[:, 0], from_centre[:, 1]
-    turns = np.arctan2(aim[:, 1] @ x - aim[:, 0] @ y, aim[:, 0] @ x + aim[:, 1] @ y)
-    c, s = np.cos(turns), np.sin(turns)
-    ahead = target[0] - (c * centres[0] - s * centres[1])
-    return np.stack([ahead, target[1] - (s * centres[0] + c * centres[1]), turns], axis=1)
+@jit
+def hold(
+    tiles: FloatArray, seen: IntArray, landmarks: FloatArray, poses: FloatArray, means: FloatArray, lever: float,
+    weights: FloatArray, moved: FloatArray, motions: FloatArray, scatter: FloatArray,
+) -> bool:  # fmt: skip
+    """Write what `Held` holds, `scatter` from zeros on; return whether that helps.
+
+    Args:
+        tiles, seen, landmarks, poses, means, weights: As of `holding`.
+        lever: [m] At which headings are felt.
+        moved, motions, scatter: As of `Held`, results.
+    """
+    n, m = len(seen), len(weights)
+    targets, points, squares = landmarks[seen], np.empty((n, 2, m)), np.empty((n, m))
+    look_at(tiles, seen, targets, points, squares)
+    shares = np.empty(n)
+    share(squares, weights, shares)
+    fit(points, targets, shares, motions)
+    if not bring_nearer(poses, motions, means, lever, weights, moved):
+        return False
+    add_scatter(motions, weights, scatter)
+    return True
+
+
+@in_place
+def share(squares: FloatArray, weights: FloatArray, shares: FloatArray) -> None:
+    """Write weights of landmarks (n,) that sum to 1, by the inverse of the mean of squares (n, M), weighed by (M,)."""
+    total = 0.0
+    for n in range(len(squares)):
+        mean = 0.0
+        for i in range(len(weights)):
+            mean += squares[n, i] * weights[i]
+        shares[n] = 1.0 / max(mean, 1e-300)
+        total += shares[n]
+    for n in range(len(shares)):
+        shares[n] /= total
+
+
+@in_place
+def fit(points: FloatArray, targets: FloatArray, shares: FloatArray, motions: FloatArray) -> None:
+    """Write the rigid motions (M, 3) that bring points (n, 2, M) to targets (n, 2 or 3) best, weighed by (n,)."""
+    target_x, target_y = 0.0, 0.0
+    for n in range(len(shares)):
+        target_x += shares[n] * targets[n, 0]
+        target_y += shares[n] * targets[n, 1]
+    for i in range(len(motions)):
+        centre_x, centre_y = 0.0, 0.0
+        for n in range(len(shares)):
+            centre_x += shares[n] * points[n, 0, i]
+            centre_y += shares[n] * points[n, 1, i]
+        along, across = 0.0, 0.0
+        for n in range(len(shares)):
+            x, y = points[n, 0, i] - centre_x, points[n, 1, i] - centre_y
+            aim_x, aim_y = shares[n] * (targets[n, 0] - target_x), shares[n] * (targets[n, 1] - target_y)
+            along += aim_x * x + aim_y * y
+            across += aim_y * x - aim_x * y
+        turn = math.atan2(across, along)
+        c, s = math.cos(turn), math.sin(turn)
+        motions[i, 0] = target_x - (c * centre_x - s * centre_y)
+        motions[i, 1] = target_y - (s * centre_x + c * centre_y)
+        motions[i, 2] = turn
+
+
+@in_place
+def add_scatter(motions: FloatArray, weights: FloatArray, scatter: FloatArray) -> None:
+    """Add the mean square (3, 3) of the inverses of motions (M, 3), weighed by (M,)."""
+    for i in range(len(motions)):
+        x, y, turn = motions[i, 0], motions[i, 1], motions[i, 2]
+        c, s = math.cos(turn), math.sin(turn)
+        back = (-(c * x + s * y), s * x - c * y, -turn)
+        for row in range(3):
+            for column in range(3):
+                scatter[row, column] += weights[i] * back[row] * back[column]  # (9)
 
 
 @in_place
@@ -89,7 +145,7 @@ def look_at(
 
     Args:
         tiles, seen: As of `holding`.
-        targets: (n, 2) [m] where they are in the most probable path.
+        targets: (n, 2 or 3) [m] where they are in the most probable path.
         points: (n, 2, M) [m], result.
         squares: (n, M) [m^2], result: squared distances from there, and the variances of the landmarks.
     """
@@ -151,12 +207,7 @@ def bring_nearer(
 
 def move_tiles(tiles: FloatArray, motions: FloatArray) -> None:
     """Move landmarks (l, P / LANES, 9, LANES) of each particle, in place, by its motion (M, 3); surplus lanes stay."""
-    blocks = tiles.shape[1]
-    rows = np.zeros((4, blocks * LANES))
-    rows[0], rows[1, : len(motions)] = 1.0, np.sin(motions[:, 2])
-    rows[0, : len(motions)] = np.cos(motions[:, 2])
-    rows[2:, : len(motions)] = motions[:, :2].T
-    moved_tiles(tiles.reshape(-1), len(tiles), blocks, np.ascontiguousarray(rows.reshape(4, blocks, LANES)))
+    moved_tiles(tiles.reshape(-1), len(tiles), tiles.shape[1], motions)
 
 
 @lanes
@@ -166,14 +217,19 @@ def moved_tiles(tiles: FloatArray, num_landmarks: int, num_blocks: int, motions:
     Args:
         tiles: (num_landmarks * num_blocks * 9 * LANES,) x, y, z, xx, xy, xz, yy, yz, zz of each, by lanes.
         num_landmarks, num_blocks: How many there are.
-        motions: (4, num_blocks, LANES) cosine and sine of each turn, and the shift [m].
+        motions: (M, 3) [m, m, rad] of the particles.
     """
-    for landmark in range(num_landmarks):
-        for block in range(num_blocks):
+    cosine, sine, ahead, left = room(LANES), room(LANES), room(LANES), room(LANES)
+    for block in range(num_blocks):
+        first = block * LANES
+        for i in range(LANES):
+            cosine[i], sine[i], ahead[i], left[i] = 1.0, 0.0, 0.0, 0.0
+        for i in range(min(LANES, len(motions) - first)):
+            motion = motions[first + i]
+            cosine[i], sine[i], ahead[i], left[i] = math.cos(motion[2]), math.sin(motion[2]), motion[0], motion[1]
+        for landmark in range(num_landmarks):
             base = (landmark * num_blocks + block) * 9 * LANES
             tile = tiles[base : base + 9 * LANES]
-            cosine, sine = motions[0, block], motions[1, block]
-            ahead, left = motions[2, block], motions[3, block]
             for i in range(LANES):
                 c, s = cosine[i], sine[i]
                 x, y = tile[i], tile[LANES + i]

@@ -1,12 +1,11 @@
 """`rejuvenate`: new particles from the posterior of whole paths, in place of those that resampling has impoverished."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend._blas import on_one_thread
 from slam_backend.errors import FloatArray, IntArray
 from slam_backend.geometry import wrap_angle
 from slam_backend.log_arrays import EXACT, LogArrays
@@ -26,8 +25,7 @@ from slam_backend.smoothing.solving import NO_POSE, Mode, find_mode
 NEAR = 10.0  # times the tolerance: a descent that is not followed by draws may end so much sooner
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Looks:
+class Looks(NamedTuple):
     """Appearance of landmarks that no caller has named.
 
     Attributes:
@@ -41,8 +39,7 @@ class Looks:
     gate: float
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Particles:
+class Particles(NamedTuple):
     """M particles from the posterior of whole paths.
 
     Attributes:
@@ -70,8 +67,7 @@ class Particles:
     frame: FloatArray
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Rejuvenation:
+class Rejuvenation(NamedTuple):
     """What came of an attempt.
 
     Attributes:
@@ -89,7 +85,6 @@ class Rejuvenation:
     particles: Particles | None
 
 
-@on_one_thread
 def rejuvenate(
     graph: PathGraph,
     logs: Sequence[LogArrays],
@@ -215,10 +210,12 @@ def _descriptors(graph: PathGraph, looks: Looks) -> NDArray[np.float32]:
 
 def _particles(graph: PathGraph, mode: Mode, draws: Draws) -> Particles:
     """Gather what particles hold."""
-    weights = draws.weights
-    counts = np.bincount(mode.sightings.landmarks, weights=mode.sightings.counts, minlength=len(graph.landmark_ids))
-    seen = counts > 0
-    tiles = draws.tiles if seen.all() else draws.tiles[seen]
+    weights, tiles, ids, landmarks = draws.weights, draws.tiles, graph.landmark_ids, mode.landmarks
+    counts, in_view = np.empty(len(ids), dtype=np.int64), np.empty(len(ids), dtype=np.bool_)
+    _kernels.count(mode.sightings.starts, mode.sightings.counts, graph.point_landmarks, counts, in_view)
+    if not counts.all():
+        seen = counts > 0
+        tiles, ids, landmarks, in_view, counts = tiles[seen], ids[seen], landmarks[seen], in_view[seen], counts[seen]
     poses, starts = draws.poses[graph.tips], draws.poses[graph.heads]
     means = mode.poses[graph.tips]
     covariances = np.zeros((len(means), 3, 3))
@@ -230,10 +227,8 @@ def _particles(graph: PathGraph, mode: Mode, draws: Draws) -> Particles:
     if not _kernels.weigh_deviations(joint, off, densities):
         raise np.linalg.LinAlgError("the joint covariance of the robots' poses is not positive definite")
     frame = np.zeros((3, 3))
-    in_view = np.zeros(len(seen), dtype=np.bool_)
-    in_view[graph.point_landmarks] = True
-    (rows,) = in_view[seen].nonzero()
-    if (held := holding(tiles, rows, mode.landmarks[seen], poses, means, weights)) is not None:
+    (in_sight,) = in_view.nonzero()
+    if (held := holding(tiles, in_sight, landmarks, poses, means, weights)) is not None:
         move_tiles(tiles, held.motions)
         poses, frame = held.poses, held.scatter
         for head in (mode.columns[graph.heads] >= 0).nonzero()[0].tolist():
@@ -243,6 +238,5 @@ def _particles(graph: PathGraph, mode: Mode, draws: Draws) -> Particles:
         array[:, 2] = wrap_angle(array[:, 2])
     means[:, 2] = wrap_angle(means[:, 2])
     return Particles(
-        poses, starts, np.log(np.maximum(weights, 1e-300)), densities, graph.landmark_ids[seen], tiles,
-        counts[seen].astype(np.int64), means, covariances, frame,
+        poses, starts, np.log(np.maximum(weights, 1e-300)), densities, ids, tiles, counts, means, covariances, frame,
     )  # fmt: skip

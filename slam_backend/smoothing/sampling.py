@@ -1,14 +1,12 @@
 """Whole paths drawn from the posterior of a smoother, their landmarks, and their importance weights."""
 
-from dataclasses import dataclass
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 
 from slam_backend.errors import FloatArray, IntArray
-from slam_backend.resampling import effective_sample_size
 from slam_backend.smoothing import _kernels
-from slam_backend.smoothing._kernels import LANES, POSE_ROWS, WORK_ROWS
+from slam_backend.smoothing._kernels import LANES, POSE_ROWS
 from slam_backend.smoothing.bending import bend
 from slam_backend.smoothing.graph import LEVER, PathGraph
 from slam_backend.smoothing.solving import Mode
@@ -16,8 +14,7 @@ from slam_backend.smoothing.solving import Mode
 BENT_BELOW = 0.5  # share of M: where the sample size of straight paths is less, bent ones are tried
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Draws:
+class Draws(NamedTuple):
     """M paths with the landmarks that each of them asks for.
 
     Attributes:
@@ -39,9 +36,9 @@ class Draws:
     @classmethod
     def weighed(cls, poses: FloatArray, tiles: FloatArray, log_weights: FloatArray, spreads: FloatArray) -> Self:
         """Return paths with their weights normalised; arguments as the attributes."""
-        weights = np.exp(log_weights - log_weights.max())
-        weights /= weights.sum()
-        return cls(poses, tiles, log_weights, weights, effective_sample_size(weights), spreads)
+        weights = np.empty(len(log_weights))
+        sample_size = _kernels.normalise(log_weights, weights)
+        return cls(poses, tiles, log_weights, weights, sample_size, spreads)
 
     @property
     def landmarks(self) -> FloatArray:
@@ -110,7 +107,7 @@ def lane_rows(poses: FloatArray) -> FloatArray:
     """
     k, _, m = poses.shape
     rows = np.empty((-(-m // LANES), k, POSE_ROWS, LANES))
-    _kernels.to_lanes(poses, rows)
+    _kernels.to_lanes(poses, rows.reshape(-1))
     return rows
 
 
@@ -128,10 +125,10 @@ def replay(mode: Mode, rows: FloatArray, num_particles: int) -> tuple[FloatArray
     blocks, k = rows.shape[:2]
     seen = mode.sightings
     tiles = np.empty((len(mode.landmarks), blocks, 9, LANES))
-    log_likelihood = np.zeros(blocks * LANES)
+    log_likelihood = np.empty(blocks * LANES)
     _kernels.replay(
         rows.reshape(-1), k, blocks, mode.landmarks, seen.keys, seen.starts, seen.centres, seen.infos, seen.slopes,
-        np.zeros(WORK_ROWS * LANES), tiles.reshape(-1), log_likelihood,
+        tiles.reshape(-1), log_likelihood,
     )  # fmt: skip
     return tiles, log_likelihood[:num_particles]
 
@@ -150,7 +147,7 @@ def weigh_odometry(graph: PathGraph, mode: Mode, rows: FloatArray, num_particles
         scatter, headings felt at `LEVER`.
     """
     blocks, k = rows.shape[:2]
-    log_density, spreads = np.zeros(blocks * LANES), np.zeros(k)
+    log_density, spreads = np.empty(blocks * LANES), np.empty(k)
     _kernels.odometry_of_paths(
         rows.reshape(-1), k, blocks, num_particles, graph.previous, mode.poses, graph.motions, mode.odometry_infos,
         LEVER, log_density, spreads,

@@ -1,7 +1,6 @@
 """`Sightings`: all that was measured from key poses, one quadratic form for each pair of key and landmark."""
 
-from dataclasses import dataclass
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -10,8 +9,7 @@ from slam_backend.smoothing import _kernels
 from slam_backend.smoothing.graph import PathGraph
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Sightings:
+class Sightings(NamedTuple):
     """Forms of s sightings, by landmark; those of raw measurements change with the point of linearisation.
 
     Attributes:
@@ -49,17 +47,9 @@ class Sightings:
             frozen, centres, infos, slopes, counts, of_points,
         )  # fmt: skip
         return cls(
-            keys=keys[:num],
-            landmarks=landmarks[:num],
-            starts=starts,
-            frozen=frozen[:num],
-            centres=centres[:num],
-            infos=infos[:num],
-            slopes=slopes[:num],
-            counts=counts[:num],
-            of_points=of_points,
-            squares=np.zeros(n),
-        )
+            keys[:num], landmarks[:num], starts, frozen[:num], centres[:num], infos[:num], slopes[:num], counts[:num],
+            of_points, np.zeros(n),
+        )  # fmt: skip
 
     def linearise(
         self, graph: PathGraph, poses: FloatArray, landmarks: FloatArray, camera: FloatArray, scale: float,

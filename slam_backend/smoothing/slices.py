@@ -6,11 +6,11 @@ descent and draws. Between slices there is nothing but a graph, and how damped i
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
-from slam_backend._blas import on_one_thread
 from slam_backend.errors import FloatArray
 from slam_backend.log_arrays import REJECTED, LogArrays
 from slam_backend.motion import OdometryModel
@@ -27,8 +27,7 @@ STEPS = 2  # of Gauss and Newton in a slice: the second as a rule tells that the
 LAST_STEPS = 3  # of Gauss and Newton in the slice that draws: the graph was at its mode but for the last few keys
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Draft:
+class Draft(NamedTuple):
     """A graph in the middle of a descent.
 
     Attributes:
@@ -42,8 +41,7 @@ class Draft:
     steps: int = 0
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Smoother:
+class Smoother(NamedTuple):
     """What all slices need.
 
     Attributes:
@@ -87,7 +85,6 @@ class Smoother:
         mode = find_mode(draft.graph, self.camera, self.options, STEPS, draft.damping, NEAR)
         return self._after(draft, mode)
 
-    @on_one_thread
     def draw(
         self,
         graph: PathGraph,

@@ -1,6 +1,5 @@
 """The most probable paths and landmarks: Gauss-Newton over key poses and landmarks, by a sparse factorisation."""
 
-from dataclasses import dataclass
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -18,8 +17,7 @@ NO_POSE = "no pose to seek"  # the reason where all poses are given
 CREEP = 10.0  # times the tolerance: so far from its end a descent may be that has used up the options' iterations
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Mode:
+class Mode(NamedTuple):
     """The most probable paths, and the Gaussian about them.
 
     Attributes:
@@ -76,8 +74,8 @@ class Mode:
         The work of either grows with the sum of the columns' lengths, that of `spreads` with the sum of their squares.
         """
         assert self.system is not None
-        lengths = np.diff(self.system.pattern.tops)
-        return bool((lengths * lengths).sum() > LONG_COLUMNS * lengths.sum())
+        pattern = self.system.pattern
+        return pattern.squares > LONG_COLUMNS * len(pattern.rows)
 
     def spreads(self) -> FloatArray:
         """Return how far the motions from the keys before scatter (k,) [m^2], headings felt at `LEVER`; if of use."""
@@ -150,7 +148,7 @@ def find_mode(
 
 
 class _Pattern(NamedTuple):
-    """Where the blocks of a factor lie; see `_kernels.ordering.lay_out`."""
+    """Where the blocks of a factor lie, how many nodes are drawn, and how long columns are; see `_kernels.lay_out`."""
 
     order: IntArray
     ranks: IntArray
@@ -161,6 +159,8 @@ class _Pattern(NamedTuple):
     row_tops: IntArray
     row_columns: IntArray
     row_places: IntArray
+    drawn: int
+    squares: int
 
     @classmethod
     def of(cls, graph: PathGraph, columns: IntArray, seen: Sightings, num: int) -> Self:
@@ -172,11 +172,11 @@ class _Pattern(NamedTuple):
         tops, row_tops = np.empty(num + 1, dtype=np.int64), np.empty(num + 1, dtype=np.int64)
         rows, row_columns, row_places = (np.empty(filled, dtype=np.int64) for _ in range(3))
         links, cross = np.empty(len(columns), dtype=np.int64), np.empty(len(seen.keys), dtype=np.int64)
-        _kernels.lay_out(
+        drawn, squares = _kernels.lay_out(
             near, order, columns, graph.previous, seen.keys, seen.starts, ranks, tops, rows, links, cross, row_tops,
             row_columns, row_places,
         )  # fmt: skip
-        return cls(order, ranks, tops, rows, links, cross, row_tops, row_columns, row_places)
+        return cls(order, ranks, tops, rows, links, cross, row_tops, row_columns, row_places, drawn, squares)
 
 
 class _System:
@@ -233,8 +233,7 @@ class _System:
     def draw(self, poses: FloatArray, num_paths: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
         """Return paths about poses (k, 3) and their log densities, see `Mode.paths`."""
         p, seen = self.pattern, self.sightings
-        drawn = (p.order < self.num_poses) | (p.row_tops[1:] > p.row_tops[:-1])
-        normals = rng.standard_normal((int(drawn.sum()), 3, num_paths))
+        normals = rng.standard_normal((p.drawn, 3, num_paths))
         normals[:, :, 0] = 0.0
         paths, log_densities = np.empty((len(poses), 3, num_paths)), np.empty(num_paths)
         _kernels.draw(
@@ -246,8 +245,7 @@ class _System:
     def covariance(self, columns: IntArray) -> FloatArray:
         """Return the joint covariance (3 r, 3 r) of poses by their columns (r,)."""
         p = self.pattern
-        result = _kernels.covariance(self.pivots, self.values, p.ranks, p.tops, p.rows, columns // 3)
-        return 0.5 * (result + result.T)
+        return _kernels.covariance(self.pivots, self.values, p.ranks, p.tops, p.rows, columns // 3)
 
     def spreads(self, poses: FloatArray) -> FloatArray:
         """Return how far motions to each pose (k, 3) scatter, see `Mode.spreads`."""

@@ -1,8 +1,8 @@
-"""How probable many vectors at a time are under one Gaussian."""
+"""How probable many vectors at a time are under one Gaussian, and weights from logarithms of such densities."""
 
 import math
 
-from slam_backend._jit import fused
+from slam_backend._jit import fused, in_place
 from slam_backend.errors import FloatArray
 
 
@@ -39,3 +39,21 @@ def weigh_deviations(covariance: FloatArray, off: FloatArray, log_densities: Flo
             off[i, p] *= scale
             log_densities[p] -= 0.5 * off[i, p] * off[i, p]
     return True
+
+
+@in_place
+def normalise(log_weights: FloatArray, weights: FloatArray) -> float:
+    """Write weights (M,) that sum to 1 from their logarithms (M,); return their effective sample size, 1 / sum w^2.
+
+    Where one is NaN, or infinitely large, all are NaN, as is the size.
+    """
+    top, total, squares = -math.inf, 0.0, 0.0
+    for log_weight in log_weights:
+        top = max(top, log_weight)
+    for i in range(len(weights)):
+        weights[i] = math.exp(log_weights[i] - top)
+        total += weights[i]
+    for i in range(len(weights)):
+        weights[i] /= total
+        squares += weights[i] * weights[i]
+    return 1.0 / squares

@@ -123,7 +123,7 @@ def solve(
 def covariance(
     pivots: FloatArray, values: FloatArray, ranks: IntArray, tops: IntArray, rows: IntArray, nodes: IntArray
 ) -> FloatArray:
-    """Return the blocks (3 r, 3 r) of the inverse that belong to r nodes.
+    """Return the blocks (3 r, 3 r) of the inverse that belong to r nodes, the mean of either half of it.
 
     Only columns to which the first blocks lead from these nodes' own take part: all other elements are zero on the way
     down, and not asked for on the way up.
@@ -151,6 +151,9 @@ def covariance(
             for m in range(len(nodes)):
                 for i in range(3):
                     result[3 * m + i, 3 * n + axis] = x[ranks[nodes[m]], i]
+    for i in range(len(result)):
+        for j in range(i):
+            result[i, j] = result[j, i] = 0.5 * (result[i, j] + result[j, i])
     return result
 
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from slam_backend._jit import jit
+from slam_backend._jit import in_place, jit
 from slam_backend.errors import BoolArray, FloatArray, IntArray
 
 
@@ -73,3 +73,23 @@ def gather(
     for landmark in range(len(starts) - 1):
         starts[landmark + 1] += starts[landmark]
     return num
+
+
+@in_place
+def count(
+    starts: IntArray, counts: IntArray, point_landmarks: IntArray, totals: IntArray, in_view: BoolArray
+) -> None:  # fmt: skip
+    """Say how often each landmark was measured, and which of them have raw measurements.
+
+    Args:
+        starts, counts: (l + 1,), (s,) as of `gather`.
+        point_landmarks: (n,) of the raw measurements.
+        totals, in_view: (l,), results.
+    """
+    for landmark in range(len(totals)):
+        totals[landmark] = 0
+        for q in range(starts[landmark], starts[landmark + 1]):
+            totals[landmark] += counts[q]
+    in_view[:] = False
+    for landmark in point_landmarks:
+        in_view[landmark] = True

@@ -125,7 +125,7 @@ def lay_out(
     near: Bits, order: IntArray, columns: IntArray, previous: IntArray, keys: IntArray, starts: IntArray,
     ranks: IntArray, tops: IntArray, rows: IntArray, link_places: IntArray, cross_places: IntArray,
     row_tops: IntArray, row_columns: IntArray, row_places: IntArray,
-) -> None:  # fmt: skip
+) -> tuple[int, int]:  # fmt: skip
     """Say where each block of the factor lies: column by column, in each by ascending rows.
 
     Args:
@@ -136,6 +136,9 @@ def lay_out(
         link_places, cross_places: (k,), (s,), results: 1 + place of each block of `links` and `cross`, negative if
             it is transposed there, 0 if there is none.
         row_tops, row_columns, row_places: (N + 1,), (filled,), (filled,), results: the same blocks row by row.
+
+    Returns:
+        How many nodes `draw` draws, and the sum of the squares of the columns' lengths.
     """
     num, words = near.shape
     for j in range(num):
@@ -179,3 +182,8 @@ def lay_out(
             cross_places[q] = 0
             if own >= 0:
                 cross_places[q] = _place(tops, rows, ranks[own // 3], ranks[first_landmark + landmark])
+    drawn, squares = 0, 0
+    for j in range(num):
+        drawn += order[j] < first_landmark or row_tops[j] < row_tops[j + 1]
+        squares += (tops[j + 1] - tops[j]) * (tops[j + 1] - tops[j])
+    return drawn, squares

@@ -4,7 +4,8 @@ import math
 
 import numpy as np
 
-from slam_backend._jit import fused, in_place, lanes
+from slam_backend._jit import fused, lanes, room
+from slam_backend._kernels.lane_math import log_of, sine_cosine
 from slam_backend.errors import FloatArray, IntArray
 from slam_backend.smoothing._kernels.equations import WEAK
 
@@ -14,35 +15,37 @@ LANES = 52  # as in the filter, which takes over tiles as they are
 PX, PY, COS, SIN, HEADING = (LANES * k for k in range(5))
 POSE_ROWS = 5
 A00, A01, A02, A11, A12, A22, B0, B1, B2, ENERGY = (LANES * k for k in range(10))
-WORK_ROWS = 10
+WORK_SIZE = 10 * LANES
 
 
-@in_place
+@lanes
 def to_lanes(poses: FloatArray, rows: FloatArray) -> None:
     """Write paths in blocks of lanes; surplus lanes are copies of the first path.
 
     Args:
         poses: (k, 3, M) float64 [m, m, rad].
-        rows: (P / LANES, k, 5, LANES), result: x, y, cos, sin, heading.
+        rows: (P / LANES * k * 5 * LANES,), result: x, y, cos, sin, heading of each block and key.
     """
-    num_paths = poses.shape[2]
-    for block in range(len(rows)):
+    num_keys, num_paths = len(poses), poses.shape[2]
+    for block in range(len(rows) // (num_keys * POSE_ROWS * LANES)):
         first = block * LANES
         count = min(LANES, num_paths - first)
-        for key in range(len(poses)):
-            row = rows[block, key]
+        for key in range(num_keys):
+            base = (block * num_keys + key) * POSE_ROWS * LANES
+            row, pose = rows[base : base + POSE_ROWS * LANES], poses[key]
+            for i in range(count):
+                path = first + i
+                row[PX + i], row[PY + i], row[HEADING + i] = pose[0, path], pose[1, path], pose[2, path]
+            for i in range(count, LANES):
+                row[PX + i], row[PY + i], row[HEADING + i] = pose[0, 0], pose[1, 0], pose[2, 0]
             for i in range(LANES):
-                path = first + i if i < count else 0
-                heading = poses[key, 2, path]
-                row[0, i], row[1, i], row[4, i] = poses[key, 0, path], poses[key, 1, path], heading
-                row[2, i], row[3, i] = math.cos(heading), math.sin(heading)
+                row[SIN + i], row[COS + i] = sine_cosine(row[HEADING + i])
 
 
 @lanes
 def replay(
     poses: FloatArray, num_keys: int, num_blocks: int, landmarks: FloatArray, keys: IntArray, starts: IntArray,
-    centres: FloatArray, infos: FloatArray, slopes: FloatArray, work: FloatArray, tiles: FloatArray,
-    log_likelihood: FloatArray,
+    centres: FloatArray, infos: FloatArray, slopes: FloatArray, tiles: FloatArray, log_likelihood: FloatArray,
 ) -> None:  # fmt: skip
     """Give each path the landmarks that its sightings ask for, and the log-likelihood of these, up to a constant.
 
@@ -51,12 +54,12 @@ def replay(
         num_keys, num_blocks: k, and the number of blocks of lanes.
         landmarks: (l, 3) about which forms are evaluated, map frame.
         keys, starts, centres, infos, slopes: Sightings, those of landmark i are starts[i] to starts[i + 1].
-        work: (WORK_ROWS * LANES,) room.
         tiles: (l * num_blocks * 9 * LANES,), result: mean (3) and covariance (6) per lane; zeros for a landmark without
             sightings.
         log_likelihood: (num_blocks * LANES,), result.
     """
     log_likelihood[:] = 0.0
+    work = room(WORK_SIZE)
     for block in range(num_blocks):  # one after the other, for the poses of one are as many as a cache holds
         out = log_likelihood[block * LANES : (block + 1) * LANES]
         for landmark in range(len(landmarks)):
@@ -67,7 +70,7 @@ def replay(
             if first == last:
                 tile[:] = 0.0
                 continue
-            for i in range(WORK_ROWS * LANES):
+            for i in range(WORK_SIZE):
                 work[i] = 0.0
             for i in range(LANES):
                 work[A00 + i] = work[A11 + i] = work[A22 + i] = WEAK
@@ -115,7 +118,9 @@ def replay(
                 work[ENERGY + i] = 0.5 * (b0 * m0 + b1 * m1 + b2 * m2) - work[ENERGY + i]
                 work[A00 + i] = det
             for i in range(LANES):
-                out[i] += work[ENERGY + i] - 0.5 * math.log(work[A00 + i])  # (6)
+                det = work[A00 + i]
+                log_det = log_of(det) if det > 0.0 else math.nan
+                out[i] += work[ENERGY + i] - 0.5 * log_det  # (6)
 
 
 @fused

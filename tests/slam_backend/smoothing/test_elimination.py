@@ -139,16 +139,18 @@ def test_covariances_of_poses_are_the_dense_ones(posed):
 
 
 def test_blocks_of_the_inverse_are_the_solutions_for_unit_vectors(posed):
-    """Columns that are left out on the way to a few nodes would have added nothing: the same bits."""
+    """Columns that are left out on the way to a few nodes would have added nothing: the same bits, made symmetric."""
     system = posed.mode.system
     assert system is not None
     p, nodes = system.pattern, np.array([system.num_poses - 1, 2])
     found = _kernels.covariance(system.pivots, system.values, p.ranks, p.tops, p.rows, nodes)
+    expected = np.empty((6, 6))
     for column in range(6):
         unit = np.zeros(system.vector.shape)
         unit[nodes[column // 3], column % 3] = 1.0
         solved = solve(system.pivots, system.values, p.order, p.tops, p.rows, unit)
-        np.testing.assert_array_equal(found[:, column], solved[nodes].ravel())
+        expected[:, column] = solved[nodes].ravel()
+    np.testing.assert_array_equal(found, 0.5 * (expected + expected.T))
 
 
 def test_spreads_are_those_of_the_dense_covariance(posed):
@@ -184,6 +186,14 @@ def test_a_graph_is_crowded_where_all_poses_see_all_landmarks(posed):
     graph = extended(PathGraph.at_starts(np.zeros((1, 3))), [log.arrays()], OdometryModel(), np.zeros(3))
     mode = find_mode(graph, camera_of(small_run()), TIGHT)
     assert mode.crowded
+
+
+def test_a_pattern_tells_what_is_drawn_and_how_long_its_columns_are(posed):
+    """Poses are drawn, and landmarks for which a pose waits; lengths are those of the columns."""
+    assert posed.mode.system is not None
+    p, num_poses = posed.mode.system.pattern, posed.mode.system.num_poses
+    assert p.drawn == sum(node < num_poses or rank in p.rows for rank, node in enumerate(p.order.tolist()))
+    assert p.squares == (np.diff(p.tops) ** 2).sum()
 
 
 def test_densities_of_paths_are_the_dense_ones(posed):
@@ -224,3 +234,8 @@ def test_sightings_are_gathered_as_by_sorting():
     for name in ("centres", "infos", "slopes"):
         np.testing.assert_array_equal(getattr(seen, name)[seen.frozen], getattr(graph, name))
         assert not getattr(seen, name)[~seen.frozen].any()
+    totals, in_view = np.empty(landmarks + 1, dtype=np.int64), np.empty(landmarks + 1, dtype=np.bool_)
+    starts = np.append(seen.starts, seen.starts[-1])  # of one more that was never measured
+    _kernels.count(starts, seen.counts, graph.point_landmarks, totals, in_view)
+    np.testing.assert_array_equal(totals, np.bincount(seen.landmarks, seen.counts, landmarks + 1))
+    np.testing.assert_array_equal(in_view, np.isin(np.arange(landmarks + 1), graph.point_landmarks))

@@ -14,7 +14,17 @@ from slam_backend.geometry import between, compose, inverse, rotation, transform
 from slam_backend.smoothing import rejuvenation
 from slam_backend.smoothing._kernels import LANES
 from slam_backend.smoothing.graph import RIGID, PathGraph
-from slam_backend.smoothing.holding import bring_nearer, holding, look_at, measure_off, move, move_tiles
+from slam_backend.smoothing.holding import (
+    add_scatter,
+    bring_nearer,
+    fit,
+    holding,
+    look_at,
+    measure_off,
+    move,
+    move_tiles,
+    share,
+)
 from training.stereo_runs import RunSpec, simulate_run
 
 SCATTER = np.array([[0.04, 0.01, -0.02], [0.01, 0.09, 0.03], [-0.02, 0.03, 0.05]])
@@ -107,6 +117,23 @@ def test_what_holding_looks_at_is_as_by_arrays():
     np.testing.assert_array_equal(again, moved)
     move(poses, motions, poses)
     np.testing.assert_array_equal(poses, moved)
+
+
+def test_motions_are_fitted_as_by_arrays():
+    """Least squares by the singular value decomposition, one particle at a time; weights and scatter by their sums."""
+    rng = np.random.default_rng(7)
+    points, targets, weights = rng.normal(size=(5, 2, 30)), rng.normal(size=(5, 2)), rng.dirichlet(np.ones(30))
+    share(squares := rng.uniform(0.1, 2.0, (5, 30)), weights, shares := np.empty(5))
+    np.testing.assert_allclose(shares, 1.0 / (squares @ weights) / (1.0 / (squares @ weights)).sum(), rtol=1e-12)
+    fit(points, targets, shares, motions := np.empty((30, 3)))
+    for m, motion in enumerate(motions):
+        centre, target = shares @ points[:, :, m], shares @ targets
+        u, _, v = np.linalg.svd((shares[:, None] * (targets - target)).T @ (points[:, :, m] - centre))
+        turn = u @ np.diag([1.0, np.linalg.det(u @ v)]) @ v
+        np.testing.assert_allclose(rotation(motion[2]), turn, atol=1e-12)
+        np.testing.assert_allclose(motion[:2], target - turn @ centre, atol=1e-12)
+    add_scatter(motions, weights, scatter := np.zeros((3, 3)))
+    np.testing.assert_allclose(scatter, (weights * inverse(motions).T) @ inverse(motions), atol=1e-12)
 
 
 def test_a_scattered_frame_scatters_poses_and_points():

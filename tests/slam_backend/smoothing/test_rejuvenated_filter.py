@@ -1,7 +1,5 @@
 """`FastSlam(rejuvenate_every=...)`: what the smoother gives the filter, and that nothing is lost on the way."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from same_bits import assert_same
@@ -124,7 +122,7 @@ def test_landmarks_that_no_sighting_supports_are_given_up(left, monkeypatch):
 
     def renew(new):
         kept.append(new.ids[:left])
-        renew_all(replace(new, ids=new.ids[:left], tiles=new.tiles[:left], counts=new.counts[:left]))
+        renew_all(new._replace(ids=new.ids[:left], tiles=new.tiles[:left], counts=new.counts[:left]))
 
     renew_all = slam._renew
     monkeypatch.setattr(slam, "_renew", renew)

@@ -7,7 +7,7 @@ from slam_backend._kernels import LANES as FILTER_LANES
 from slam_backend.errors import FloatArray
 from slam_backend.motion import OdometryModel
 from slam_backend.run_log import RobotLog
-from slam_backend.smoothing._kernels import LANES, weigh_deviations
+from slam_backend.smoothing._kernels import LANES, normalise, weigh_deviations
 from slam_backend.smoothing.extending import extended
 from slam_backend.smoothing.graph import PathGraph
 from slam_backend.smoothing.sampling import draw_paths, drawn_spreads, lane_rows, replay, weigh_odometry
@@ -68,6 +68,22 @@ def test_where_all_is_linear_the_paths_scatter_as_the_posterior():
     assert chi2.ppf(0.005, n * m) < squares < chi2.ppf(0.995, n * m)
     correlations = (white @ white.T / m)[np.triu_indices(n, 1)]
     assert m * (correlations**2).sum() < chi2.ppf(0.99, len(correlations))
+
+
+def test_weights_are_those_of_their_logarithms():
+    """They sum to 1, whatever their scale; where one is not finite none means anything."""
+    log_weights = np.random.default_rng(6).normal(size=70) - 2000.0
+    size = normalise(log_weights, weights := np.empty(70))
+    expected = np.exp(log_weights + 2000.0) / np.exp(log_weights + 2000.0).sum()
+    np.testing.assert_allclose(weights, expected, rtol=1e-12)
+    assert size == pytest.approx(1.0 / (expected**2).sum(), rel=1e-12)
+    log_weights[3] = -np.inf
+    normalise(log_weights, weights)
+    assert weights[3] == 0.0
+    for wrong in (np.nan, np.inf):
+        log_weights[5] = wrong
+        assert np.isnan(normalise(log_weights, weights))
+        assert np.isnan(weights).all()
 
 
 def test_the_first_path_is_the_most_probable_one():
