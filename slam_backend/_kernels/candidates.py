@@ -87,9 +87,10 @@ def find_candidates(
     while n > 0 and ids[n - 1] < 0:
         n -= 1
     starts = np.zeros(num + 1, dtype=np.int64)
-    slots, squares = np.empty(num * n, dtype=np.int64), np.empty(num * n)  # as far as they are written to
-    partial = np.empty(n, dtype=np.float32)
-    hits = np.empty(n, dtype=np.int64)
+    listed, squares = np.empty((4, num * n), dtype=np.int64), np.empty(num * n)  # as far as they are written to
+    slots, owners, same, unique = listed[0], listed[1], listed[2], listed[3]
+    partial, of_slots = np.empty(n, dtype=np.float32), np.empty((2, n), dtype=np.int64)
+    hits, last = of_slots[0], of_slots[1]
     stride = measured.shape[1] // max(heads.shape[0], 1)
     limit = 1.0001 * gate + 1e-4  # rounding of single precision decides nothing
     total = 0
@@ -120,10 +121,8 @@ def find_candidates(
             slots[at] = slot
             total += 1
     starts[num] = total
-    owners = np.empty(total, dtype=np.int64)
-    same = np.full(total, REJECTED, dtype=np.int64)
-    unique = np.empty(total, dtype=np.int64)
-    last = np.full(n, REJECTED, dtype=np.int64)
+    for q in range(total):
+        last[slots[q]] = REJECTED
     count = 0
     for b in range(num):
         for q in range(starts[b], starts[b + 1]):
@@ -134,4 +133,4 @@ def find_candidates(
                 unique[count] = slot
                 count += 1
             last[slot] = q
-    return starts, slots[:total], squares[:total], owners, same, unique[:count]
+    return starts, slots[:total], squares[:total], owners[:total], same[:total], unique[:count]
