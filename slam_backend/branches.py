@@ -62,9 +62,9 @@ class Branch:
             self.split_from, self.split_counts = main.number, {}
         for done in replayed:
             for robot in set(done.robots) & set(self.live):
-                for name in done.report.created[main.robots.index(robot)].tolist():
-                    if name >= 0:
-                        self.split_counts.setdefault(name, 0)
+                row = done.report.rows[main.robots.index(robot)]
+                for name in done.report.findings.names_created(row):
+                    self.split_counts.setdefault(name, 0)
         return self.split_counts
 
     def get_state(self) -> dict[str, Any]:

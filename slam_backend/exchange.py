@@ -20,7 +20,7 @@ from typing import Any
 from slam_backend._kernels import MOVED, PLACED
 from slam_backend.branches import ReplayedStep
 from slam_backend.landmark_map import LandmarkMap
-from slam_backend.reports import StepReport, num_named
+from slam_backend.reports import StepReport
 
 LANDMARK_BYTES = 8 + 9 * 8  # id, mean and covariance
 POSE_BYTES = 3 * 8
@@ -52,8 +52,8 @@ class ExchangeLedger:
         findings = report.findings
         for robot in report.rows:
             if robot >= 0:
-                touched = num_named(findings.associated(robot)) if report.num_rejected else findings.num_given(robot)
-                created = num_named(findings.created(robot)) if report.num_created else 0
+                touched = len(findings.names_associated(robot)) if report.num_rejected else findings.num_given(robot)
+                created = len(findings.names_created(robot)) if report.num_created else 0
                 self.sent[robot] += POSE_BYTES + touched * LANDMARK_BYTES + created * 4 * descriptor_size
 
     def record_replay(self, replayed: Sequence[ReplayedStep]) -> None:

@@ -58,6 +58,20 @@ class Findings(NamedTuple):
         """Return likewise which landmarks they created."""
         return self._cut(row, CREATED)
 
+    def names_associated(self, row: int) -> list[int]:
+        """Return the landmarks that measurements of a robot were taken for, in their order."""
+        return self._names(row, ASSOCIATED)
+
+    def names_created(self, row: int) -> list[int]:
+        """Return likewise the landmarks that they created."""
+        return self._names(row, CREATED)
+
+    def _names(self, row: int, kind: int) -> list[int]:
+        """Return the names among what became of the measurements of a robot."""
+        _, begin, end, _, _, _ = self.turns[row]
+        found: list[int] = self.told[kind, begin:end].tolist()
+        return [name for name in found if name != REJECTED]
+
     def _cut(self, row: int, kind: int) -> IntArray:
         """Return what became of the measurements of a robot, -1 for those that were not used."""
         _, begin, end, _, _, _ = self.turns[row] if row >= 0 else UNHEARD

@@ -9,7 +9,7 @@ import numpy as np
 from slam_backend.branches import ReplayedStep
 from slam_backend.exchange import ExchangeLedger
 from slam_backend.input_log import InputLog
-from slam_backend.reports import LandmarksCreated, MapCopied, MapEntry, StepReport, num_named
+from slam_backend.reports import LandmarksCreated, MapCopied, MapEntry, StepReport
 
 
 class Records:
@@ -45,8 +45,8 @@ class Records:
     def note_created(self, number: int, step: int, report: StepReport) -> None:
         """Write down which landmarks a step of the filter of a map created."""
         for robot in report.rows:
-            if robot >= 0 and num_named(ids := report.findings.created(robot)):
-                self.entries.append(LandmarksCreated(number, robot, step, ids))
+            if robot >= 0 and report.findings.names_created(robot):
+                self.entries.append(LandmarksCreated(number, robot, step, report.findings.created(robot)))
 
     def note_replay(self, number: int, replayed: Sequence[ReplayedStep]) -> None:
         """Write down which landmarks a replay created in a map."""

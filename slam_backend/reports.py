@@ -87,12 +87,6 @@ class StepReport(NamedTuple):
         return tuple([self.findings.created(row) for row in self.rows])
 
 
-def num_named(ids: IntArray) -> int:
-    """Return how many of the ids (n,) in a `StepReport` name a landmark."""
-    names: list[int] = ids.tolist()
-    return len(names) - names.count(-1)
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class RejuvenationReport:
     """What came of an attempt to rejuvenate a filter.

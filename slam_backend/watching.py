@@ -90,10 +90,9 @@ class Watch:
 
     def note(self, robots: Sequence[int], report: StepReport) -> None:
         """Note which side has found which landmarks, from a step of the joint filter of `robots`."""
-        for robot, ids in zip(robots, report.created, strict=True):
-            names = [name for name in ids.tolist() if name >= 0]
-            if names:
-                self.own[robot not in self.sides[0].robots].update(names)
+        for robot, row in zip(robots, report.rows, strict=True):
+            if row >= 0:
+                self.own[robot not in self.sides[0].robots].update(report.findings.names_created(row))
 
     def together(self, live: Sequence[int]) -> bool:
         """Tell whether robots of both sides are among those that go by the joint filter."""

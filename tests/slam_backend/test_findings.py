@@ -17,7 +17,7 @@ rows_of_ids = st.lists(st.lists(st.integers(-1, 9), max_size=4), min_size=1, max
 
 @given(ids=rows_of_ids, offset=st.integers(0, 5))
 def test_each_robot_finds_what_became_of_what_it_measured(ids: list[list[int]], offset: int) -> None:
-    """What was gathered robot by robot is cut out as it was; nobody is told of a robot that is not there."""
+    """What was gathered robot by robot is cut out as it was, or only the names in it; nobody is told of robot -1."""
     found, made = ([np.array(row, np.int64) + k for row in ids] for k in (0, offset))
     findings = Findings.gathered(found, made)
     rows = (-1, *reversed(range(len(ids))))
@@ -27,8 +27,10 @@ def test_each_robot_finds_what_became_of_what_it_measured(ids: list[list[int]], 
         np.testing.assert_array_equal(created, [] if row < 0 else made[row])
         assert row < 0 or findings.num_given(row) == len(found[row])
         associated[:], created[:] = 77, 77  # copies
-    for row, own in enumerate(found):
+    for row, (own, new) in enumerate(zip(found, made, strict=True)):
         np.testing.assert_array_equal(findings.associated(row), own)
+        assert findings.names_associated(row) == own[own >= 0].tolist()
+        assert findings.names_created(row) == new[new >= 0].tolist()
 
 
 @given(seeds=st.lists(st.integers(0, 10_000), min_size=1, max_size=4))
