@@ -191,10 +191,11 @@ class _System:
         num, k = size + len(graph.landmark_ids), graph.num_keys
         self.num_poses = size
         self.pattern = _Pattern.of(graph, columns, sightings, num)
-        self.blocks, self.links = np.empty((num, 6)), np.empty((k, 3, 3))
+        self.blocks, self.links, self.turns = np.empty((num, 6)), np.empty((k, 3, 3)), np.empty((k, 2))
         self.cross = np.empty((len(sightings.keys), 3, 3))
         self.vector = np.empty((num, 3))
         self.pivots, self.values = np.empty((num, 6)), np.empty((len(self.pattern.rows), 9))
+        self.where = np.empty(num, dtype=np.int64)
         self.eased = 0.0  # by so much the cost would fall if landmarks alone moved
 
     def form(self, poses: FloatArray, landmarks: FloatArray) -> float:
@@ -203,7 +204,7 @@ class _System:
         loss = seen.linearise(graph, poses, landmarks, self.camera, self.options.noise_scale, self.options.kernel)
         cost, self.eased = _kernels.form(
             poses, landmarks, self.columns, graph.previous, graph.motions, self.informations, seen.keys, seen.starts,
-            seen.centres, seen.infos, seen.slopes, self.blocks, self.links, self.cross, self.vector,
+            seen.centres, seen.infos, seen.slopes, self.turns, self.blocks, self.links, self.cross, self.vector,
         )  # fmt: skip
         return loss + cost
 
@@ -212,7 +213,7 @@ class _System:
         p = self.pattern
         return _kernels.factorise(
             self.blocks, self.links, self.cross, damping, self.num_poses, p.order, p.tops, p.rows, p.link_places,
-            p.cross_places, p.row_tops, p.row_columns, p.row_places, self.pivots, self.values,
+            p.cross_places, p.row_tops, p.row_columns, p.row_places, self.where, self.pivots, self.values,
         )  # fmt: skip
 
     def step(

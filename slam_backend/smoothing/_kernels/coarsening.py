@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from slam_backend._jit import in_place, inlined, jit
+from slam_backend._jit import in_place, inlined, jit, room
 from slam_backend.errors import BoolArray, FloatArray, IntArray
 from slam_backend.smoothing._kernels.forms import _spun
 
@@ -198,7 +198,7 @@ def join_keys(
     return number
 
 
-@jit
+@in_place
 def add_sightings(
     rows: IntArray, keys: IntArray, landmarks: IntArray, centres: FloatArray, infos: FloatArray, slopes: FloatArray,
     counts: IntArray, roots: IntArray, numbers: IntArray, offsets: FloatArray, new_keys: IntArray,
@@ -224,12 +224,13 @@ def add_sightings(
             at -= 1
         rows[at] = row
     num = 0
-    info = np.empty(6)
+    info = room(6)
     for row in rows:
         key, landmark, offset = numbers[roots[keys[row]]], landmarks[row], offsets[keys[row]]
         x, y, z = centres[row, 0], centres[row, 1], centres[row, 2]
         g0, g1, g2 = slopes[row, 0], slopes[row, 1], slopes[row, 2]
-        info[:] = infos[row]
+        for i in range(6):
+            info[i] = infos[row, i]
         if roots[keys[row]] != keys[row]:
             c, s = math.cos(offset[2]), math.sin(offset[2])
             x, y = c * x - s * y + offset[0], s * x + c * y + offset[1]
@@ -247,6 +248,7 @@ def add_sightings(
         new_keys[num], new_landmarks[num], new_counts[num] = key, landmark, counts[row]
         new_centres[num, 0], new_centres[num, 1], new_centres[num, 2] = x, y, z
         new_slopes[num, 0], new_slopes[num, 1], new_slopes[num, 2] = g0, g1, g2
-        new_infos[num] = info
+        for i in range(6):
+            new_infos[num, i] = info[i]
         num += 1
     return num

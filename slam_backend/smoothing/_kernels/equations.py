@@ -7,9 +7,7 @@ the information of a sighting turned into these, a sighting adds A^T L A to the 
 
 import math
 
-import numpy as np
-
-from slam_backend._jit import in_place, jit
+from slam_backend._jit import in_place, room
 from slam_backend.errors import FloatArray, IntArray
 from slam_backend.smoothing._kernels.forms import FREE, _inverse, _spun
 
@@ -24,11 +22,11 @@ def _wrapped(angle: float) -> float:
     return angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
 
 
-@jit
+@in_place
 def form(
     poses: FloatArray, landmarks: FloatArray, columns: IntArray, previous: IntArray, motions: FloatArray,
     link_infos: FloatArray, keys: IntArray, starts: IntArray, centres: FloatArray, infos: FloatArray,
-    slopes: FloatArray, blocks: FloatArray, links: FloatArray, cross: FloatArray, vector: FloatArray,
+    slopes: FloatArray, turns: FloatArray, blocks: FloatArray, links: FloatArray, cross: FloatArray, vector: FloatArray,
 ) -> tuple[float, float]:  # fmt: skip
     """Write the normal equations of n poses and l landmarks.
 
@@ -39,6 +37,7 @@ def form(
             in the frame of the previous key, and its information.
         keys, starts: (s,) key of each sighting; those of landmark i are starts[i] to starts[i + 1].
         centres, infos, slopes: Of the sightings.
+        turns: (k, 2), result: cosine and sine of each heading.
         blocks: (n + l, 6), result: second derivatives by each node.
         links: (k, 3, 3), result: by a key (rows) and the one before (columns), where both are sought.
         cross: (s, 3, 3), result: by pose (rows) and landmark (columns), where the pose is sought.
@@ -51,21 +50,23 @@ def form(
     blocks[:] = 0.0
     vector[:] = 0.0
     cost = 0.0
-    cosines, sines = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-    f, g, h = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    r = np.empty(3)
+    for b in range(len(poses)):
+        turns[b, 0], turns[b, 1] = math.cos(poses[b, 2]), math.sin(poses[b, 2])
+    f, g, h = room(9).reshape(3, 3), room(9).reshape(3, 3), room(9).reshape(3, 3)
+    r = room(3)
     for b in range(len(poses)):  # odometry
         a = previous[b]
         if a < 0:
             continue
-        c, s = cosines[a], sines[a]
+        c, s = turns[a, 0], turns[a, 1]
         dx, dy = poses[b, 0] - poses[a, 0], poses[b, 1] - poses[a, 1]
         mx, my = c * dx + s * dy, -s * dx + c * dy
         r[0], r[1] = mx - motions[b, 0], my - motions[b, 1]
         r[2] = _wrapped(poses[b, 2] - poses[a, 2] - motions[b, 2])
         g[:] = 0.0
         g[0, 0], g[0, 1], g[1, 0], g[1, 1], g[2, 2] = c, s, -s, c, 1.0
-        f[:] = -g
+        f[:] = 0.0
+        f[0, 0], f[0, 1], f[1, 0], f[1, 1], f[2, 2] = -c, -s, s, -c, -1.0
         f[0, 2], f[1, 2] = my, -mx
         w = link_infos[b]
         for side in range(2):
@@ -91,7 +92,7 @@ def form(
             for j in range(3):
                 cost += 0.5 * r[i] * w[i, j] * r[j]
     first_landmark = len(blocks) - len(landmarks)
-    turned, p = np.empty(6), np.empty(6)
+    turned, p = room(6), room(6)
     eased = 0.0
     for landmark in range(len(landmarks)):
         first, last = starts[landmark], starts[landmark + 1]
@@ -99,7 +100,7 @@ def form(
         block[0] = block[3] = block[5] = WEAK
         for q in range(first, last):
             key = keys[q]
-            c, s = cosines[key], sines[key]
+            c, s = turns[key, 0], turns[key, 1]
             dx, dy = landmarks[landmark, 0] - poses[key, 0], landmarks[landmark, 1] - poses[key, 1]
             u0 = c * dx + s * dy - centres[q, 0]
             u1 = -s * dx + c * dy - centres[q, 1]
@@ -136,7 +137,7 @@ def form(
             mine[4] -= x[2, 1]
             mine[5] += dy * x[2, 0] - dx * x[2, 1]
         if not _inverse(block, p) > 0.0:
-            return np.inf, 0.0
+            return math.inf, 0.0
         m0, m1, m2 = force[0], force[1], force[2]
         eased += 0.5 * (p[0] * m0 * m0 + p[3] * m1 * m1 + p[5] * m2 * m2)
         eased += p[1] * m0 * m1 + p[2] * m0 * m2 + p[4] * m1 * m2

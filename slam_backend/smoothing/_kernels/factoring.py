@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from slam_backend._jit import fused, inlined
+from slam_backend._jit import fused, inlined, lanes
 from slam_backend.errors import FloatArray, IntArray
 
 
@@ -26,11 +26,11 @@ def _added(values: FloatArray, place: int, block: FloatArray) -> None:
                 out[3 * j + i] += block[i, j]
 
 
-@fused
+@lanes
 def factorise(
     blocks: FloatArray, links: FloatArray, cross: FloatArray, damping: float, num_poses: int, order: IntArray,
     tops: IntArray, rows: IntArray, link_places: IntArray, cross_places: IntArray, row_tops: IntArray,
-    row_columns: IntArray, row_places: IntArray, pivots: FloatArray, values: FloatArray,
+    row_columns: IntArray, row_places: IntArray, where: IntArray, pivots: FloatArray, values: FloatArray,
 ) -> bool:  # fmt: skip
     """Write the factor of the normal equations, column by column from those to the left; False if there is none.
 
@@ -39,6 +39,7 @@ def factorise(
         damping: The diagonal of each pose is enlarged by this share.
         num_poses: The nodes before this one are poses.
         order, tops, rows, link_places, cross_places, row_tops, row_columns, row_places: As of `lay_out`.
+        where: (N,) room.
         pivots, values: (N, 6), (filled, 9), results.
     """
     num = len(order)
@@ -47,7 +48,6 @@ def factorise(
         _added(values, link_places[b], links[b])
     for q in range(len(cross_places)):
         _added(values, cross_places[q], cross[q])
-    where = np.empty(num, dtype=np.int64)
     for j in range(num):
         node = order[j]
         first, last = tops[j], tops[j + 1]

@@ -8,9 +8,7 @@ as their upper triangles by rows (6).
 
 import math
 
-import numpy as np
-
-from slam_backend._jit import in_place, inlined, jit
+from slam_backend._jit import in_place, inlined, room
 from slam_backend.errors import BoolArray, FloatArray, IntArray
 
 FREE = -1  # column of a pose that is given, not sought
@@ -63,14 +61,14 @@ def seek(previous: IntArray, columns: IntArray) -> int:
     return num
 
 
-@jit
+@in_place
 def invert(matrices: FloatArray, columns: IntArray, out: FloatArray) -> bool:
     """Write the inverses of symmetric matrices (n, 3, 3) to `out`, likewise; return whether all are positive definite.
 
     Zeros are written, whatever the matrix, where `columns` (n,) says `FREE`. Where one that is to be inverted is not
     positive definite, those after it are not written.
     """
-    upper, inverse = np.empty(6), np.empty(6)
+    upper, inverse = room(6), room(6)
     for n in range(len(matrices)):
         if columns[n] == FREE:
             out[n] = 0.0
@@ -89,7 +87,7 @@ def invert(matrices: FloatArray, columns: IntArray, out: FloatArray) -> bool:
     return True
 
 
-@jit
+@in_place
 def seek_poses(
     previous: IntArray, noises: FloatArray, columns: IntArray, informations: FloatArray
 ) -> tuple[int, bool]:  # fmt: skip
@@ -142,7 +140,7 @@ def linearise(
     info[3], info[4], info[5] = pixel, 0.0, pixel
 
 
-@jit
+@in_place
 def condense(
     points: FloatArray, noises: FloatArray, given: BoolArray, frames: IntArray, sightings: IntArray,
     frame_keys: IntArray, frame_offsets: FloatArray, poses: FloatArray, landmarks: FloatArray,
@@ -167,8 +165,8 @@ def condense(
     Returns:
         Half the sum of the (robust) squared distances.
     """
-    e, y, d = np.empty(3), np.empty(3), np.empty(3)
-    info, turned = np.empty(6), np.empty(6)
+    e, y, d = room(3), room(3), room(3)
+    info, turned = room(6), room(6)
     for s in range(len(keys)):
         if frozen[s]:
             continue
@@ -178,13 +176,14 @@ def condense(
         centres[s, 0], centres[s, 1], centres[s, 2] = c * dx + sn * dy, -sn * dx + c * dy, landmark[2]
         infos[s] = 0.0
         slopes[s] = 0.0
-    total = 0.0
+    total, frame, c, sn = 0.0, -1, 1.0, 0.0
     for n in range(len(sightings)):
         s = sightings[n]
         if frozen[s]:
             continue
         offset = frame_offsets[frames[n]]
-        c, sn = math.cos(offset[2]), math.sin(offset[2])
+        if frame != frames[n]:  # they come one after the other
+            frame, c, sn = frames[n], math.cos(offset[2]), math.sin(offset[2])
         dx, dy = centres[s, 0] - offset[0], centres[s, 1] - offset[1]
         e[0] = c * dx + sn * dy - camera[4]
         e[1] = -sn * dx + c * dy - camera[5]

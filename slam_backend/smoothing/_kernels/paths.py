@@ -2,9 +2,7 @@
 
 import math
 
-import numpy as np
-
-from slam_backend._jit import fused, lanes, room
+from slam_backend._jit import lanes, room
 from slam_backend._kernels.lane_math import log_of, sine_cosine
 from slam_backend.errors import FloatArray, IntArray
 from slam_backend.smoothing._kernels.equations import WEAK
@@ -123,7 +121,7 @@ def replay(
                 out[i] += work[ENERGY + i] - 0.5 * log_det  # (6)
 
 
-@fused
+@lanes
 def odometry_of_paths(
     poses: FloatArray, num_keys: int, num_blocks: int, num_paths: int, previous: IntArray, mode: FloatArray,
     motions: FloatArray, infos: FloatArray, lever: float, log_density: FloatArray, spreads: FloatArray,
@@ -140,7 +138,7 @@ def odometry_of_paths(
         spreads: (k,), result [m^2]: mean square of what the motion from the previous key differs from that of the mode.
     """
     log_density[:] = 0.0
-    squares = np.empty(LANES)
+    squares = room(LANES)
     for b in range(num_keys):
         a = previous[b]
         spreads[b] = 0.0
