@@ -46,7 +46,7 @@ class ParticleMaps(MapStore):
             self._make_maps()
         self._free_maps, best = _kernels.resample(
             ancestors, of_robots, of_particles, self.counts, self.table, self.maps, self.users, self.free_rows,
-            self.tops, self.heads,
+            self.tops, self.heads, np.empty((3, len(ancestors)), np.uint32),
         )  # fmt: skip
         return best
 

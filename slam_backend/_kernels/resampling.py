@@ -1,48 +1,49 @@
 """Particles become copies of their ancestors, their landmarks lazily."""
 
 import math
+from typing import Any
 
 import numpy as np
 
-from slam_backend._jit import jit
+from slam_backend._jit import in_place
 from slam_backend._kernels.layout import FAR, FREE_SLOTS, IDS, LOG_WEIGHTS, MAP_OF, PATH_LOG_WEIGHTS, ROW_OF
 from slam_backend.errors import Float32Array, FloatArray, Int32Array, IntArray
 
 
-@jit
-def settle(ancestors: IntArray, count: int) -> tuple[IntArray, IntArray]:
+@in_place
+def settle(ancestors: IntArray, moved: Any) -> int:
     """Arrange resampled particles so that most stay in place.
 
     A particle with at least one copy keeps its place; surplus copies fill the places of the dead, in ascending order.
 
     Args:
-        ancestors: (count,) index of each new particle's parent, ascending.
-        count: M.
+        ancestors: (M,) index of each new particle's parent, ascending.
+        moved: (3, M) uint32. Written to, as far as places change: these, below each the particle that is copied into
+            it; and how many copies each particle has.
 
     Returns:
-        The places that change and, for each, the particle that is copied into it.
+        How many places change.
     """
-    copies = np.zeros(count, dtype=np.int64)
-    for i in range(count):
-        copies[ancestors[i]] += 1
-    targets = np.empty(count, dtype=np.int64)
-    sources = np.empty(count, dtype=np.int64)
+    targets, sources, copies = moved[0], moved[1], moved[2]
+    copies[:] = 0
+    for parent in ancestors:
+        copies[parent] += 1
     moves, place = 0, 0
-    for parent in range(count):
-        for _ in range(copies[parent] - 1):
+    for parent in range(len(ancestors)):
+        for _ in range(int(copies[parent]) - 1):
             while copies[place] > 0:
                 place += 1
             targets[moves] = place
             sources[moves] = parent
             moves += 1
             place += 1
-    return targets[:moves], sources[:moves]
+    return moves
 
 
-@jit
+@in_place
 def resample(
     ancestors: IntArray, robots: FloatArray, weights: FloatArray, counts: Int32Array, table: IntArray,
-    maps: Int32Array, users: IntArray, free_rows: IntArray, tops: IntArray, heads: Float32Array,
+    maps: Int32Array, users: IntArray, free_rows: IntArray, tops: IntArray, heads: Float32Array, moved: Any,
 ) -> tuple[int, int]:  # fmt: skip
     """Let particles become copies of their ancestors, their landmarks lazily, and free what no survivor holds.
 
@@ -54,14 +55,13 @@ def resample(
         robots: (5, K, 3, P) as in `take_turns`; columns are copied.
         weights: (4, P); those along paths are copied, those since the last resampling begin anew.
         counts, ..., heads: The store, see `ParticleMaps`. At least one map is free.
+        moved: Room for what `settle` writes.
 
     Returns:
         How many maps are still free, and the particle of the largest weight along paths.
     """
-    count = len(ancestors)
-    places = settle(ancestors, count)
-    targets, sources = places[0].astype(np.uint32), places[1].astype(np.uint32)  # unsigned: none counts from the end
-    moves = len(targets)
+    count, moves = len(ancestors), settle(ancestors, moved)
+    targets, sources = moved[0], moved[1]  # unsigned: none counts from the end
     path_log_weights, rows = weights[PATH_LOG_WEIGHTS], robots.reshape((-1, robots.shape[3]))
     for i in range(moves):
         path_log_weights[targets[i]] = path_log_weights[sources[i]]

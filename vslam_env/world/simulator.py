@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pymunk
 
-from slam_backend._jit import jit
+from slam_backend._jit import in_place
 from slam_backend.errors import FloatArray, check_array, check_float
 from vslam_env.world.spec import World
 
@@ -17,10 +17,11 @@ STANDING_MASS = 1e6  # [kg] a robot with its brakes on is not pushed away by one
 SHORTFALL = 0.01  # share of the commanded way that must be missing for a bump
 
 
-@jit
+@in_place
 def _drive_freely(
-    poses: FloatArray, commands: FloatArray, tick: float, walls: FloatArray, radius: float, goals: FloatArray
-) -> bool:
+    poses: FloatArray, commands: FloatArray, tick: float, walls: FloatArray, radius: float, goals: FloatArray,
+    reach: FloatArray,
+) -> bool:  # fmt: skip
     """Write down where robots end after a tick if nothing stops them; tell whether surely nothing can.
 
     A robot goes along the chord of its arc, so that it ends where the arc does. A command that is not finite is never
@@ -33,8 +34,8 @@ def _drive_freely(
         walls: (S, 4) float64 [m], world frame.
         radius: Of the robots [m].
         goals: (K, 3) float64 [m, m, rad], world frame. Written to.
+        reach: (K,) float64 [m]. Written to: how far from where it was each robot may have come, its body included.
     """
-    reach = np.empty(len(poses))
     clear = True
     for k in range(len(poses)):
         turn = commands[k, 1] * tick
@@ -87,6 +88,7 @@ class Simulator:
         self._bodies = []
         self.poses = check_array("start_poses", start_poses, (None, 3), "Give one row x y theta for each robot.")
         self._shape = len(self.poses), 2  # of commands
+        self._reach = np.empty(len(self.poses))
         _, _, x_max, y_max = world.bounds
         apart = 4.0 * (radius + SKIN)
         self._parking = [(x_max + apart * (2 + robot), y_max + apart) for robot in range(len(self.poses))]
@@ -113,7 +115,7 @@ class Simulator:
         if type(commands) is not np.ndarray or commands.dtype != np.float64 or commands.shape != self._shape:
             commands = self._checked(commands)
         goals = np.empty((len(self._bodies), 3))
-        clear = _drive_freely(self.poses, commands, self.tick, self._walls, self.radius + SKIN, goals)
+        clear = _drive_freely(self.poses, commands, self.tick, self._walls, self.radius + SKIN, goals, self._reach)
         if clear:
             self.bumped = self._nobody
         else:
