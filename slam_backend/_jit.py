@@ -68,7 +68,7 @@ def inlined(function: Callable[P, T]) -> Callable[P, T]:
 
 
 def lanes(function: Callable[P, T]) -> Callable[P, T]:
-    """Compile a kernel whose loops over lanes are to become vector instructions, or as `fused` one that works in place."""
+    """Compile a kernel whose loops over lanes are to become vector instructions, or one as of `fused` in place."""
     return _compiled(function, counted=False, **_LANES)
 
 
