@@ -18,8 +18,8 @@ from slam_backend.smoothing.rejuvenation import Looks
 def places_of(maps: ParticleMaps, best: int) -> Places:
     """Return where the most probable particle holds its landmarks to be."""
     rows = OutlineRows.unwritten(len(maps.ids))
-    held = rows.part(0, write_outline(maps, best, 1, rows, 0))
-    return Places(held.ids.copy(), held.means.copy())
+    num = write_outline(maps, best, 1, rows, 0)
+    return Places(rows.names[:num, 1].copy(), rows.places[:num, :3].copy())
 
 
 def known_of(maps: ParticleMaps, best: int) -> Known:

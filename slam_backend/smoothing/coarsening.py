@@ -5,7 +5,10 @@ keys than allowed, those neighbours become one whose relative pose is known best
 first, what was measured from it is moved there, and the odometry between them is spent.
 """
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 
 from slam_backend.errors import BoolArray, FloatArray
 from slam_backend.smoothing import _kernels
@@ -33,37 +36,33 @@ def coarsened(
         options: How many keys, and how many of them fresh, of all robots together.
         sightings: Of the graph, wherever they were linearised before they are here; None: they are gathered.
     """
-    k, robots = graph.num_keys, len(graph.tips)
-    fresh, raw, sighted = (np.empty(k, dtype=np.bool_) for _ in range(3))
+    robots = len(graph.tips)
     share = max(1, options.fresh_keys // robots)
-    _kernels.look_at_keys(graph.robots, graph.frame_keys, share, MOST_FRAMES, fresh, raw)
     seen = Sightings.of(graph) if sightings is None else sightings
-    graph, seen = _consistent(graph, seen, raw, camera, options)
-    rows = np.empty(len(seen.keys), dtype=np.int64)
-    rows = rows[: _kernels.to_freeze(seen.frozen, seen.keys, raw, rows, sighted)]
+    graph, seen = _consistent(graph, seen, share, camera, options)
+    k, n = graph.num_keys, len(seen.keys)
+    raw, numbers = np.empty(k, dtype=np.bool_), np.empty(k, dtype=np.int64)
     keys = {name: getattr(graph, name).copy() for name in OF_KEYS}
-    roots, numbers, offsets = np.empty(k, dtype=np.int64), np.empty(k, dtype=np.int64), np.empty((k, 3))
-    left = _kernels.join_keys(fresh, sighted, options.most_keys(robots), roots, numbers, offsets, *keys.values())
-    n = len(rows)
     frozen_keys, frozen_landmarks, counts = (np.empty(n, dtype=np.int64) for _ in range(3))
     centres, infos, slopes = np.empty((n, 3)), np.empty((n, 6)), np.empty((n, 3))
-    num = _kernels.add_sightings(
-        rows, seen.keys, seen.landmarks, seen.centres, seen.infos, seen.slopes, seen.counts, roots, numbers, offsets,
-        frozen_keys, frozen_landmarks, centres, infos, slopes, counts,
+    left, num = _kernels.coarsen(
+        share, MOST_FRAMES, options.most_keys(robots), graph.frame_keys, seen.keys, seen.landmarks, seen.frozen,
+        seen.centres, seen.infos, seen.slopes, seen.counts, raw, numbers, frozen_keys, frozen_landmarks, centres, infos,
+        slopes, counts, *keys.values(),
     )  # fmt: skip
-    fewer = graph.with_columns(
+    fewer = {
         **{name: column[:left] for name, column in keys.items()},
-        frame_keys=numbers[graph.frame_keys],
-        frozen_keys=frozen_keys[:num],
-        frozen_landmarks=frozen_landmarks[:num],
-        centres=centres[:num],
-        infos=infos[:num],
-        slopes=slopes[:num],
-        counts=counts[:num],
-        heads=numbers[graph.heads],
-        tips=numbers[graph.tips],
-    )
-    return _without_unused(fewer, raw[graph.frame_keys[graph.point_frames]])
+        "frame_keys": numbers[graph.frame_keys],
+        "frozen_keys": frozen_keys[:num],
+        "frozen_landmarks": frozen_landmarks[:num],
+        "centres": centres[:num],
+        "infos": infos[:num],
+        "slopes": slopes[:num],
+        "counts": counts[:num],
+        "heads": numbers[graph.heads],
+        "tips": numbers[graph.tips],
+    }
+    return _without_unused(graph, fewer, raw[graph.frame_keys[graph.point_frames]])
 
 
 def at_mode(graph: PathGraph, mode: Mode, spreads: FloatArray | None = None) -> PathGraph:
@@ -74,34 +73,45 @@ def at_mode(graph: PathGraph, mode: Mode, spreads: FloatArray | None = None) -> 
 
 def compacted(graph: PathGraph) -> PathGraph:
     """Return the graph without the frames from which, and the landmarks of which, nothing was measured."""
-    return _without_unused(graph, np.ones(len(graph.points), dtype=np.bool_))
+    return _without_unused(graph, {}, np.ones(len(graph.points), dtype=np.bool_))
 
 
-def _without_unused(graph: PathGraph, kept: BoolArray) -> PathGraph:
-    """Return the graph with some of its raw measurements (n,), and with what anything is left of; see `compacted`."""
-    frozen = graph.frozen_landmarks.copy()
-    columns = {name: getattr(graph, name).copy() for name in (*OF_POINTS, *OF_FRAMES, *OF_LANDMARKS)}
+def _without_unused(graph: PathGraph, changed: dict[str, NDArray[Any]], kept: BoolArray) -> PathGraph:
+    """Return the graph with some columns in place of its own, but with what anything is left of; see `compacted`.
+
+    Args:
+        graph: As it was.
+        changed: Columns by their names.
+        kept: (n,) which of its raw measurements are left.
+    """
+    all_columns = graph.to_mapping() | changed
+    frozen = all_columns["frozen_landmarks"].copy()
+    columns = {name: all_columns[name].copy() for name in (*OF_POINTS, *OF_FRAMES, *OF_LANDMARKS)}
     points, frames, landmarks = _kernels.drop_unused(kept, frozen, *columns.values())
-    return graph.with_columns(
-        frozen_landmarks=frozen,
-        **{name: columns[name][:points] for name in OF_POINTS},
-        **{name: columns[name][:frames] for name in OF_FRAMES},
-        **{name: columns[name][:landmarks] for name in OF_LANDMARKS},
-    )
+    used = {OF_POINTS: points, OF_FRAMES: frames, OF_LANDMARKS: landmarks}
+    changed = changed | {name: columns[name][:num] for names, num in used.items() for name in names}
+    return graph.with_columns(**changed | {"frozen_landmarks": frozen})
 
 
 def _consistent(
-    graph: PathGraph, seen: Sightings, raw: BoolArray, camera: FloatArray, options: SmoothingOptions
+    graph: PathGraph, seen: Sightings, share: int, camera: FloatArray, options: SmoothingOptions
 ) -> tuple[PathGraph, Sightings]:
     """Return the graph without old measurements that the smoothed path contradicts, and its sightings, linearised."""
     _linearise(seen, graph, camera, options)
     if options.kernel:
         lost = seen.squares > CONTRADICTION * options.kernel
-        if lost.any() and (lost := lost & ~raw[graph.frame_keys[graph.point_frames]]).any():
+        if lost.any() and (lost := lost & ~_is_raw(graph, share)).any():
             graph = graph.with_columns(**_of_points(graph, ~lost))
             seen = Sightings.of(graph)
             _linearise(seen, graph, camera, options)
     return graph, seen
+
+
+def _is_raw(graph: PathGraph, share: int) -> BoolArray:
+    """Return which measurements (n,) stay raw where so many keys of a robot are fresh."""
+    fresh, raw = np.empty(graph.num_keys, dtype=np.bool_), np.empty(graph.num_keys, dtype=np.bool_)
+    _kernels.look_at_keys(graph.robots, graph.frame_keys, share, MOST_FRAMES, fresh, raw)
+    return raw[graph.frame_keys[graph.point_frames]]
 
 
 def _linearise(seen: Sightings, graph: PathGraph, camera: FloatArray, options: SmoothingOptions) -> None:

@@ -173,6 +173,14 @@ def move(poses: FloatArray, motions: FloatArray, moved: FloatArray) -> None:
 
 
 @in_place
+def wrap(poses: FloatArray) -> None:
+    """Bring the headings of poses (K, 3, M) [m, m, rad] to [-pi, pi), in place."""
+    for robot in range(len(poses)):
+        for i in range(poses.shape[2]):
+            poses[robot, 2, i] = (poses[robot, 2, i] + math.pi) % (2.0 * math.pi) - math.pi
+
+
+@in_place
 def measure_off(poses: FloatArray, means: FloatArray, lever: float, squares: FloatArray) -> None:
     """Write how far off particles are.
 

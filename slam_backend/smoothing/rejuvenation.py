@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend.errors import FloatArray, IntArray
-from slam_backend.geometry import wrap_angle
 from slam_backend.log_arrays import EXACT, LogArrays
 from slam_backend.motion import OdometryModel
 from slam_backend.resampling import systematic
@@ -17,7 +16,7 @@ from slam_backend.smoothing.duplicates import find_duplicates, without_duplicate
 from slam_backend.smoothing.extending import Places, extended, first_rows
 from slam_backend.smoothing.graph import PathGraph
 from slam_backend.smoothing.guesses import Guesses
-from slam_backend.smoothing.holding import holding, move, move_tiles
+from slam_backend.smoothing.holding import holding, move, move_tiles, wrap
 from slam_backend.smoothing.options import SmoothingOptions
 from slam_backend.smoothing.sampling import Draws, draw_paths, drawn_spreads
 from slam_backend.smoothing.solving import NO_POSE, Mode, find_mode
@@ -234,9 +233,8 @@ def _particles(graph: PathGraph, mode: Mode, draws: Draws) -> Particles:
         for head in (mode.columns[graph.heads] >= 0).nonzero()[0].tolist():
             own = starts[head : head + 1]
             move(own, held.motions, own)
-    for array in (poses, starts):
-        array[:, 2] = wrap_angle(array[:, 2])
-    means[:, 2] = wrap_angle(means[:, 2])
+    for array in (poses, starts, means[:, :, None]):
+        wrap(array)
     return Particles(
         poses, starts, np.log(np.maximum(weights, 1e-300)), densities, ids, tiles, counts, means, covariances, frame,
     )  # fmt: skip

@@ -1,6 +1,7 @@
 """Compiled inner loops of the smoother: forms of sightings, normal equations, their factor, many paths at a time."""
 
-from slam_backend.smoothing._kernels.coarsening import add_sightings, join_keys, look_at_keys, to_freeze
+from slam_backend.smoothing._kernels.coarse import coarsen
+from slam_backend.smoothing._kernels.coarsening import look_at_keys
 from slam_backend.smoothing._kernels.densities import normalise, weigh_deviations
 from slam_backend.smoothing._kernels.drawing import draw
 from slam_backend.smoothing._kernels.dropping import drop_unused
@@ -14,8 +15,7 @@ from slam_backend.smoothing._kernels.scattering import scatter_of_links
 from slam_backend.smoothing._kernels.stepping import step
 
 __all__ = [
-    "FREE", "LANES", "POSE_ROWS", "add_sightings", "condense", "count", "covariance", "draw", "drop_unused",
-    "factorise", "form", "gather", "join_keys", "lay_out", "look_at_keys", "minimum_degree", "neighbours",
-    "normalise", "odometry_of_paths", "replay", "scatter_of_links", "seek_poses", "step", "to_freeze", "to_lanes",
-    "weigh_deviations",
+    "FREE", "LANES", "POSE_ROWS", "coarsen", "condense", "count", "covariance", "draw", "drop_unused", "factorise",
+    "form", "gather", "lay_out", "look_at_keys", "minimum_degree", "neighbours", "normalise", "odometry_of_paths",
+    "replay", "scatter_of_links", "seek_poses", "step", "to_lanes", "weigh_deviations",
 ]  # fmt: skip
