@@ -1,6 +1,5 @@
 """`extended`: a graph takes in what the robots did since; steps without measurements are chained away."""
 
-import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -11,13 +10,14 @@ from slam_backend.errors import FloatArray, IntArray, bad_argument
 from slam_backend.geometry import compose, rotation
 from slam_backend.log_arrays import EXACT, LogArrays
 from slam_backend.motion import OdometryModel
-from slam_backend.smoothing._walking import choose, number, place, rename, start_anew, walk
+from slam_backend.smoothing import _kernels
 from slam_backend.smoothing.graph import LEVER, OF_FRAMES, OF_KEYS, OF_LANDMARKS, OF_POINTS, PathGraph
 from slam_backend.smoothing.guesses import Guesses
 
 LEAST_NOISE = 1e-5  # [m, rad] of odometry in one step: where a part has none, as with no floors, nothing is singular
 NO_COVARIANCES = np.empty((0, 6))
 NO_COVARIANCES.setflags(write=False)  # as those of logs are
+NO_GUESSES = Guesses.none()
 
 
 class Places(NamedTuple):
@@ -30,6 +30,9 @@ class Places(NamedTuple):
 
     ids: IntArray
     means: FloatArray
+
+
+NO_PLACES = Places(np.empty(0, dtype=np.int64), np.empty((0, 3)))
 
 
 def extended(
@@ -64,21 +67,14 @@ def extended(
     steps, most = sum(map(len, logs)), sum(len(log.ids) for log in logs)
     room = {OF_KEYS: steps, OF_FRAMES: steps, OF_POINTS: most, OF_LANDMARKS: most}
     columns = {name: _with_room(getattr(graph, name), more) for names, more in room.items() for name in names}
-    supposed = _supposed(logs, guesses)
-    keys, frames, points, tips = _walked(graph, logs, motion, supposed, rigid_within, columns)
-    old, known = len(graph.points), len(graph.landmarks)
-    new, first = columns["point_landmarks"][old:points], np.empty(points - old, dtype=np.int64)  # as yet names
-    rename(new, graph.aliases)
-    landmarks = number(new, graph.landmark_ids.argsort(), columns["landmark_ids"], first)
-    place(
-        columns["poses"], columns["frame_keys"], columns["frame_offsets"], columns["point_frames"][old:points],
-        columns["points"][old:points], first[: landmarks - known], mount, columns["landmarks"][known:landmarks],
+    keys, frames, points, tips, is_guided = _walked(graph, logs, motion, guesses, rigid_within, columns)
+    new, held = slice(len(graph.points), points), NO_PLACES if places is None else places
+    landmarks = _kernels.settle(
+        graph.aliases, len(graph.landmarks), columns["point_landmarks"][new], columns["points"][new],
+        columns["point_frames"][new], columns["poses"], columns["frame_keys"], columns["frame_offsets"], mount,
+        is_guided and len(held.ids) > 0, graph.frozen_landmarks, graph.counts, graph.point_landmarks, held.ids,
+        held.means, columns["landmark_ids"], columns["landmarks"],
     )  # fmt: skip
-    if places is not None and len(places.ids) and guesses is not None and all(map(_guided, logs, supposed)):
-        start_anew(
-            graph.frozen_landmarks, graph.counts, graph.point_landmarks, new, columns["landmark_ids"][:landmarks],
-            places.ids, places.means, columns["landmarks"][:landmarks],
-        )  # fmt: skip
     latest = [int(log.steps[-1]) if len(log) else before for log, before in zip(logs, graph.latest, strict=True)]
     used = {OF_KEYS: keys, OF_FRAMES: frames, OF_POINTS: points, OF_LANDMARKS: landmarks}
     return graph.with_columns(
@@ -89,47 +85,37 @@ def extended(
 
 
 def _walked(
-    graph: PathGraph, logs: Sequence[LogArrays], motion: OdometryModel, supposed: Sequence[FloatArray],
+    graph: PathGraph, logs: Sequence[LogArrays], motion: OdometryModel, guesses: Sequence[Guesses] | None,
     rigid_within: float, columns: dict[str, NDArray[Any]],
-) -> tuple[int, int, int, IntArray]:  # fmt: skip
+) -> tuple[int, int, int, IntArray, bool]:  # fmt: skip
     """Walk through the robots' new steps: which of them become keys, and what was measured.
 
     Args:
-        graph, logs, motion, rigid_within: As of `extended`.
-        supposed: Of `_supposed`.
+        graph, logs, motion, guesses, rigid_within: As of `extended`.
         columns: Of the graph with room; those of keys, frames and measurements are written, with landmarks' names in
             place of their rows.
 
     Returns:
-        How many keys, frames and measurements there are then, and the newest key of each robot (K,).
+        How many keys, frames and measurements there are then, the newest key of each robot (K,), and whether each robot
+        is supposed to be anywhere where it measured something.
     """
-    tips = graph.tips.copy()
-    variances = motion.variances(np.concatenate([log.motions for log in logs]))
-    if not motion.is_exact:
-        variances = np.maximum(variances, LEAST_NOISE**2)
-    of_points = [columns[name] for name in OF_POINTS]
-    of_keys_and_frames = [columns[name] for name in (*OF_KEYS, *OF_FRAMES)]
-    keys, frames, points, first = graph.num_keys, len(graph.frame_keys), len(graph.points), 0
+    tips, is_guided = graph.tips.copy(), guesses is not None
+    written = [columns[name] for name in (*OF_KEYS, *OF_FRAMES, *OF_POINTS)]
+    keys, frames, points = graph.num_keys, len(graph.frame_keys), len(graph.points)
     for robot, log in enumerate(logs):
         if EXACT in log.kinds.tolist():
             raise bad_argument("logs", "odometry", "a pose that was given as exact", "There is nothing to smooth.")
-        own, counts = slice(first, first := first + len(log)), np.empty(len(log), dtype=np.int64)
+        variances = motion.variances(log.motions)
+        if not motion.is_exact:
+            variances = np.maximum(variances, LEAST_NOISE**2)
+        guessed = NO_GUESSES if guesses is None else guesses[robot]
         covariances = NO_COVARIANCES if log.covariances is None else log.covariances
-        points = choose(
-            log.ids, log.points, log.given, covariances, log.starts, points, frames, counts, *of_points
+        keys, frames, points, is_own = _kernels.take_in(
+            log.steps, log.kinds, log.motions, log.given, log.starts, log.points, log.ids, covariances, variances,
+            *guessed, robot, rigid_within, LEVER, keys, frames, points, tips, *written,
         )  # fmt: skip
-        keys, frames = walk(
-            log.kinds, log.motions, variances[own], counts, supposed[robot], robot, rigid_within, LEVER, keys, frames,
-            tips, *of_keys_and_frames,
-        )  # fmt: skip
-    return keys, frames, points, tips
-
-
-def _supposed(logs: Sequence[LogArrays], guesses: Sequence[Guesses] | None) -> list[FloatArray]:
-    """Return (T, 3) [m, m, rad] of each log: where its robot is thought to be after its steps; NaN: nobody says."""
-    if guesses is None:
-        return [np.full((len(log), 3), np.nan) for log in logs]
-    return [guessed.at(log.steps) for log, guessed in zip(logs, guesses, strict=True)]
+        is_guided = is_guided and is_own
+    return keys, frames, points, tips, is_guided
 
 
 def _with_room(column: NDArray[Any], extra: int) -> NDArray[Any]:
@@ -137,12 +123,6 @@ def _with_room(column: NDArray[Any], extra: int) -> NDArray[Any]:
     longer = np.empty((len(column) + extra, *column.shape[1:]), dtype=column.dtype)
     longer[: len(column)] = column
     return longer
-
-
-def _guided(log: LogArrays, poses: FloatArray) -> bool:
-    """Return whether it is supposed where (T, 3) the first step that measured something was, and so all."""
-    t = int(log.starts.searchsorted(0, side="right")) - 1
-    return t == len(log) or not math.isnan(poses[t, 0])
 
 
 def chained(

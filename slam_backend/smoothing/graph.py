@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from slam_backend.errors import BoolArray, FloatArray, IntArray
 from slam_backend.geometry import between, wrap_angle
-from slam_backend.smoothing._walking import rename
+from slam_backend.smoothing._kernels import rename
 
 NONE = -1
 VAGUE = (1e4, 1e4, 10.0)  # variances [m^2, m^2, rad^2] of a start of which nothing is known

@@ -4,8 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from slam_backend._jit import jit
 from slam_backend.errors import FloatArray, IntArray
+from slam_backend.smoothing._kernels import look_up
 
 
 class Guesses(NamedTuple):
@@ -38,22 +38,3 @@ class Guesses(NamedTuple):
         poses = np.empty((len(steps), 3))
         look_up(self.steps, self.poses, steps, poses)
         return poses
-
-
-@jit
-def look_up(known: IntArray, poses: FloatArray, steps: IntArray, found: FloatArray) -> None:
-    """Write the pose of each step, NaN if it is not known.
-
-    Args:
-        known, poses: (n,) ascending, (n, 3).
-        steps: (m,) ascending.
-        found: (m, 3), result.
-    """
-    at = 0
-    for t in range(len(steps)):
-        while at < len(known) and known[at] < steps[t]:
-            at += 1
-        if at < len(known) and known[at] == steps[t]:
-            found[t] = poses[at]
-        else:
-            found[t] = np.nan

@@ -9,7 +9,8 @@ from small_problems import camera_of, graph_of, logs_of, small_run
 from slam_backend.geometry import between, compose, transform_points, wrap_angle
 from slam_backend.log_arrays import ODOMETRY, REJECTED, STOOD
 from slam_backend.motion import OdometryModel
-from slam_backend.smoothing._walking import choose, number, place, rename, start_anew, walk
+from slam_backend.smoothing._kernels.naming import number, place, rename, start_anew
+from slam_backend.smoothing._kernels.walking import choose, walk
 from slam_backend.smoothing.extending import chained, extended
 from slam_backend.smoothing.graph import LEVER, PathGraph
 from slam_backend.smoothing.options import SmoothingOptions

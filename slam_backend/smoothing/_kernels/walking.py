@@ -1,4 +1,4 @@
-"""A robot's new steps, compiled: which of them become keys, where the others stand to these, what was measured."""
+"""A robot's new steps: which of them become keys, where the others stand to these, what was measured."""
 
 import math
 
@@ -148,98 +148,60 @@ def choose(
 
 
 @in_place
-def rename(names: IntArray, aliases: IntArray) -> None:
-    """Give landmarks the names by which they go, in place: (n,) int64, and rows (name, name it goes by) in order."""
-    for row in range(len(aliases)):
-        old, new = aliases[row, 0], aliases[row, 1]
-        for n in range(len(names)):
-            if names[n] == old:
-                names[n] = new
-
-
-@in_place
-def number(names: IntArray, order: IntArray, ids: IntArray, first: IntArray) -> int:
-    """Number the landmarks of measurements; those that are new come after the known ones.
+def look_up(known: IntArray, poses: FloatArray, steps: IntArray, found: FloatArray) -> None:
+    """Write the pose of each step, NaN if it is not known.
 
     Args:
-        names: (n,) int64. Of each measurement's landmark; changed: its row of `ids`.
-        order: (l,) int64. Rows of the known landmarks by ascending name.
-        ids: (l + n,) int64. Their names, each once; those of the new ones are written from row l on.
-        first: (n,) int64, result, of which the first rows are written: the first measurement of each new one.
-
-    Returns:
-        How many landmarks there are then.
+        known, poses: (n,) ascending, (n, 3).
+        steps: (m,) ascending.
+        found: (m, 3), result.
     """
-    known, num = len(order), len(order)
-    for n in range(len(names)):
-        name, low, high = names[n], 0, known
-        while low < high:
-            middle = (low + high) // 2
-            if ids[order[middle]] < name:
-                low = middle + 1
-            else:
-                high = middle
-        row = order[low] if low < known and ids[order[low]] == name else known
-        if row == known:
-            while row < num and ids[row] != name:
-                row += 1
-            if row == num:
-                ids[num], first[num - known] = name, n
-                num += 1
-        names[n] = row
-    return num
-
-
-@in_place
-def place(
-    poses: FloatArray, frame_keys: IntArray, offsets: FloatArray, frames: IntArray, points: FloatArray,
-    chosen: IntArray, mount: FloatArray, places: FloatArray,
-) -> None:  # fmt: skip
-    """Write where some measured points lie in the map.
-
-    Args:
-        poses: (k, 3) float64 [m, m, rad]. Of the keys, map frame.
-        frame_keys, offsets: (f,), (f, 3) key of each frame, and the frame seen from it.
-        frames, points: (n,), (n, 3) [m] frame of each point, and the point, robot axes, from the camera centre.
-        chosen: (m,) which of them.
-        mount: (3,) [m] of the camera on the robot.
-        places: (m, 3) [m], map frame, result.
-    """
-    for i in range(len(chosen)):
-        point, frame = points[chosen[i]], frames[chosen[i]]
-        pose, offset = poses[frame_keys[frame]], offsets[frame]
-        c, s = math.cos(pose[2]), math.sin(pose[2])
-        x, y = pose[0] + c * offset[0] - s * offset[1], pose[1] + s * offset[0] + c * offset[1]
-        c, s = math.cos(pose[2] + offset[2]), math.sin(pose[2] + offset[2])
-        ahead, left = point[0] + mount[0], point[1] + mount[1]
-        places[i, 0], places[i, 1] = x + c * ahead - s * left, y + s * ahead + c * left
-        places[i, 2] = point[2] + mount[2]
+    at = 0
+    for t in range(len(steps)):
+        while at < len(known) and known[at] < steps[t]:
+            at += 1
+        if at < len(known) and known[at] == steps[t]:
+            for axis in range(3):
+                found[t, axis] = poses[at, axis]
+        else:
+            found[t] = math.nan
 
 
 @jit
-def start_anew(
-    frozen_landmarks: IntArray, counts: IntArray, point_landmarks: IntArray, new_landmarks: IntArray, names: IntArray,
-    held: IntArray, means: FloatArray, landmarks: FloatArray,
-) -> None:  # fmt: skip
-    """Put those landmarks where a filter holds them to be that have more new measurements than old ones.
+def take_in(
+    steps: IntArray, kinds: NDArray[np.int8], motions: FloatArray, given: BoolArray, starts: IntArray,
+    measured: FloatArray, ids: IntArray, covariances: FloatArray, variances: FloatArray, known: IntArray,
+    known_poses: FloatArray, robot: int, rigid_within: float, lever: float, keys: int, frames: int, num: int,
+    tips: IntArray, robots: IntArray, poses: FloatArray, previous: IntArray, key_motions: FloatArray,
+    key_noises: FloatArray, spreads: FloatArray, slack: FloatArray, frame_keys: IntArray, offsets: FloatArray,
+    points: FloatArray, noises: FloatArray, taken_given: BoolArray, point_frames: IntArray, names: IntArray,
+) -> tuple[int, int, int, bool]:  # fmt: skip
+    """Take in a robot's log of T steps: where it is supposed to be, what was measured, and what becomes a key.
 
     Args:
-        frozen_landmarks, counts: (s,) landmark of each frozen sighting, and the measurements in it.
-        point_landmarks: (n,) of each old raw measurement.
-        new_landmarks: (m,) of each new one.
-        names: (l,) int64. Of the landmarks.
-        held, means: (h,) int64, ascending, (h, 3) [m]. Names of those that the filter holds, and where.
-        landmarks: (l, 3) float64 [m], map frame; changed.
+        steps, kinds, motions, given, starts, measured, ids, covariances: Of the log, as of `walk` and `choose`.
+        variances: As of `walk`.
+        known, known_poses: Poses after some steps, as of `look_up`.
+        robot, rigid_within, lever, keys, frames, tips: As of `walk`.
+        num: How many measurements there are before.
+        robots, poses, previous, key_motions, key_noises, spreads, slack, frame_keys, offsets: As of `walk`, written.
+        points, noises, taken_given, point_frames, names: As of `choose`, written.
+
+    Returns:
+        How many keys, frames and measurements there are then; and whether it is supposed to be anywhere after the first
+        step that measured something, and so after all of these.
     """
-    more = np.zeros(len(names), dtype=np.int64)
-    for n in range(len(frozen_landmarks)):
-        more[frozen_landmarks[n]] -= counts[n]
-    for landmark in point_landmarks:
-        more[landmark] -= 1
-    for landmark in new_landmarks:
-        more[landmark] += 1
-    for landmark in range(len(names)):
-        if more[landmark] > 0:
-            at = np.searchsorted(held, names[landmark])
-            if at < len(held) and held[at] == names[landmark]:
-                landmarks[landmark] = means[at]
+    count = len(steps)
+    supposed, counts = np.empty((count, 3)), np.empty(count, dtype=np.int64)
+    look_up(known, known_poses, steps, supposed)
+    num = choose(
+        ids, measured, given, covariances, starts, num, frames, counts, points, noises, taken_given, point_frames, names
+    )
+    keys, frames = walk(
+        kinds, motions, variances, counts, supposed, robot, rigid_within, lever, keys, frames, tips, robots, poses,
+        previous, key_motions, key_noises, spreads, slack, frame_keys, offsets,
+    )  # fmt: skip
+    first = 0
+    while first < count and starts[first + 1] == 0:
+        first += 1
+    return keys, frames, num, first == count or not math.isnan(supposed[first, 0])
