@@ -15,7 +15,10 @@ from slam_backend.measurements import Measurements, TeamMeasurements
 from slam_backend.merge_options import MergeOptions
 from slam_backend.metrics.maps import map_error
 from slam_backend.smoothing import holding
+from slam_backend.smoothing._kernels import look_at_keys
 from slam_backend.smoothing.bending import bend
+from slam_backend.smoothing.graph import PathGraph
+from slam_backend.smoothing.guesses import Guesses
 from slam_backend.smoothing.options import SmoothingOptions
 from slam_backend.team import TeamSlam
 
@@ -60,6 +63,9 @@ def warm_up() -> float:
         root = np.array([-1])
         root.setflags(write=False)
         bend(np.zeros((1, 3)), root, np.zeros((1, 3, 1)))
+        PathGraph.at_starts(np.zeros((1, 3))).known_as(names)  # of groups that merge
+        Guesses.none().at(root)  # of what was refused
+        look_at_keys(root, root[:0], 1, 1, np.empty(1, dtype=np.bool_), np.empty(1, dtype=np.bool_))  # and contradicted
         holding.move(np.zeros((1, 3, 1)), np.zeros((1, 3)), np.zeros((1, 3, 1)))  # of starts that are sought
         team = TeamSlam(2, num_particles=4, attempts=AttemptOptions(every=1), merging=MergeOptions(watch_every=1))
         for _ in range(STEPS):
