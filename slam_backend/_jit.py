@@ -1,4 +1,4 @@
-"""The few ways in which this project compiles a kernel: serial, cached on disk, under the interpreter lock."""
+"""The few ways in which this project compiles a kernel: serial, cached on disk, without the interpreter lock."""
 
 from collections.abc import Callable
 from functools import lru_cache
@@ -84,17 +84,13 @@ def any_order(function: Callable[P, T]) -> Callable[P, T]:
 
 
 def _compiled(function: Callable[P, T], counted: bool, **options: Any) -> Callable[P, T]:
-    """Compile with the cache on disk, if there is a place for it.
-
-    Kernels keep the interpreter lock: nobody here waits for it, most take a few microseconds, and to give it back and
-    take it again costs each call a tenth of one.
-    """
+    """Compile without the interpreter lock and with the cache on disk, if there is a place for it."""
     if CAN_LEAVE_UNCOUNTED:
         options["_nrt"] = counted  # said of each: numba would take that of the kernel that calls it first
     try:
-        kernel = numba.njit(cache=True, **options)(function)
+        kernel = numba.njit(cache=True, nogil=True, **options)(function)
     except RuntimeError:  # neither the package's folder nor the user's can be written: each process compiles anew
-        return cast(Callable[P, T], numba.njit(**options)(function))
+        return cast(Callable[P, T], numba.njit(nogil=True, **options)(function))
     folder = Path(function.__code__.co_filename).parent
     if folder.name.endswith(KERNELS) and hasattr(kernel, "_cache"):  # it has none where NUMBA_DISABLE_JIT is set
         file = kernel._cache._cache_file
