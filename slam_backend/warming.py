@@ -20,6 +20,7 @@ from slam_backend.smoothing.bending import bend
 from slam_backend.smoothing.graph import PathGraph
 from slam_backend.smoothing.guesses import Guesses
 from slam_backend.smoothing.options import SmoothingOptions
+from slam_backend.smoothing.reassociation import find_only
 from slam_backend.team import TeamSlam
 
 PROPOSALS: tuple[Literal["fastslam2", "fastslam1"], ...] = ("fastslam2", "fastslam1")
@@ -65,6 +66,7 @@ def warm_up() -> float:
         bend(np.zeros((1, 3)), root, np.zeros((1, 3, 1)))
         PathGraph.at_starts(np.zeros((1, 3))).known_as(names)  # of groups that merge
         Guesses.none().at(root)  # of what was refused
+        find_only(points, descriptors, points, descriptors, 1.0, 1.0, names.copy())
         look_at_keys(root, root[:0], 1, 1, np.empty(1, dtype=np.bool_), np.empty(1, dtype=np.bool_))  # and contradicted
         holding.move(np.zeros((1, 3, 1)), np.zeros((1, 3)), np.zeros((1, 3, 1)))  # of starts that are sought
         team = TeamSlam(2, num_particles=4, attempts=AttemptOptions(every=1), merging=MergeOptions(watch_every=1))

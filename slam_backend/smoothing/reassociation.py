@@ -5,6 +5,7 @@ near to something that looks the same to be new, and would be refused for ever. 
 may be false; several from different frames that agree with each other are no accident.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -12,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from slam_backend._jit import in_place
 from slam_backend._packed import UNPACK
 from slam_backend.camera import ROBOT_FROM_CAMERA
 from slam_backend.errors import BoolArray, FloatArray, IntArray
@@ -138,17 +140,48 @@ def _located(
 
 def _owners(points: _Points, logs: Sequence[LogArrays], known: Known, options: FilterOptions) -> IntArray:
     """Return the row (n,) in `known` of the only landmark that each point can be of; `NO_ONE`: none, or several."""
-    fits = np.linalg.norm(points.means[:, None] - known.means, axis=2) <= options.dead_radius
-    near, place = np.nonzero(fits)
-    unlike = np.linalg.norm(points.descriptors[near] - known.descriptors[place], axis=1)
-    fits[near, place] = unlike <= options.descriptor_gate
-    owners = np.where(fits.sum(axis=1) == 1, fits.argmax(axis=1), NO_ONE)
+    owners = np.empty(len(points.means), dtype=np.int64)
+    find_only(
+        points.means, points.descriptors, np.ascontiguousarray(known.means), known.descriptors, options.dead_radius,
+        options.descriptor_gate, owners,
+    )  # fmt: skip
     for n in np.flatnonzero(owners != NO_ONE):
         log = logs[points.robots[n]]
         t = int(np.searchsorted(log.steps, points.steps[n]))
         if (log.ids[log.starts[t] : log.starts[t + 1]] == known.ids[owners[n]]).any():
             owners[n] = NO_ONE
     return owners
+
+
+@in_place
+def find_only(
+    means: FloatArray, descriptors: NDArray[np.float32], known_means: FloatArray,
+    known_descriptors: NDArray[np.float32], radius: float, gate: float, owners: IntArray,
+) -> None:  # fmt: skip
+    """Find the only landmark that lies near each point and looks like it.
+
+    Args:
+        means, descriptors: (n, 3) [m], (n, d) of the points.
+        known_means, known_descriptors: (l, 3) [m], (l, d) of the landmarks.
+        radius: [m] Within which one is near.
+        gate: L2 distance within which two look alike.
+        owners: (n,), result: the landmark's row, `NO_ONE` where there is none or more than one.
+    """
+    for n in range(len(means)):
+        owners[n], fits = NO_ONE, 0
+        for row in range(len(known_means)):
+            dx, dy = means[n, 0] - known_means[row, 0], means[n, 1] - known_means[row, 1]
+            dz = means[n, 2] - known_means[row, 2]
+            if math.sqrt(dx * dx + dy * dy + dz * dz) > radius:
+                continue
+            unlike = 0.0
+            for i in range(descriptors.shape[1]):
+                off = descriptors[n, i] - known_descriptors[row, i]
+                unlike += off * off
+            if math.sqrt(unlike) <= gate:
+                owners[n], fits = row, fits + 1
+        if fits != 1:
+            owners[n] = NO_ONE
 
 
 def _agreeing(points: _Points, members: IntArray, gate: float) -> BoolArray:

@@ -11,12 +11,24 @@ from slam_backend.log_arrays import REJECTED
 from slam_backend.measurements import Measurements
 from slam_backend.run_log import RobotLog
 from slam_backend.smoothing.guesses import Guesses
-from slam_backend.smoothing.reassociation import Known, Refused, taken_up
+from slam_backend.smoothing.reassociation import NO_ONE, Known, Refused, find_only, taken_up
 
 OPTIONS = FilterOptions(camera=StereoCamera(sigma_px=0.2, sigma_disparity_px=0.1, mount=(0.1, 0.0, 0.9)))
 POSES = {4: np.array([0.0, 0.0, 0.3]), 5: np.array([0.4, 0.1, 0.2]), 7: np.array([0.9, 0.1, -0.1])}
 PLACE = np.array([5.0, 0.6, 1.2])
 LOOK, OTHER_LOOK = np.eye(4, dtype=np.float32)[:2]
+
+
+def test_the_only_one_that_is_near_and_looks_alike_is_found_as_by_arrays():
+    """Where none is, or several are, there is no one."""
+    rng = np.random.default_rng(8)
+    means, known_means = rng.uniform(0.0, 3.0, (60, 3)), rng.uniform(0.0, 3.0, (25, 3))
+    looks, known_looks = (rng.normal(size=(n, 8)).astype(np.float32) for n in (60, 25))
+    find_only(means, looks, known_means, known_looks, 1.4, 3.7, owners := np.empty(60, dtype=np.int64))
+    near = np.linalg.norm(means[:, None] - known_means, axis=2) <= 1.4
+    fits = near & (np.linalg.norm(looks[:, None] - known_looks, axis=2) <= 3.7)
+    np.testing.assert_array_equal(owners, np.where(fits.sum(axis=1) == 1, fits.argmax(axis=1), NO_ONE))
+    assert {0, 1, 2} <= set(fits.sum(axis=1).tolist())
 
 
 def seen_from(pose, place):
