@@ -8,7 +8,7 @@ import numpy as np
 
 from slam_backend._existence_step import ExistenceStep
 from slam_backend._filter_arrays import FilterArrays
-from slam_backend._journal import Entry, write_down
+from slam_backend._journal import Journal
 from slam_backend._kernels import add_share
 from slam_backend._kernels.layout import CAMERA, RECOVERY
 from slam_backend._mixtures import pose_mixtures
@@ -62,7 +62,7 @@ class FilterState(FilterArrays):
         self._best = 0
         self._steps = 0
         self._robot_logs = [RobotLog() for _ in range(k)]
-        self._journal: list[Entry] = []
+        self._journal = Journal(k)
         self._estimates = self._mixtures()
 
     @property
@@ -129,14 +129,13 @@ class FilterState(FilterArrays):
     @property
     def _logs(self) -> list[RobotLog]:
         """Per robot what it did and measured so far, and which landmarks that was taken for."""
-        if self._journal:
+        if self._journal.steps:
             self._write_down()
         return self._robot_logs
 
     def _write_down(self) -> None:
         """Enter into the logs, and tell the smoother, what the steps in the journal came to."""
-        write_down(self._journal, self._robot_logs, self._rejuvenation)
-        self._journal.clear()
+        self._journal.write_down(self._robot_logs, self._rejuvenation)
 
     # ------------------------------------------------------------------ snapshots
 

@@ -1,66 +1,73 @@
 """What the last steps of a filter came to, as it waits to be written into the robots' logs, many steps at a time."""
 
 from collections.abc import Sequence
-from itertools import groupby
 
 import numpy as np
 
-from slam_backend._kernels.layout import ASSOCIATED
+from slam_backend._kernels.layout import ASSOCIATED, NUM_MEASURED, NUM_NOTED
 from slam_backend._log_kernels import write_guesses
 from slam_backend._rejuvenation_step import RejuvenationStep
-from slam_backend.errors import FloatArray
-from slam_backend.input_log import StepInput
-from slam_backend.reports import StepReport
+from slam_backend.errors import IntArray
+from slam_backend.input_log import Seats, StepInput
 from slam_backend.run_log import RobotLog
 
 LONGEST = 32  # steps that wait
+ROOM = 16 * LONGEST  # for measurements at first
 
 
-# Of one step: its number, what was read, what the filter made of it, and where its robots were thought to be (K, 3).
-Entry = tuple[int, StepInput, StepReport, FloatArray]
-
-
-def write_down(entries: Sequence[Entry], logs: Sequence[RobotLog], smoother: RejuvenationStep | None) -> None:
-    """Enter into the logs of K robots, and tell the smoother, what some steps came to.
+class Journal:
+    """Steps that wait; kernels write into its arrays.
 
     Args:
-        entries: The steps in order.
-        logs: Of the robots; a step in which one did nothing and was given no measurement gets no row.
-        smoother: Of the filter, if it has one.
+        num_robots: K, of the filter.
+
+    Attributes:
+        steps: Numbers of the steps, T.
+        noted: (`LONGEST`, K, 10) float64. Of each step, of which T are written, and robot; see `_kernels.layout`.
+        measured: (>= n, 10) float64. What was measured in all of them, one robot's after the other's.
+        num_measured: n.
     """
-    for _, alike in groupby(entries, _robots_of):
-        _write_together(list(alike), logs, smoother)
 
+    __slots__ = ("measured", "noted", "num_measured", "steps")
 
-def _robots_of(entry: Entry) -> tuple[int, tuple[int, ...]]:
-    """Return how many robots there are readings of, and whose were taken in: these make steps alike."""
-    _, inputs, report, _ = entry
-    return len(inputs.turns), report.rows
+    def __init__(self, num_robots: int) -> None:
+        self.steps: list[int] = []
+        self.noted = np.empty((LONGEST, num_robots, NUM_NOTED))
+        self.measured = np.empty((ROOM, NUM_MEASURED))
+        self.num_measured = 0
 
+    def make_room(self, used: int) -> None:
+        """Provide room for so many more measurements."""
+        needed = self.num_measured + used
+        if needed > len(self.measured):
+            wider = np.empty((2 * needed, NUM_MEASURED))
+            wider[: self.num_measured] = self.measured[: self.num_measured]
+            self.measured = wider
 
-def _write_together(entries: Sequence[Entry], logs: Sequence[RobotLog], smoother: RejuvenationStep | None) -> None:
-    """Do what `write_down` does for steps that are alike."""
-    numbers, inputs, reports, means_then = zip(*entries, strict=True)
-    steps = np.array(numbers)
-    table = np.concatenate([read.table for read in inputs])
-    moves = np.concatenate([read.moves for read in inputs])
-    sightings = np.concatenate([read.sightings for read in inputs])
-    told, means = np.concatenate([report.findings.told for report in reports], axis=1), np.concatenate(means_then)
-    for robot, (row, log) in enumerate(zip(reports[0].rows, logs, strict=True)):
-        if row >= 0:
-            log.extend(row, steps, table, moves, sightings, told[ASSOCIATED])
+    def clear(self) -> None:
+        """Let no step wait any more."""
+        self.steps.clear()
+        self.num_measured = 0
+
+    def write_down(self, logs: Sequence[RobotLog], smoother: RejuvenationStep | None) -> None:
+        """Enter what waits into the logs of K robots, and tell the smoother of the filter, if it has one.
+
+        A step in which a robot did nothing and was given no measurement gets no row.
+        """
+        steps = np.array(self.steps)
+        noted, measured = self.noted[: len(steps)], self.measured[: self.num_measured]
+        for robot, log in enumerate(logs):
+            log.extend(robot, steps, noted, measured)
             if smoother is not None:
                 heard, poses = np.empty_like(steps), np.empty((len(steps), 3))
-                count, is_placed = write_guesses(row, robot, steps, table, means, heard, poses)
+                count, is_placed = write_guesses(robot, steps, noted, heard, poses)
                 smoother.note(robot, heard[:count], poses[:count], is_placed)
-                _tell_refused(smoother, robot, row, entries)
+        self.clear()
 
 
-def _tell_refused(smoother: RejuvenationStep, robot: int, row: int, entries: Sequence[Entry]) -> None:
-    """Tell the smoother what of a robot's measurements was neither matched nor new."""
-    for step, inputs, report, _ in entries:
-        if report.num_rejected:
-            _, begin, end, _, named, _ = inputs.turns[row]
-            if not named:
-                found = report.findings.told[ASSOCIATED, begin:end]
-                smoother.note_refused(robot, step, found, inputs.descriptors[begin:end])
+def tell_refused(smoother: RejuvenationStep, step: int, inputs: StepInput, seats: Seats, told: IntArray) -> None:
+    """Tell the smoother what of a step's measurements, those with names left out, was neither matched nor new."""
+    for robot, row in seats.heard:
+        _, begin, end, _, named, _ = inputs.turns[row]
+        if not named:
+            smoother.note_refused(robot, step, told[ASSOCIATED, begin:end], inputs.descriptors[begin:end])

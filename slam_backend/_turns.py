@@ -7,6 +7,7 @@ import numpy as np
 
 from slam_backend import _kernels
 from slam_backend._filter_arrays import FilterArrays
+from slam_backend._journal import LONGEST
 from slam_backend._kernels import IDLE, PLACED
 from slam_backend._kernels.layout import CREATED
 from slam_backend.errors import FloatArray, IntArray
@@ -58,7 +59,7 @@ def place(arrays: FilterArrays, robot: int, exact: FloatArray) -> None:
 def take_turns(slam: "FilterState", inputs: StepInput, seats: Seats, told: IntArray) -> tuple[Summary, list[IntArray]]:
     """Move all robots of a filter, match what they saw, weigh and update (Algorithm 1, l. 6-8), and sum it up.
 
-    Where one did and saw nothing no random number is drawn.
+    Where one did and saw nothing no random number is drawn. The step waits in the journal then.
 
     Args:
         slam: Its particles and their maps are changed, its estimates written.
@@ -70,7 +71,7 @@ def take_turns(slam: "FilterState", inputs: StepInput, seats: Seats, told: IntAr
         What all of it came to; and slots of landmarks that turned out not to exist, to be released when nobody asks for
         their ids.
     """
-    maps = slam._maps
+    maps, journal = slam._maps, slam._journal
     active = used = 0
     for robot, row in seats.heard:
         act, begin, end, _, _, _ = inputs.turns[row]
@@ -81,6 +82,9 @@ def take_turns(slam: "FilterState", inputs: StepInput, seats: Seats, told: IntAr
         maps.make_room(used, inputs.descriptors.shape[1])
         if len(slam._found) < len(inputs.sightings):
             slam._make_room_for(len(inputs.sightings))
+    if len(journal.steps) == LONGEST:
+        slam._write_down()
+    journal.make_room(used)
     now = 0 if slam._rejuvenation is None else slam._rejuvenation.steps + 1
     normals = slam._rng.standard_normal((active, maps.num_particles, 3))
     means, covariances = slam._estimates
@@ -92,10 +96,13 @@ def take_turns(slam: "FilterState", inputs: StepInput, seats: Seats, told: IntAr
             maps.values, maps.counts, maps.odds, maps.table, maps.maps, maps.users, maps.free_rows, maps.tops,
             maps.descriptors, maps.heads, inputs.sightings, inputs.descriptors, inputs.names,
             slam._found, slam._distances, told, means, covariances,
+            journal.noted[len(journal.steps)], journal.measured, journal.num_measured,
         )  # fmt: skip
         if slam._existence is not None and not is_over and (row := seats.rows[low]) >= 0:
             _, begin, end, _, _, count = inputs.turns[row]
             if count >= 0:
                 found, new_slots = slam._found[begin:end], told[CREATED, begin:end]
                 deserted.append(slam._existence.weigh(maps, slam._poses[low], slam._best, found, new_slots))
+    journal.steps.append(slam._steps)
+    journal.num_measured += used
     return summary, deserted

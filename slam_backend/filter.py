@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from slam_backend._journal import LONGEST
+from slam_backend._journal import tell_refused
 from slam_backend._rejuvenation_step import RejuvenationStep
 from slam_backend._step_input import check_step
 from slam_backend._turns import take_turns
@@ -175,9 +175,8 @@ class FastSlam(FilterKnowledge):
         summary, deserted = take_turns(self, inputs, seats, findings.told)
         self._best, long_unseen, created, new, matched, rejected, ess, nis, is_depleted = summary
         report = StepReport(findings, seats.rows, created, new, matched, rejected, ess, nis, is_depleted)
-        if len(self._journal) == LONGEST:
-            self._write_down()
-        self._journal.append((self._steps, inputs, report, self._estimates.means.copy()))
+        if rejected and self._rejuvenation is not None:
+            tell_refused(self._rejuvenation, self._steps, inputs, seats, findings.told)
         self._steps += 1
         for slots in deserted:
             self._maps.release(slots)

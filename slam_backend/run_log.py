@@ -7,8 +7,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from slam_backend import _kernels
-from slam_backend._kernels.layout import END
+from slam_backend._kernels.layout import COVERED, DID, LOGGED, MOTION, MOVED, NAME, PLACED, THOUGHT, USED
 from slam_backend._log_kernels import write_rows
 from slam_backend.errors import FloatArray, IntArray, bad_argument, check_array, check_choice, check_int
 from slam_backend.log_arrays import EXACT, ODOMETRY, REJECTED, STOOD, LogArrays, LogStep, join
@@ -117,16 +116,13 @@ class RobotLog:
                 self._room_for_descriptor_rows()[start:end] = REJECTED if descriptor_rows is None else descriptor_rows
         self._num_rows, self._num_measurements, self._last = t + 1, end, step
 
-    def extend(
-        self, row: int, steps: IntArray, table: IntArray, moves: FloatArray, sightings: FloatArray, ids: IntArray
-    ) -> None:
-        """Add the steps in which one of N robots did or measured anything, as `append` does one by one.
+    def extend(self, robot: int, steps: IntArray, noted: FloatArray, measured: FloatArray) -> None:
+        """Add the steps in which one of K robots did or measured anything, as `append` does one by one.
 
         Args:
-            row: Which robot.
+            robot: Which.
             steps: (T,) their indices in the run.
-            table, moves: (T N, 6), (T N, 3). Of all steps one after the other, as in `StepInput`.
-            sightings, ids: (n, 9), (n,). Likewise, and the landmarks, -1 = rejected.
+            noted, measured: (T, K, 10), (n, 10). Of all steps, as in a `Journal`.
 
         Raises:
             ValueError: If steps go back; the log then holds no more than the steps before.
@@ -136,30 +132,26 @@ class RobotLog:
             if self._covariances is None and self._descriptor_rows is None and steps[k] > self._last:
                 most = min(MEASUREMENTS, len(self._ids))
                 k, self._num_rows, self._num_measurements = write_rows(
-                    row, k, steps, table, moves, sightings, ids, most, self._num_rows, self._num_measurements,
+                    robot, k, steps, noted, measured, most, self._num_rows, self._num_measurements,
                     self._steps, self._kinds, self._motions, self._given, self._starts, self._points, self._ids,
                 )  # fmt: skip
                 if self._num_rows:
                     self._last = int(self._steps[self._num_rows - 1])
             if k < len(steps):  # what cannot stand there yet
-                self._append_turn(k, row, steps, table, moves, sightings, ids)
+                self._append_turn(k, robot, steps, noted, measured)
                 k += 1
 
-    def _append_turn(
-        self, k: int, row: int, steps: IntArray, table: IntArray, moves: FloatArray, sightings: FloatArray,
-        ids: IntArray,
-    ) -> None:  # fmt: skip
+    def _append_turn(self, k: int, robot: int, steps: IntArray, noted: FloatArray, measured: FloatArray) -> None:
         """Append what a robot did and measured in step k, if it did; the others are as of `extend`."""
-        turns, motions = table.reshape(len(steps), -1, 6), moves.reshape(len(steps), -1, 3)
-        act, begin, end, given, _, count = turns[k, row].tolist()
-        if act == _kernels.IDLE and count <= 0:
+        note = noted[k, robot]
+        if not note[LOGGED]:
             return
-        base = int(turns[:k, -1, END].sum())
-        own = slice(base + begin, base + end)
-        move = motions[k, row] if act in (_kernels.MOVED, _kernels.PLACED) else None
-        pose = move if act == _kernels.PLACED else None
-        spreads = sightings[own, 3:] if given and count else None
-        self.append(int(steps[k]), move, pose, sightings[own, :3], ids[own], spreads)
+        begin = int(noted[:k, :, USED].sum() + noted[k, :robot, USED].sum())
+        own = measured[begin : begin + int(note[USED])]
+        move = note[MOTION:THOUGHT] if note[DID] in (MOVED, PLACED) else None
+        pose = move if note[DID] == PLACED else None
+        spreads = own[:, 3:NAME] if note[COVERED] else None
+        self.append(int(steps[k]), move, pose, own[:, :3], own[:, NAME].astype(np.int64), spreads)
 
     def _refusal(
         self, step: int, odometry: Any, pose: Any, points: Any, ids: Any, covariances: Any, descriptor_rows: Any

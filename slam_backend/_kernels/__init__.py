@@ -21,13 +21,13 @@ g = A^T S^-1 r to the gradient. A gate takes S + A P A^T, with P the covariance 
 """
 
 from slam_backend._kernels.landmark_updates import YOUNG
-from slam_backend._kernels.layout import FAR, LANES, MIN_DEPTH
+from slam_backend._kernels.layout import FAR, IDLE, LANES, MIN_DEPTH, MOVED, PLACED, STOOD
 from slam_backend._kernels.particle_maps import gather, hold, outline
 from slam_backend._kernels.places import carry_odds, refresh
 from slam_backend._kernels.readings import extent, noises_to_robot_axes, read_team, to_robot_axes
 from slam_backend._kernels.resampling import resample
 from slam_backend._kernels.start_frames import stand
-from slam_backend._kernels.turns import IDLE, MOVED, PLACED, STOOD, take_turns, write_sigmas
+from slam_backend._kernels.turns import take_turns, write_sigmas
 from slam_backend._kernels.weights import add_share, mixture
 
 __all__ = [

@@ -43,6 +43,11 @@ POSES, STARTS, MEANS, COVARIANCES = range(4)
 LOG_WEIGHTS, PATH_LOG_WEIGHTS, WEIGHTS, LOG_LIKELIHOOD = range(4)
 ROW_OF, MAP_OF, IDS, IDENTITIES, LAST_SEEN, FREE_SLOTS = range(6)  # of the table of a map's slots, (6, slots)
 ACT, BEGIN, END, GIVEN, NAMED, COUNT = range(6)  # of a robot's turn
+IDLE, STOOD, MOVED, PLACED = 0, 1, 2, 3  # what a robot did: nothing at all, stood and looked, moved, was told its pose
+# What a journal holds of a robot's turn: whether it did or was given anything, what it did, whether its measurements
+# come with covariances, and how many were used; its odometry or pose (3), and where it was thought to be then (3).
+LOGGED, DID, COVERED, USED, MOTION, THOUGHT, NUM_NOTED = 0, 1, 2, 3, 4, 7, 10
+NAME, NUM_MEASURED = 9, 10  # of a measurement there, behind point and covariance: the landmark it was taken for
 ASSOCIATED, CREATED = range(2)  # what becomes of measurements, (2, n)
 # What a filter assumes: the first of six numbers, seven and three, and then one each.
 NOISE, CAMERA, RECOVERY = 0, 6, 13

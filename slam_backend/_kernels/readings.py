@@ -5,8 +5,7 @@ import math
 import numpy as np
 
 from slam_backend._jit import in_place
-from slam_backend._kernels.layout import ACT, BEGIN, COUNT, END, GIVEN, MIN_DEPTH, NAMED
-from slam_backend._kernels.turns import MOVED
+from slam_backend._kernels.layout import ACT, BEGIN, COUNT, END, GIVEN, MIN_DEPTH, MOVED, NAMED
 from slam_backend.errors import FloatArray, IntArray
 
 

@@ -5,6 +5,7 @@ import math
 from slam_backend._jit import in_place, room
 from slam_backend._kernels.fastslam1 import update_fastslam1
 from slam_backend._kernels.fastslam2 import update_fastslam2
+from slam_backend._kernels.journals import note_turns
 from slam_backend._kernels.layout import (
     ACT,
     AMBIGUITY,
@@ -20,6 +21,7 @@ from slam_backend._kernels.layout import (
     FREE_SLOTS,
     GIVEN,
     IDENTITIES,
+    IDLE,
     IDS,
     IS_ONE_TO_ONE,
     IS_SIGHTING,
@@ -29,8 +31,10 @@ from slam_backend._kernels.layout import (
     LONG,
     MAP_OF,
     MEANS,
+    MOVED,
     NAMED,
     NOISE,
+    PLACED,
     POSES,
     POSITION_GATE,
     RECOVERY,
@@ -42,8 +46,6 @@ from slam_backend._kernels.layout import (
 from slam_backend._kernels.motion import move_blind, take_as_exact
 from slam_backend._kernels.weights import conclude
 from slam_backend.errors import Float32Array, FloatArray, Int32Array, IntArray
-
-IDLE, STOOD, MOVED, PLACED = 0, 1, 2, 3  # what a robot did: nothing at all, stood and looked, moved, was told its pose
 
 
 @in_place
@@ -64,7 +66,7 @@ def take_turns(
     free_rows: IntArray, tops: IntArray, stored: Float32Array, heads: Float32Array,
     sightings: FloatArray, descriptors: Float32Array, names: IntArray,
     found: Int32Array, distances: FloatArray, told: IntArray,
-    mean: FloatArray, covariance: FloatArray,
+    mean: FloatArray, covariance: FloatArray, noted: FloatArray, measured: FloatArray, num_measured: int,
 ) -> tuple[int, int, int, int, int, int, float, float, bool]:  # fmt: skip
     """Move robots `low` to `high` - 1 in all particles, match, weigh and update landmarks (Algorithm 1, l. 6-8).
 
@@ -91,6 +93,7 @@ def take_turns(
         found, distances: (n, P), written as in `update_fastslam2`.
         told: (2, n), written: the slots of the landmarks that were started, -1 = none; in the end as in `summarise`.
         mean, covariance: (K, 3), (K, 3, 3), written in the end, as in `conclude`.
+        noted, measured, num_measured: Of a journal, likewise, see `note_turns`.
 
     Returns:
         What `conclude` returns; zeros before that.
@@ -152,7 +155,9 @@ def take_turns(
         blind[robot] = was_blind
     if not is_over:
         return 0, 0, 0, 0, 0, 0, 0.0, 0.0, False
-    return conclude(
+    summary = conclude(
         weights, num_particles, means, covariances, frame, mean, covariance, rows, turns, found, distances, told, ids,
         table[LAST_SEEN], now, assumed[LONG], assumed[RESAMPLE_THRESHOLD],
     )  # fmt: skip
+    note_turns(rows, turns, moves, sightings, told, mean, noted, measured, num_measured)
+    return summary

@@ -10,10 +10,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from same_bits import assert_same
 
+from slam_backend._journal import LONGEST, ROOM
 from slam_backend._kernels import IDLE, MOVED, PLACED
 from slam_backend._kernels import STOOD as STOOD_STILL
+from slam_backend._kernels.journals import note_turns
+from slam_backend._kernels.layout import DID, LOGGED, MOTION, NAME, NUM_MEASURED, NUM_NOTED, THOUGHT
 from slam_backend._log_kernels import write_guesses
+from slam_backend.filter import FastSlam
 from slam_backend.log_arrays import EXACT, ODOMETRY, STOOD
+from slam_backend.measurements import Measurements
 from slam_backend.run_log import MEASUREMENTS, ROWS, RobotLog
 
 Step = dict[str, Any]
@@ -203,52 +208,91 @@ def test_a_frame_larger_than_a_chunk(before: int) -> None:
 
 
 @pytest.mark.parametrize(("most", "optional", "together"), [(5, 0.0, 32), (90, 0.0, 7), (300, 0.0, 32), (5, 0.1, 3)])
-def test_steps_of_a_table_are_as_one_by_one(most: int, optional: float, together: int) -> None:
+def test_steps_of_a_journal_are_as_one_by_one(most: int, optional: float, together: int) -> None:
     """A log that is told of many robots' steps, some at a time, holds those of its own, as if they were appended."""
-    count, row, rng = 3, 1, np.random.default_rng(6)
+    count, own, rng = 3, 1, np.random.default_rng(6)
     log, expected = RobotLog(), RobotLog()
     for first in range(0, 2 * ROWS, together):
-        steps, turns, moves, sightings = np.arange(first, first + together), [], [], [np.empty((0, 9))]
-        ids = rng.integers(-1, 9, most * count * together)
-        last = 0
-        for step in steps.tolist():
-            end = 0
+        steps = np.arange(first, first + together)
+        measured, noted = [np.empty((0, NUM_MEASURED))], np.zeros((together, count, NUM_NOTED))
+        for k, step in enumerate(steps.tolist()):
             for robot in range(count):
                 n, act = int(rng.integers(0, most)) * int(rng.random() < 0.8), int(rng.choice([IDLE, MOVED, PLACED]))
-                begin, end, covered = end, end + n, rng.random() < optional
+                covered = n > 0 and rng.random() < optional
                 act = STOOD_STILL if n and act == IDLE else act
-                turns.append((act, begin, end, covered, False, n))
-                moves.append(rng.normal(size=3) * (act in (MOVED, PLACED)))
-                sightings.append(rng.normal(size=(n, 9)))
-                own = slice(last, last + n)
-                last += n
-                if robot == row and act != IDLE:
-                    motion, seen = moves[-1] if act in (MOVED, PLACED) else None, sightings[-1]
-                    pose, spreads = motion if act == PLACED else None, seen[:, 3:] if covered and n else None
-                    expected.append(step, motion, pose, seen[:, :3], ids[own], spreads)
-        table = np.array(turns, dtype=np.int64)
-        log.extend(row, steps, table, np.array(moves), np.concatenate(sightings), ids[:last])
+                motion, seen = rng.normal(size=3) * (act in (MOVED, PLACED)), rng.normal(size=(n, NUM_MEASURED))
+                seen[:, NAME] = rng.integers(-1, 9, n)
+                noted[k, robot, :MOTION] = act != IDLE, act, covered, n
+                noted[k, robot, MOTION:THOUGHT] = motion
+                measured.append(seen)
+                if robot == own and act != IDLE:
+                    move, pose = motion if act in (MOVED, PLACED) else None, motion if act == PLACED else None
+                    spreads, ids = seen[:, 3:NAME] if covered else None, seen[:, NAME].astype(np.int64)
+                    expected.append(step, move, pose, seen[:, :3], ids, spreads)
+        log.extend(own, steps, noted, np.concatenate(measured))
     assert len(log) > 1.5 * ROWS
     assert_same(log.get_state(), expected.get_state())
     with pytest.raises(ValueError, match="Log steps in order"):
-        log.extend(row, steps, table, np.array(moves), np.concatenate(sightings), ids[:last])
+        log.extend(own, steps, noted, np.concatenate(measured))
     assert_same(log.get_state(), expected.get_state())
 
 
+@given(st.lists(st.lists(st.tuples(st.integers(0, 3), st.integers(-1, 3), st.booleans()), min_size=4, max_size=4)))
+def test_a_journal_holds_what_robots_of_a_filter_did_and_measured(steps: list[list[tuple[int, int, bool]]]) -> None:
+    """Of four robots two, in the other order, and one that is nowhere; what else was measured is left out."""
+    rows, rng = np.array([2, -1, 0]), np.random.default_rng(4)
+    measured, expected, first = np.empty((12 * len(steps), NUM_MEASURED)), [], 0
+    for step in steps:
+        turns, end = np.zeros((4, 6), np.int64), 0
+        for robot, (act, count, covered) in enumerate(step):
+            turns[robot] = act, end, end + max(count, 0), covered, False, count
+            end += max(count, 0)
+        moves, sightings, told = rng.normal(size=(4, 3)), rng.normal(size=(end, 9)), rng.integers(-1, 50, (2, end))
+        means, noted = rng.normal(size=(3, 3)), np.empty((3, NUM_NOTED))
+        note_turns(rows, turns, moves, sightings, told, means, noted, measured, first)
+        assert not noted[1].any()
+        for robot in (0, 2):
+            act, begin, last, covered, _, count = turns[rows[robot]].tolist()
+            logged = act != IDLE or count > 0
+            assert noted[robot, :MOTION].tolist() == [logged, act, covered and count > 0, last - begin]
+            np.testing.assert_array_equal(noted[robot, MOTION:THOUGHT], moves[rows[robot]])
+            np.testing.assert_array_equal(noted[robot, THOUGHT:], means[robot])
+            columns = NAME if covered else 3
+            expected += [(*sightings[b, :columns], told[0, b]) for b in range(begin, last)]
+            first += last - begin
+    assert len(expected) == first
+    for seen, known in zip(measured[:first], expected, strict=True):
+        assert (*seen[: len(known) - 1], seen[NAME]) == known
+
+
+def test_a_filter_logs_all_that_it_was_given() -> None:
+    """Far more than a journal has room for at first, in more steps than wait; distances say which points they are."""
+    slam, rng, size = FastSlam(num_particles=2), np.random.default_rng(5), ROOM // 8
+    points = rng.uniform(1.0, 9.0, (LONGEST + 8, size, 3))
+    for frame in points:
+        slam.step([np.array([0.1, 0.0, 0.0])], [Measurements(frame, rng.normal(size=(size, 4)))])
+    logged = slam.log().arrays()
+    np.testing.assert_array_equal(logged.steps, np.arange(len(points)))
+    np.testing.assert_array_equal(np.diff(logged.starts), size)
+    np.testing.assert_array_equal(logged.motions, np.tile([0.1, 0.0, 0.0], (len(points), 1)))
+    np.testing.assert_allclose(
+        np.linalg.norm(logged.points, axis=1), np.linalg.norm(points, axis=2).ravel(), rtol=1e-12
+    )
+
+
 def test_guesses_are_of_the_steps_in_which_a_robot_did_or_measured_anything() -> None:
-    """One row for each of these, of one robot of the table and another number in the filter; whether it was told."""
-    count, size, num_steps, rng = 3, 2, 40, np.random.default_rng(8)
-    numbers, means = np.arange(7, 7 + num_steps), rng.normal(size=(num_steps * size, 3))
-    for row, acts in ((0, [IDLE, MOVED]), (2, [IDLE, STOOD_STILL, PLACED])):
-        table = np.zeros((num_steps * count, 6), np.int64)
-        table[:, 0], table[:, 5] = rng.choice(acts, len(table)), rng.integers(-1, 2, len(table))
-        turns = table.reshape(num_steps, count, 6)[:, row]
-        kept = [t for t, turn in enumerate(turns) if turn[0] != IDLE or turn[5] > 0]
-        assert 0 < len(kept) < num_steps
+    """One row for each of these, of one robot of the filter; whether it was told."""
+    num_steps, rng = 40, np.random.default_rng(8)
+    numbers, noted = np.arange(7, 7 + num_steps), rng.normal(size=(num_steps, 3, NUM_NOTED))
+    for robot, acts in ((0, [IDLE, MOVED]), (2, [IDLE, STOOD_STILL, PLACED])):
+        did = noted[:, robot, DID] = rng.choice(acts, num_steps)
+        kept = did != IDLE
+        noted[:, robot, LOGGED] = kept
         steps, poses = np.empty(num_steps, np.int64), np.empty((num_steps, 3))
-        num, is_placed = write_guesses(row, 1, numbers, table, means, steps, poses)
+        num, is_placed = write_guesses(robot, numbers, noted, steps, poses)
         np.testing.assert_array_equal(steps[:num], numbers[kept])
-        np.testing.assert_array_equal(poses[:num], means[1::size][kept])
+        np.testing.assert_array_equal(poses[:num], noted[kept, robot, THOUGHT:])
+        assert 0 < num < num_steps
         assert is_placed == (PLACED in acts)
 
 
