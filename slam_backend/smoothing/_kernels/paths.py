@@ -12,8 +12,8 @@ LANES = 52  # as in the filter, which takes over tiles as they are
 # Rows of a block of poses and of the workspace of `replay`.
 PX, PY, COS, SIN, HEADING = (LANES * k for k in range(5))
 POSE_ROWS = 5
-A00, A01, A02, A11, A12, A22, B0, B1, B2, ENERGY = (LANES * k for k in range(10))
-WORK_SIZE = 10 * LANES
+A00, A01, A02, A11, A12, B0, B1, B2, ENERGY = (LANES * k for k in range(9))
+WORK_SIZE = 9 * LANES
 
 
 @lanes
@@ -71,7 +71,8 @@ def replay(
             for i in range(WORK_SIZE):
                 work[i] = 0.0
             for i in range(LANES):
-                work[A00 + i] = work[A11 + i] = work[A22 + i] = WEAK
+                work[A00 + i] = work[A11 + i] = WEAK
+            h = WEAK  # of the height: the same however a path turns
             for q in range(first, last):
                 base = (block * num_keys + keys[q]) * POSE_ROWS * LANES
                 pose = poses[base : base + POSE_ROWS * LANES]
@@ -95,10 +96,10 @@ def replay(
                     work[A02 + i] += c * n2 - s * n4
                     work[A11 + i] += s * s * n0 + 2.0 * c * s * n1 + c * c * n3
                     work[A12 + i] += s * n2 + c * n4
-                    work[A22 + i] += n5
+                h += n5
             for i in range(LANES):
                 a, b, d = work[A00 + i], work[A01 + i], work[A02 + i]
-                e, f, h = work[A11 + i], work[A12 + i], work[A22 + i]
+                e, f = work[A11 + i], work[A12 + i]
                 p, q1, r = e * h - f * f, d * f - b * h, b * f - d * e
                 det = a * p + b * q1 + d * r
                 inverse = 1.0 / det
