@@ -39,7 +39,7 @@ class Phase:
 
 
 PHASES = (
-    Phase("physics", 25, ((Simulator, "drive"),)),
+    Phase("physics", 25, ((Simulator, "step"),)),
     Phase("landmark sensor", 40, ((LandmarkSensor, "measure"),)),
     Phase("scans", 20, ((Scan, "measure"),)),
     Phase("grid painting", 20, ((SharedGrids, "step"),)),
