@@ -134,7 +134,7 @@ class TeamBelief:
         renaming = self._team.merge(robot_a, robot_b, alignment, known)
         self._look_up_poses()
         self._grids.keep(self._tick + 1, renaming)
-        self._grids.meet(self._lineup.mates, self.points.starts)
+        self._grids.meet(self._tick + 1, self._lineup.mates, self.points.starts)
         return renaming
 
     def speaker(self, group: tuple[int, ...]) -> int:

@@ -1,40 +1,22 @@
 """`SharedGrids`: the robots' seen grids, what they tell each other of the floor, and how a wrong merge is wiped out."""
 
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import permutations
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from slam_backend.errors import BoolArray, FloatArray, IntArray
+from slam_backend.errors import BoolArray, FloatArray
 from slam_backend.geometry import compose, inverse
 from slam_backend.reports import MapDropped, MergeUndone, Renaming, TeamReport
 from slam_backend.standpoints import Standpoints
 from vslam_env.navigation import SeenGrid, TeamGrids, ray_directions
 from vslam_env.robot_belief import Body
+from vslam_env.strokes import Strokes, Telling, caught_up
 
-
-class Strokes(NamedTuple):
-    """What the readings of one tick wrote into the grids, as `TeamGrids.paint_readings` takes it.
-
-    Attributes:
-        tick: Of the readings.
-        shared: (K, K) int64. 1 where i's grid took what robot j read.
-        poses: (K, K, 3) [m, m, rad]. Where robot j was believed to be in i's start frame.
-        scans: (K, R) [m].
-        bumps: (K,) bool. Who bumped into something.
-    """
-
-    tick: int
-    shared: IntArray
-    poses: FloatArray
-    scans: FloatArray
-    bumps: BoolArray
-
-    def within(self, side: Sequence[int]) -> "Strokes":
-        """Return those of some robots' readings that went into these robots' grids."""
-        own = np.isin(np.arange(len(self.shared)), side)
-        return self._replace(shared=self.shared * own * own[:, None])
+TOGETHER, STRANGERS = -1, -2  # in place of the tick in which two robots lost each other
+LONGEST_ABSENCE = 1000  # [ticks] whoever is away for longer comes back as a stranger: to paint takes 10 us a tick
 
 
 class Kept(NamedTuple):
@@ -56,10 +38,12 @@ class Kept(NamedTuple):
 class SharedGrids:
     """The seen grids of a team, each in its robot's own start frame.
 
-    Robots that go by one filter paint what each of them scans into all of their grids. Those that come together, by a
-    merge or on return, absorb each other's grids; evidence is bounded, so that what both had already only gets firmer.
-    While a merge can be undone the grids from before it are kept, with what was painted since; an undo restores them
-    and paints again what the robots of each side scanned.
+    Robots that go by one filter paint what each of them scans into all of their grids. Those that come together for
+    the first time, by a merge, absorb each other's grids. Those that lost each other and return paint what their grids
+    miss of what was scanned meanwhile, so that no scan is painted twice: to absorb whole grids each time would add all
+    walls anew, a little thicker, to what came from the same scans. While a merge can be undone the grids from before
+    it are kept, with what was painted since; an undo restores them and paints again what the robots of each side
+    scanned.
 
     Args:
         num_robots: K.
@@ -73,7 +57,8 @@ class SharedGrids:
         self.team = TeamGrids(num_robots)
         self._grids = self.team.grids
         self._hardware = ray_directions(body.ray_angles), float(body.scan_range), float(body.radius)
-        self._settle([(robot,) for robot in range(num_robots)])
+        self._parted = np.full((num_robots, num_robots), STRANGERS)  # since which tick two do not share what they scan
+        self._settle(0, [(robot,) for robot in range(num_robots)])
         self._kept: list[Kept] = []
         self._strokes: deque[Strokes] = deque()
 
@@ -118,9 +103,9 @@ class SharedGrids:
         if report.entries or self._strokes:
             self._follow(tick, report)
         if mates != self._mates:
-            self.meet(mates, points.starts)
+            self.meet(tick, mates, points.starts)
         self.team.paint_readings(self._shared, points.poses, scans, bumps, *self._hardware)
-        if self._kept:
+        if self._kept or self._oldest_parting is not None:
             self._strokes.append(Strokes(tick, self._shared, points.poses.copy(), scans.copy(), bumps.copy()))
 
     def _follow(self, tick: int, report: TeamReport) -> None:
@@ -129,14 +114,18 @@ class SharedGrids:
             if isinstance(entry, Renaming) and entry in report.renamings:
                 self.keep(tick, entry)
             elif isinstance(entry, MergeUndone):
-                self._undo(entry)
+                self._undo(tick, entry)
             elif isinstance(entry, MapDropped):
                 self._kept = [kept for kept in self._kept if entry.number not in kept.maps[:2]]
+        if self._oldest_parting is not None and self._oldest_parting < tick - LONGEST_ABSENCE:
+            self._look_for_parted(tick)
         oldest = self._kept[0].tick if self._kept else tick  # both stand in order of time
+        if self._oldest_parting is not None:
+            oldest = min(oldest, self._oldest_parting)
         while self._strokes and self._strokes[0].tick < oldest:
             self._strokes.popleft()
 
-    def _undo(self, undone: MergeUndone) -> None:
+    def _undo(self, tick: int, undone: MergeUndone) -> None:
         """Restore the grids from before a merge and paint again what the robots of each side have scanned since."""
         kept = next((kept for kept in self._kept if kept.maps == undone.maps), None)
         if kept is None:
@@ -148,44 +137,65 @@ class SharedGrids:
             for strokes in self._strokes:
                 if strokes.tick >= kept.tick:
                     self.team.paint_readings(*strokes.within(side)[1:], *self._hardware)
+        one, two = kept.sides
+        self._parted[np.ix_(one, two)] = self._parted[np.ix_(two, one)] = STRANGERS
         side_of = {robot: side for side in kept.sides for robot in side}
-        self._settle(
-            [
-                tuple(mate for mate in mates if mate in side_of.get(robot, mates))
-                for robot, mates in enumerate(self._mates)
-            ]
-        )
+        mates = [
+            tuple(mate for mate in group if mate in side_of.get(robot, group))
+            for robot, group in enumerate(self._mates)
+        ]
+        self._settle(tick, mates)
 
-    def meet(self, mates: Sequence[tuple[int, ...]], starts: FloatArray) -> None:
-        """Let robots that have come together absorb what the others have seen.
+    def meet(self, tick: int, mates: Sequence[tuple[int, ...]], starts: FloatArray) -> None:
+        """Let robots that have come together absorb, or paint, what the others have seen.
 
         Args:
+            tick: Whose readings are painted next.
             mates: Per robot those that go by the same filter now, itself included.
             starts: (K, 3) [m, m, rad]. The motion from the map frame to each robot's start frame.
         """
-        for now in sorted(set(mates)):
-            before = sorted({tuple(mate for mate in self._mates[robot] if mate in now) for robot in now})
-            if len(before) > 1:
-                # Robots that were together have seen the same already, so that one of each part stands for all of it.
-                grids = [self._grids[part[0]].copy() for part in before]
-                for part in before:
-                    for other, grid in zip(before, grids, strict=True):
-                        if other is not part:
-                            for robot in part:
-                                own_from_other = compose(starts[robot], inverse(starts[other[0]]))
-                                self._grids[robot].absorb(grid, own_from_other)
-        self._settle(mates)
+        tellings = [telling for now in sorted(set(mates)) for telling in self._tellings(now, starts)]
+        if tellings:
+            grids = {telling.giver: self._grids[telling.giver].copy() for telling in tellings if telling.is_whole}
+            for telling in tellings:
+                if telling.is_whole:
+                    self._grids[telling.taker].absorb(grids[telling.giver], telling.motion)
+            history, missed = caught_up(self._strokes, tellings)
+            self._strokes = deque(history)
+            for strokes in missed:
+                self.team.paint_readings(*strokes[1:], *self._hardware)
+        self._settle(tick, mates)
 
-    def _settle(self, mates: Sequence[tuple[int, ...]]) -> None:
-        """Take note of who goes by the same filter as whom."""
+    def _tellings(self, now: tuple[int, ...], starts: FloatArray) -> Iterator[Telling]:
+        """Yield who of those who are together now is told by whom; of strangers one is told all that the other has."""
+        before = sorted({tuple(mate for mate in self._mates[robot] if mate in now) for robot in now})
+        for part, other in permutations(before, 2):
+            # Robots that were together have seen the same already, so that one of each part stands for all of it.
+            are_strangers = bool((self._parted[np.ix_(part, other)] == STRANGERS).any())
+            for robot in part:
+                yield Telling(other[0], robot, compose(starts[robot], inverse(starts[other[0]])), are_strangers)
+
+    def _settle(self, tick: int, mates: Sequence[tuple[int, ...]]) -> None:
+        """Take note of who goes by the same filter as whom from a tick on."""
         self._mates = tuple(mates)
-        self._shared = np.array([[robot in group for robot in range(len(mates))] for group in mates], np.int64)
+        together = np.array([[robot in group for robot in range(len(mates))] for group in mates])
+        self._shared = together.astype(np.int64)
+        self._parted[(self._parted == TOGETHER) & ~together] = tick
+        self._parted[together] = TOGETHER
+        self._look_for_parted(tick)
+
+    def _look_for_parted(self, tick: int) -> None:
+        """Note since when strokes are needed because robots lost each other; forget who has been away for long."""
+        self._parted[(self._parted >= 0) & (self._parted < tick - LONGEST_ABSENCE)] = STRANGERS
+        since = self._parted[self._parted >= 0]
+        self._oldest_parting = int(since.min()) if len(since) else None
 
     def get_state(self) -> dict[str, Any]:
         """Return all that decides how the grids go on; what is never written to is shared."""
         return {
             "grids": [grid.get_state() for grid in self._grids],
             "mates": self._mates,
+            "parted": self._parted.copy(),
             "kept": tuple(self._kept),
             "strokes": tuple(self._strokes),
         }
@@ -194,5 +204,6 @@ class SharedGrids:
         """Go on as the grids that gave `state`, in place: views of them follow."""
         for grid, seen in zip(self._grids, state["grids"], strict=True):
             grid.set_state(seen)
-        self._settle(state["mates"])
+        self._parted[:] = state["parted"]
+        self._settle(0, state["mates"])
         self._kept, self._strokes = list(state["kept"]), deque(state["strokes"])

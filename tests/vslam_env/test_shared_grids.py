@@ -1,0 +1,150 @@
+"""Grids of robots that lose each other and return hold what those hold that were never apart."""
+
+import numpy as np
+import pytest
+from navigation_rooms import ANGLES, MAX_RANGE, building, cast
+from small_env import MEETING, small_env, turning
+
+from slam_backend.findings import Findings
+from slam_backend.geometry import between, compose, inverse
+from slam_backend.reports import TeamReport
+from slam_backend.standpoints import Standpoints
+from vslam_env.navigation import OCCUPIED, UNKNOWN
+from vslam_env.robot_belief import Body
+from vslam_env.shared_grids import LONGEST_ABSENCE, SharedGrids
+from vslam_env.strokes import Strokes, Telling, caught_up
+
+BODY = Body(radius=0.2, ray_angles=ANGLES, scan_range=MAX_RANGE)
+STARTS = np.array([[7.3, 2.5, 1.5], [8.6, 1.8, 2.1], [6.2, 2.9, -2.0]])  # of three robots, in one room of the building
+NEAR, FAR = [5.4, 0.4, -4.0], [9.6, 4.1, 4.0]  # corners of that room; headings as they come
+ALL, NONE = ((0, 1, 2),) * 3, ((0,), (1,), (2,))
+NOTHING = np.empty(0, np.int64)
+Mates = tuple[tuple[int, ...], ...]
+
+
+def stand(path: np.ndarray) -> Standpoints:
+    """Return where robots at true poses (3, 3) believe themselves and each other to be, who know it well."""
+    points = Standpoints(3)
+    for own in range(3):
+        points.poses[own] = between(STARTS[own], path)
+        points.starts[own] = inverse(STARTS[own])  # the map frame is that of the building
+    points.own[:] = points.poses[np.arange(3), np.arange(3)]
+    return points
+
+
+class Drive:
+    """Three robots in a building, whose grids follow them.
+
+    Args:
+        seed: Of where they drive.
+    """
+
+    def __init__(self, seed: int) -> None:
+        self.grids, self.tick = SharedGrids(3, BODY), 0
+        self._rng, self._path = np.random.default_rng(seed), STARTS.copy()
+
+    def on(self, mates: Mates) -> None:
+        """Drive on for a tick, with these in contact."""
+        way = self._rng.uniform([-0.05, -0.05, -0.2], [0.15, 0.05, 0.2], (3, 3))
+        self._path = np.clip(compose(self._path, way), NEAR, FAR)
+        scans = np.array([cast(building(), pose) for pose in self._path])
+        report = TeamReport(
+            self.tick, Findings.gathered([NOTHING], [NOTHING]), mates, (), (), (0, 0, 0), (), self.tick + 1
+        )
+        self.grids.step(self.tick, report, mates, stand(self._path), scans, np.zeros(3, np.bool_))
+        self.tick += 1
+
+    def cells(self) -> np.ndarray:
+        """Return all verdicts (3, 300, 300)."""
+        return np.array([self.grids[robot].cells for robot in range(3)])
+
+
+def parted(rng: np.random.Generator) -> Mates:
+    """Return who is in contact with whom where any link may fail."""
+    patterns: list[Mates] = [ALL, NONE, ((0, 1), (0, 1), (2,)), ((0, 2), (1,), (0, 2)), ((0,), (1, 2), (1, 2))]
+    return patterns[int(rng.integers(len(patterns)))]
+
+
+@pytest.mark.parametrize("seed", range(100, 104))
+def test_robots_that_return_hold_what_those_hold_that_never_parted(seed: int) -> None:
+    """But for the order of what was painted: each scan went into each grid once, whoever told whom of it."""
+    rng, lossy, steady = np.random.default_rng(seed), Drive(seed), Drive(seed)
+    for drive, patterns in ((steady, [ALL] * 150), (lossy, [ALL] + [parted(rng) for _ in range(148)] + [ALL])):
+        for mates in patterns:
+            drive.on(mates)
+    ours, theirs = lossy.cells(), steady.cells()
+    assert ((ours == UNKNOWN) == (theirs == UNKNOWN)).all()
+    assert (ours != theirs).sum() < 0.01 * (theirs != UNKNOWN).sum()
+
+
+def test_meeting_again_without_having_read_anything_new_changes_nothing() -> None:
+    """However often, in whatever frames."""
+    drive = Drive(100)
+    for _ in range(20):
+        drive.on(ALL)
+    before = drive.cells()
+    points = stand(STARTS)
+    for tick in range(drive.tick, drive.tick + 50):
+        drive.grids.meet(tick, NONE, points.starts)
+        drive.grids.meet(tick, ALL, points.starts)
+    assert (drive.cells() == before).all()
+
+
+def test_whoever_was_away_for_long_is_told_in_one_piece_and_nothing_is_kept_for_longer() -> None:
+    """What is kept of the time apart is bounded; after it they absorb each other's grids."""
+    drive = Drive(100)
+    drive.on(ALL)
+    for _ in range(LONGEST_ABSENCE + 5):
+        drive.on(((0, 1), (0, 1), (2,)))
+        assert len(drive.grids.get_state()["strokes"]) <= LONGEST_ABSENCE + 1
+    assert not drive.grids.get_state()["strokes"]
+    alone = drive.cells()
+    drive.on(ALL)
+    known = drive.cells() != UNKNOWN
+    assert (known.sum(axis=(1, 2)) > (alone != UNKNOWN).sum(axis=(1, 2)))[2]
+
+
+def test_restored_grids_know_what_was_missed() -> None:
+    """A state taken while robots are apart goes on to the same cells."""
+    rng, drive = np.random.default_rng(100), Drive(100)
+    for mates in [ALL] * 3 + [parted(rng) for _ in range(20)]:
+        drive.on(mates)
+    other = SharedGrids(3, BODY)
+    other.set_state(drive.grids.get_state())
+    points, nothing = stand(STARTS), np.full((3, len(ANGLES)), MAX_RANGE)
+    report = TeamReport(drive.tick, Findings.gathered([NOTHING], [NOTHING]), ALL, (), (), (0, 0, 0), (), drive.tick + 1)
+    for grids in (drive.grids, other):
+        grids.step(drive.tick, report, ALL, points, nothing, np.zeros(3, np.bool_))
+    for robot in range(3):
+        assert (drive.grids[robot].cells == other[robot].cells).all()
+
+
+def test_what_is_told_is_told_once() -> None:
+    """Of two that hold the same, one tells it; what is known is noted, not told; others hand on what they were told."""
+    shared = np.array([[1, 1, 0], [1, 1, 0], [0, 0, 1]])
+    strokes = Strokes(7, shared, np.zeros((3, 3, 3)), np.ones((3, 2)), np.zeros(3, np.bool_))
+    motion = np.array([1.0, 2.0, 0.5])
+    tellings = [Telling(0, 2, motion, False), Telling(1, 2, motion, False), Telling(2, 0, -motion, True)]
+    (after,), (missed,) = caught_up([strokes], tellings)
+    assert missed.shared.tolist() == [[0, 0, 0], [0, 0, 0], [1, 1, 0]]
+    assert after.shared.tolist() == [[1, 1, 1], [1, 1, 0], [1, 1, 1]]
+    np.testing.assert_array_equal(missed.poses[2, :2], [motion, motion])
+    (later,), (missed,) = caught_up([after], [Telling(0, 1, motion, False)])
+    assert later.shared.all()
+    assert missed.shared.tolist() == [[0, 0, 0], [0, 0, 1], [0, 0, 0]]
+    assert strokes.shared is shared
+    assert shared.sum() == 5
+    assert caught_up([], tellings) == ([], [])
+
+
+def test_radios_that_lose_half_leave_walls_as_thin_as_they_are() -> None:
+    """In an environment: as many cells are occupied, to a fifth, as where nothing is lost."""
+    occupied = []
+    for loss in (0.0, 0.5):
+        env = small_env(comm_loss=loss, oracle_merge=True, max_cycles=200)
+        env.reset(seed=100, options={"start_poses": MEETING})
+        while env.agents:
+            env.step(turning(env.agents))
+        assert env.belief("robot_0").group == (0, 1)
+        occupied.append(sum(int((env.belief(agent).grid.cells == OCCUPIED).sum()) for agent in env.possible_agents))
+    assert occupied[1] < 1.2 * occupied[0]
