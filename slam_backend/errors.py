@@ -1,5 +1,7 @@
 """The one form in which bad input is refused: argument, what was expected, what came, and the cure."""
 
+import math
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -10,6 +12,8 @@ Float32Array = NDArray[np.float32]
 IntArray = NDArray[np.int64]
 Int32Array = NDArray[np.int32]
 BoolArray = NDArray[np.bool_]
+
+NUMBERS = "biuf"  # kinds of dtypes that are real numbers
 
 
 def bad_argument(name: str, expected: str, got: object, cure: str) -> ValueError:
@@ -28,26 +32,38 @@ def bad_argument(name: str, expected: str, got: object, cure: str) -> ValueError
     num_particles: expected an int >= 1, got 0. Use at least one particle.
     """
     described = isinstance(got, str) and got.startswith(("shape ", "an array ", "a ", "'", "no ", "NaN"))
-    text = str(got) if described else repr(got)
+    text = str(got) if described else _shown(got)
     if len(text) > 80:
         text = text[:77] + "..."
     return ValueError(f"{name}: expected {expected}, got {text}. {cure}")
 
 
-def check_int(name: str, value: Any, minimum: int, cure: str) -> int:
-    """Return `value` as an int, or raise if it is not an integer (bools are not) or below `minimum`.
+def _shown(got: object) -> str:
+    """Return the `repr` of something, or its type where that fails."""
+    try:
+        return repr(got)
+    except Exception:  # an int of 5000 digits has none, and an object of the caller's may raise anything
+        return f"a {type(got).__name__} that cannot be shown"
+
+
+def check_int(name: str, value: Any, minimum: int, cure: str, maximum: int | None = None) -> int:
+    """Return `value` as an int, or raise if it is not an integer (bools are not) or out of bounds.
 
     Args:
         name: The argument as the caller wrote it.
         value: What came.
         minimum: The least that is accepted.
         cure: What to do about another, a full sentence.
+        maximum: The most that is accepted; None: any.
 
     Raises:
         ValueError: As `bad_argument` words it.
     """
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < minimum:
+    is_int = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+    if not is_int or value < minimum:
         raise bad_argument(name, f"an int >= {minimum}", value, cure)
+    if maximum is not None and value > maximum:
+        raise bad_argument(name, f"an int <= {maximum}", value, cure)
     return int(value)
 
 
@@ -80,16 +96,19 @@ def check_float(
         expected += f" >= {at_least:g}"
     if at_most is not None:
         expected += f" and <= {at_most:g}" if (above is not None or at_least is not None) else f" <= {at_most:g}"
-    number_like = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
+    try:
+        is_number = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
+        number = float(value) if is_number else math.nan
+    except OverflowError:  # an int beyond all floats
+        number = math.inf
     if (
-        not number_like
-        or not np.isfinite(value)
-        or (above is not None and value <= above)
-        or (at_least is not None and value < at_least)
-        or (at_most is not None and value > at_most)
+        not math.isfinite(number)
+        or (above is not None and number <= above)
+        or (at_least is not None and number < at_least)
+        or (at_most is not None and number > at_most)
     ):
         raise bad_argument(name, expected, value, cure)
-    return float(value)
+    return number
 
 
 def check_seed(seed: Any) -> Any:
@@ -127,6 +146,7 @@ def check_array(
     *,
     dtype: Any = np.float64,
     finite: bool = True,
+    within: float | None = None,
 ) -> NDArray[Any]:
     """Return `value` as a fresh C-ordered array of `dtype`, or raise if its shape or content is wrong.
 
@@ -135,8 +155,9 @@ def check_array(
         value: Anything that numpy can read.
         shape: Expected shape, None for a free axis.
         cure: What to do about it.
-        dtype: Of the result.
+        dtype: Of the result; None: as it comes.
         finite: Refuse NaN and infinity.
+        within: Refuse larger numbers, by magnitude.
 
     Returns:
         An array of that shape. Integer dtypes accept floats only if these are whole numbers.
@@ -144,32 +165,54 @@ def check_array(
     Raises:
         ValueError: As `bad_argument` words it.
     """
-    if np.issubdtype(dtype, np.integer):
-        _check_whole(name, value, cure)
-    if isinstance(value, np.ndarray) and value.dtype.kind == "c":  # numpy would drop a part
-        raise bad_argument(name, "real numbers", f"an array of {value.dtype}", cure)
-    try:
-        array = np.array(value, dtype=dtype, order="C")
-    except (TypeError, ValueError) as error:
-        raise bad_argument(name, f"an array of shape {_shape_text(shape)}", value, cure) from error
+    given = value if type(value) is np.ndarray and value.dtype.kind in NUMBERS else _read(name, value, shape, cure)
+    is_ready = dtype is None or given.dtype == dtype
+    array = np.array(given, order="C") if is_ready else _cast(name, value, given, dtype, cure)
     if array.ndim != len(shape) or any(s is not None and s != n for s, n in zip(shape, array.shape, strict=True)):
         raise bad_argument(name, f"an array of shape {_shape_text(shape)}", f"shape {array.shape}", cure)
     if finite and array.size and not np.isfinite(array).all():
         where = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
+        if np.isfinite(given[where]):
+            raise bad_argument(name, f"numbers that {array.dtype} can hold", given[where].item(), cure)
         raise bad_argument(name, "finite numbers", f"NaN or infinity at index {where}", cure)
+    if within is not None and array.size and (largest := float(np.abs(array).max())) > within:
+        raise bad_argument(name, f"numbers within +-{within:g}", largest, cure)
     return array
+
+
+def _read(name: str, value: Any, shape: tuple[int | None, ...], cure: str) -> NDArray[Any]:
+    """Return what is not plainly an array of real numbers as one, perhaps the caller's own, or raise."""
+    expected = f"an array of shape {_shape_text(shape)}"
+    if isinstance(value, np.ma.MaskedArray) and np.ma.is_masked(value):  # numpy would take what the mask hides
+        raise bad_argument(name, expected, "a masked array with hidden entries", cure)
+    try:
+        given = np.asarray(value)
+        if given.dtype.kind == "O" and all(isinstance(entry, Real) for entry in given.flat):
+            given = np.asarray(given.tolist())  # of the kind that the numbers have
+            given = given.astype(np.float64) if given.dtype.kind == "O" else given
+    except (TypeError, ValueError, OverflowError) as error:
+        raise bad_argument(name, expected, value, cure) from error
+    if given.dtype.kind not in NUMBERS:  # of complex numbers numpy would drop a part, and it would read texts
+        got = f"an array of {given.dtype}" if given.dtype.kind == "c" else value
+        raise bad_argument(name, expected + " of real numbers", got, cure)
+    return given
+
+
+def _cast(name: str, value: Any, given: NDArray[Any], dtype: Any, cure: str) -> NDArray[Any]:
+    """Return the numbers `given`, read from `value`, as a fresh array of `dtype`, or raise if they are none of these.
+
+    Only integers are asked for that here; what is too large for floats becomes infinite.
+    """
+    if np.issubdtype(dtype, np.integer):
+        if given.dtype.kind == "f" and not np.array_equal(given, np.rint(given)):
+            raise bad_argument(name, "whole numbers", value, cure)
+        bounds = np.iinfo(dtype)
+        if given.size and not bounds.min <= given.min().item() <= given.max().item() <= bounds.max:
+            raise bad_argument(name, f"whole numbers that {np.dtype(dtype)} can hold", value, cure)
+    with np.errstate(over="ignore"):  # infinity is refused by the caller
+        return np.array(given, dtype=dtype, order="C")
 
 
 def _shape_text(shape: tuple[int | None, ...]) -> str:
     """Write a shape with `n` for free axes."""
     return "(" + ", ".join("n" if s is None else str(s) for s in shape) + ("," if len(shape) == 1 else "") + ")"
-
-
-def _check_whole(name: str, value: Any, cure: str) -> None:
-    """Raise if `value` holds floats that are not whole; what is no array at all is left to the caller."""
-    try:
-        floats = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        return
-    if not np.array_equal(floats, np.rint(floats)):
-        raise bad_argument(name, "whole numbers", value, cure)

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from slam_backend.errors import FloatArray, bad_argument
+from slam_backend.errors import FloatArray, bad_argument, check_array
 from vslam_env.observation import NUM_ACTIONS
 
 MAX_SPEED, MAX_REVERSE, MAX_TURN = 1.0, 0.3, 1.5  # [m/s], [m/s], [rad/s]
@@ -75,15 +75,10 @@ def _continuous_commands(actions: Mapping[str, Any], agents: Sequence[str]) -> F
 def _pair(agent: str, action: Any) -> tuple[float, float]:
     """Return two numbers in any form as floats, or raise."""
     name = f"actions[{agent!r}]"
-    try:
-        array = np.asarray(action)
-    except (TypeError, ValueError) as error:
-        raise bad_argument(name, "an array of shape (2,)", action, PAIR_CURE) from error
-    if array.dtype.kind not in "fiu":  # text and complex numbers could be turned into floats, but mean something else
+    speed, turn = check_array(name, action, (2,), PAIR_CURE, finite=False).tolist()
+    parts = np.asarray(action, dtype=object).tolist()
+    if any(isinstance(part, (bool, np.bool_)) for part in parts):  # they could be turned into floats, but are no speeds
         raise bad_argument(name, "an array of shape (2,) of real numbers", action, PAIR_CURE)
-    if array.shape != (2,):
-        raise bad_argument(name, "an array of shape (2,)", f"shape {array.shape}", PAIR_CURE)
-    speed, turn = map(float, array.tolist())
     return speed, turn
 
 

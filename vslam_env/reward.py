@@ -10,7 +10,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from slam_backend.errors import FloatArray, bad_argument, check_float
+from slam_backend.errors import bad_argument, check_array, check_float
 from vslam_env.standing import COLLISIONS, DISTANCES, FOUND, MAP_ERRORS, PLACED_RECALLS, POSE_SIGMAS, Standing
 
 __all__ = [
@@ -167,12 +167,12 @@ def _own(term: RewardTerm, before: Standing, after: Standing) -> list[float]:
 
 
 def _floats(given: Any) -> list[float]:
-    """Return what a term of one's own gave as a list; an empty one if it is no row of numbers."""
+    """Return what a term of one's own gave as a list; an empty one if it is no row of finite numbers."""
     try:
-        row: FloatArray = np.asarray(given, dtype=np.float64)
-    except (TypeError, ValueError):  # no numbers at all
+        row: list[float] = check_array("reward", given, (None,), "Return one number for each robot.").tolist()
+    except ValueError:
         return []
-    return row.tolist() if row.ndim == 1 else []
+    return row
 
 
 def totals(rewards: Mapping[str, Sequence[float]]) -> list[float]:

@@ -223,4 +223,8 @@ def _numbers(file: Path, text: str, key: str, counts: tuple[int, ...]) -> FloatA
         expected = f"{file.name} with {counts[0]} numbers {key!r}"
         raise bad_argument("calibration", expected, f"a list of {len(words)}", f"Get {str(file)!r} again.")
     cure = f"Correct {key!r} in {str(file)!r}."
-    return np.asarray(check_array("calibration", words, (len(words),), cure))
+    try:
+        numbers = [float(word) for word in words]
+    except ValueError as error:
+        raise bad_argument("calibration", f"numbers after {key!r}", words, cure) from error
+    return np.asarray(check_array("calibration", numbers, (len(words),), cure))

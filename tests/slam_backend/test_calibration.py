@@ -72,7 +72,7 @@ def test_euroc_files_are_read_with_their_remarks(tmp_path: Path) -> None:
         ("radial-tangential", "equidistant", "calibration: expected the distortion model radial-tangential, got"),
         ("-1.0, 0.0, 0.1", "-2.0, 0.0, 0.1", "calibration: expected sensor.yaml with a rigid motion T_BS"),
         ("401,", "-401,", "calibration.intrinsics: expected a finite number > 0"),
-        ("400.5,", "x,", "calibration: expected an array of shape"),
+        ("400.5,", "x,", "calibration: expected numbers after 'intrinsics', got "),
     ],
 )
 def test_broken_euroc_files_are_named(tmp_path: Path, before: str, after: str, message: str) -> None:

@@ -128,6 +128,18 @@ CASES: dict[str, tuple[Callable[[], Any], str]] = {
         _step({"robot_0": [0, 0], "robot_1": [0, 0]}, reward=[_Returns(["a", "b"])]),
         "reward term 'given': expected 2 finite numbers, got \\['a', 'b'\\]",
     ),
+    "reward of numbers as texts": (
+        _step({"robot_0": [0, 0], "robot_1": [0, 0]}, reward=[_Returns(["1", "2"])]),
+        "reward term 'given': expected 2 finite numbers, got \\['1', '2'\\]",
+    ),
+    "complex reward": (
+        _step({"robot_0": [0, 0], "robot_1": [0, 0]}, reward=[_Returns([1j, np.complex128(1.0)])]),
+        "reward term 'given': expected 2 finite numbers, got ",
+    ),
+    "reward beyond all numbers": (
+        _step({"robot_0": [0, 0], "robot_1": [0, 0]}, reward=[_Returns([10**400, 0])]),
+        "reward term 'given': expected 2 finite numbers, got \\[1000",
+    ),
     "reward by name of a robot": (
         _step({"robot_0": [0, 0], "robot_1": [0, 0]}, reward=[_Returns({"robot_0": 1.0})]),
         "reward term 'given': expected 2 finite numbers, got {'robot_0': 1.0}",
@@ -138,6 +150,10 @@ CASES: dict[str, tuple[Callable[[], Any], str]] = {
         "reward: expected terms whose name is a text, got 3",
     ),
     "weight that is NaN": (lambda: small_env(reward={"map_error": float("nan")}), "reward.*map_error.*finite number"),
+    "weight beyond all numbers": (
+        lambda: small_env(reward={"map_error": 10**400}),
+        "reward.*map_error.*: expected a finite number, got 1000",
+    ),
     "negative seed": (_reset(seed=-1), "seed: expected an int >= 0, got -1"),
     "seed as text": (_reset(seed="x"), "seed: expected an int >= 0, got 'x'"),
     "options as list": (_reset(options=[1]), r"options: expected a dict or None, got \[1\]"),
@@ -149,6 +165,22 @@ CASES: dict[str, tuple[Callable[[], Any], str]] = {
     "start that is NaN": (
         _reset(options={"start_poses": [[np.nan, 3, 0], [4, 4, 0]]}),
         "start_poses: expected finite numbers",
+    ),
+    "start that no number can be": (
+        _reset(options={"start_poses": [[10**400, 3, 0], [4, 4, 0]]}),
+        r"start_poses: expected an array of shape \(2, 3\), got",
+    ),
+    "start beyond all maps": (
+        _reset(options={"start_poses": [[1e308, 3, 0], [4, 4, 0]]}),
+        r"start_poses: expected numbers within \+-1e\+08, got 1e\+308",
+    ),
+    "starts as texts": (
+        _reset(options={"start_poses": [["3", 3, 0], [4, 4, 0]]}),
+        r"start_poses: expected an array of shape \(2, 3\) of real numbers, got \[\['3', 3, 0\]",
+    ),
+    "complex starts": (
+        _reset(options={"start_poses": [[np.complex128(3), 3, 0], [4, 4, 0]]}),
+        r"start_poses: expected an array of shape \(2, 3\) of real numbers, got an array of complex128",
     ),
     "start in a wall": (
         _reset(options={"start_poses": [[3, 3, 0], [0.1, 5, 0]]}),
@@ -196,6 +228,14 @@ CASES: dict[str, tuple[Callable[[], Any], str]] = {
         _step({"robot_0": np.array([True, False]), "robot_1": [0, 0]}),
         r"actions\['robot_0'\]: expected an array of shape \(2,\) of real numbers",
     ),
+    "action of a number and a truth value": (
+        _step({"robot_0": [True, 0.5], "robot_1": [0, 0]}),
+        r"actions\['robot_0'\]: expected an array of shape \(2,\) of real numbers, got \[True, 0.5\]",
+    ),
+    "masked action": (
+        _step({"robot_0": np.ma.masked_equal([0.5, 0.1], 0.1), "robot_1": [0, 0]}),
+        r"actions\['robot_0'\]: expected an array of shape \(2,\), got a masked array with hidden entries",
+    ),
     "action with an axis too many": (
         _step({"robot_0": np.zeros((2, 1)), "robot_1": [0, 0]}),
         r"actions\['robot_0'\]: expected an array of shape \(2,\), got shape \(2, 1\)",
@@ -219,7 +259,19 @@ CASES: dict[str, tuple[Callable[[], Any], str]] = {
     "walls nested without end": (_world_file("plan.json", b"[" * 100_000), "world: expected a JSON file"),
     "walls as text": (
         _world_file("plan.json", b'{"walls": "all"}'),
-        r"world\.walls: expected an array of shape \(n, 4\), got 'all'.* The file is .*plan\.json\.$",
+        r"world\.walls: expected an array of shape \(n, 4\) of real numbers, got 'all'.* The file is .*plan\.json\.$",
+    ),
+    "walls of texts": (
+        _world_file("plan.json", b'{"walls": [["0", 0, 9, 0]]}'),
+        r"world\.walls: expected an array of shape \(n, 4\) of real numbers, got \[\['0', 0, 9, 0\]\]",
+    ),
+    "walls beyond all numbers": (
+        _world_file("plan.json", b'{"walls": [[0, 0, 1' + b"0" * 400 + b", 0]]}"),
+        r"world\.walls: expected an array of shape \(n, 4\), got \[\[0, 0, 1000",
+    ),
+    "walls beyond all maps": (
+        _world_file("plan.json", b'{"walls": [[-1e308, 0, 1e308, 0]]}'),
+        r"world\.walls: expected numbers within \+-1e\+08, got 1e\+308",
     ),
     "no landmarks": (_reset(world=_blank_world(np.zeros((0, 3)))), "world: expected landmarks that robots can see"),
     "landmarks out of sight": (

@@ -91,10 +91,14 @@ def test_readings_of_a_team_are_those_of_its_robots() -> None:
     ("name", "value", "message"),
     [
         ("odometry", np.zeros(2), r"readings\[1\]\.odometry: expected an array of shape \(3,\), got shape \(2,\)"),
-        ("odometry", "ahead", r"readings\[1\]\.odometry: expected an array of shape \(3,\), got 'ahead'"),
+        (
+            "odometry",
+            "ahead",
+            r"readings\[1\]\.odometry: expected an array of shape \(3,\) of real numbers",
+        ),
         ("odometry", [0.0, np.nan, 0.0], r"readings\[1\]\.odometry: expected finite numbers, got NaN"),
         ("measurements", None, r"readings\[1\]\.measurements: expected an array, got None"),
-        ("scan", "far", r"readings\[1\]\.scan: expected an array of shape \(32,\), got 'far'"),
+        ("scan", "far", r"readings\[1\]\.scan: expected an array of shape \(32,\) of real numbers, got 'far'"),
         ("bump", np.zeros(2, np.bool_), r"readings\[1\]\.bump: expected an array of shape \(\), got shape \(2,\)"),
         ("pose", np.zeros(2), r"readings\[1\]\.pose: expected an array of shape \(3,\), got shape \(2,\)"),
         ("heard", np.ones(3, np.bool_), r"readings\[1\]\.heard: expected an array of shape \(2,\), got shape \(3,\)"),

@@ -10,7 +10,7 @@ from slam_backend.errors import BoolArray, FloatArray, bad_argument, check_array
 from slam_backend.geometry import wrap_angle
 from vslam_env.world.clearance import clearance_raster, distances_to_walls
 from vslam_env.world.sight_kernels import cast_scans, rays_at, seen_from_somewhere
-from vslam_env.world.spec import Landmarks, World
+from vslam_env.world.spec import FARTHEST_PLACE, Landmarks, World
 from vslam_env.world.visibility import view_limits, visible_landmarks
 
 CELL = 0.1  # [m] side of a raster cell
@@ -186,7 +186,7 @@ class FreeSpace:
                 overlaps another. The message names the robot.
         """
         cure = "Give one row x y theta, in metres and radians, for each robot."
-        starts = check_array("start_poses", start_poses, (num_robots, 3), cure)
+        starts = check_array("start_poses", start_poses, (num_robots, 3), cure, within=FARTHEST_PLACE)
         starts[:, 2] = wrap_angle(starts[:, 2])
         gaps = distances_to_walls(starts[:, :2], self.world.walls)
         near = self._near_reachable(starts[:, :2])

@@ -10,6 +10,7 @@ from slam_backend.errors import FloatArray, IntArray, bad_argument, check_array
 
 SHORTEST_WALL = 1e-3  # [m] anything shorter has no direction worth the name
 LARGEST_EXTENT = 200.0  # [m] grids of free space grow with its square
+FARTHEST_PLACE = 1e8  # [m] from the origin; no map frame on earth has more, and differences keep their micrometres
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,7 +34,7 @@ class Landmarks:
 
     def __post_init__(self) -> None:
         cure = "Give one row per landmark."
-        positions: Any = check_array("landmarks.positions", self.positions, (None, 3), cure)
+        positions: Any = check_array("landmarks.positions", self.positions, (None, 3), cure, within=FARTHEST_PLACE)
         normals: Any = check_array("landmarks.normals", self.normals, (len(positions), 2), cure)
         walls: Any = check_array("landmarks.walls", self.walls, (len(positions),), cure, dtype=np.int64)
         descriptors: Any = check_array(
@@ -79,9 +80,10 @@ class World:
     def __post_init__(self) -> None:
         if not isinstance(self.name, str):
             raise bad_argument("world.name", "a string", self.name, "Give the world a name.")
-        walls: Any = check_array("world.walls", self.walls, (None, 4), "Give rows x1 y1 x2 y2 in metres.")
+        cure = "Give rows x1 y1 x2 y2 in metres."
+        walls: Any = check_array("world.walls", self.walls, (None, 4), cure, within=FARTHEST_PLACE)
         if not len(walls):
-            raise bad_argument("world.walls", "at least one wall", "no rows", "Give rows x1 y1 x2 y2 in metres.")
+            raise bad_argument("world.walls", "at least one wall", "no rows", cure)
         lengths = np.hypot(walls[:, 2] - walls[:, 0], walls[:, 3] - walls[:, 1])
         if lengths.min() < SHORTEST_WALL:
             at = int(np.argmin(lengths))
@@ -113,9 +115,8 @@ class World:
                     "Count walls from 0.",
                 )
         if self.start_poses is not None:
-            starts: Any = check_array(
-                "world.start_poses", self.start_poses, (None, 3), "Give rows x y theta in metres and radians."
-            )
+            cure = "Give rows x y theta in metres and radians."
+            starts: Any = check_array("world.start_poses", self.start_poses, (None, 3), cure, within=FARTHEST_PLACE)
             starts.setflags(write=False)
             object.__setattr__(self, "start_poses", starts)
 
