@@ -71,5 +71,5 @@ def caught_up(history: Sequence[Strokes], tellings: Iterable[Telling]) -> tuple[
         strokes._replace(shared=shared[row], poses=poses[row]) if rows[row] else strokes
         for row, strokes in enumerate(history)
     ]
-    (late,) = missed.any(axis=(1, 2)).nonzero()
+    late = np.flatnonzero(missed.any(axis=(1, 2)))
     return after, [after[row]._replace(shared=missed[row]) for row in late.tolist()]

@@ -6,10 +6,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from slam_backend import FastSlam
+from slam_backend._kernels import MIN_DEPTH
 from slam_backend.camera import StereoCamera
 from slam_backend.geometry import compose
 from vslam_env.sensors import LandmarkSensor, LandmarkSensorConfig
-from vslam_env.sensors._landmark_kernels import make_up, measure, mix_in
+from vslam_env.sensors._landmark_kernels import NEAREST, make_up, measure, mix_in
 from vslam_env.world import FreeSpace, Landmarks, World, make_world, place_landmarks
 from vslam_env.world.sight_kernels import choose, detect
 from vslam_env.world.visibility import marks_of, view_limits, visible_landmarks
@@ -137,7 +139,7 @@ def test_noise_is_the_cameras() -> None:
 def test_a_frame_is_the_plain_definition() -> None:
     """Points are disturbed in the image and triangulated, descriptors disturbed and normalised, false ones as well.
 
-    What lies beyond infinity by its disparity is left out.
+    What lies beyond infinity or before the lens by its disparity is left out.
     """
     rng = np.random.default_rng(8)
     camera = StereoCamera(mount=(0.1, -0.2, 0.3))
@@ -154,7 +156,7 @@ def test_a_frame_is_the_plain_definition() -> None:
         positions[name, 2] = z
         positions[name, :2] = compose(poses[robot], [x, y, 0.0])[:2]
     noise = rng.standard_normal((6, 7))
-    noise[[0, 4], 2] = -1000.0
+    noise[0, 2], noise[4, 2] = -1000.0, 1e6
     sharp = [1, 2, 3, 5]
     is_true, made_up = ids[sharp, None] >= 0, (-1 - ids[sharp]) % 2
     true = np.where(is_true, seen[sharp], false[made_up])
@@ -319,6 +321,20 @@ def test_very_noisy_disparities_give_no_points_behind_the_camera() -> None:
     assert 200 < sum(len(frame.true_ids) for frame in frames) < 400
     for points, extent in [(frame.measurements.points, frame.measurements.extent) for frame in frames]:
         assert extent == (points[:, 2].min(initial=np.inf), np.abs(points).max(initial=0.0))
+
+
+def test_all_that_is_measured_can_be_taken_in() -> None:
+    """Filters take no depth below theirs, none is measured there; nor are there points at the end of the world."""
+    assert NEAREST == MIN_DEPTH
+    camera = StereoCamera(sigma_px=10.0, sigma_disparity_px=200.0, max_range=4.5)
+    close = LandmarkSensor(replace(PERFECT, camera=camera), WALL, on_wall([[0.0, 0.0], [0.01, 0.0]]))
+    slam, rng, told = FastSlam(num_particles=2, camera=camera, seed=0), np.random.default_rng(9), []
+    for x in np.linspace(0.0, 3.99, 400):
+        (frame,) = close.measure(np.array([[x, 0.0, 0.0]]), rng).of_each()
+        slam.step([(0.0, 0.0, 0.0)], [frame.measurements])
+        told.append(len(frame.true_ids))
+    assert min(told) == 0
+    assert max(told) == 2
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ from slam_backend._jit import in_place
 from slam_backend.errors import FloatArray, IntArray
 
 NEAREST_FALSE_POINT = 0.5  # [m]
+NEAREST, FARTHEST = 0.05, 1e3  # [m] no matcher reports depths beyond these; filters take none that are nearer
 
 
 @in_place
@@ -91,7 +92,7 @@ def measure(
     """Measure points and descriptors.
 
     Points are projected, their image coordinates and disparities disturbed, and triangulated again. Where the disparity
-    vanishes in the noise, no matcher reports a point: the later ones move up.
+    vanishes in the noise, or is that of a point before the lens, no matcher reports a point: the later ones move up.
 
     Args:
         ids: (K, B) int64. In each row the landmarks that a robot reports; -1 - j for false point j. Changed to those
@@ -129,10 +130,11 @@ def measure(
                 right, down, ahead = row[:3]
             scale = focal / ahead
             disparity = baseline * scale + sigma_disparity * noise[i, 2]
-            if disparity > 0.0:
+            depth = focal * baseline / disparity if disparity > 0.0 else np.inf
+            if NEAREST <= depth <= FARTHEST:
                 points[kept, 0] = (right * scale + sigma * noise[i, 0]) * baseline / disparity
                 points[kept, 1] = (down * scale + sigma * noise[i, 1]) * baseline / disparity
-                points[kept, 2] = focal * baseline / disparity
+                points[kept, 2] = depth
                 look, square = noise[i, 3:], 0.0
                 for j in range(size):
                     look[j] = row[3 + j] + each * look[j]
