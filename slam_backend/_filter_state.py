@@ -17,7 +17,7 @@ from slam_backend._rejuvenated_maps import write_maps
 from slam_backend._rejuvenation_step import SCHEDULE, RejuvenationStep
 from slam_backend._turns import assumed, spans_of
 from slam_backend.errors import IntArray, bad_argument, check_int, check_seed
-from slam_backend.filter_options import FilterOptions
+from slam_backend.filter_options import MOST_ROBOTS, FilterOptions
 from slam_backend.reports import PoseEstimates
 from slam_backend.run_log import RobotLog
 from slam_backend.smoothing.rejuvenation import Particles
@@ -45,7 +45,7 @@ class FilterState(FilterArrays):
 
     def _set_up(self, num_robots: int, options: FilterOptions, seed: Any, num_particles: int | None = None) -> None:
         """Begin with all robots at the origin and no landmarks; with `num_particles` in place of the options' own."""
-        k = check_int("num_robots", num_robots, 1, "Use at least one robot.")
+        k = check_int("num_robots", num_robots, 1, "Use at least one robot.", MOST_ROBOTS)
         m = options.num_particles if num_particles is None else num_particles
         self.options = options
         self.may_smooth = True

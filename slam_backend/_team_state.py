@@ -13,7 +13,7 @@ from slam_backend.branches import Branch
 from slam_backend.contacts import reach
 from slam_backend.errors import bad_argument, check_int, check_seed
 from slam_backend.filter import FastSlam
-from slam_backend.filter_options import FilterOptions
+from slam_backend.filter_options import MOST_ROBOTS, FilterOptions
 from slam_backend.groups import Group
 from slam_backend.lineup import Lineup
 from slam_backend.merge_options import MergeOptions
@@ -48,7 +48,7 @@ class TeamState:
         merging: MergeOptions | None = None,
         **fastslam_options: Any,
     ) -> None:
-        count = check_int("num_robots", num_robots, 1, "A team has at least one robot.")
+        count = check_int("num_robots", num_robots, 1, "A team has at least one robot.", MOST_ROBOTS)
         known = {field.name for field in fields(FilterOptions)}
         for name in fastslam_options:
             if name not in known:

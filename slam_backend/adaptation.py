@@ -22,6 +22,8 @@ from slam_backend.resampling import effective_sample_size
 
 FARTHEST_BIN = 2**20 - 1  # bins are counted up to here on each axis, so that three indices fit one integer
 
+MOST_PARTICLES = 1_000_000  # memory ends before
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AdaptiveParticles:
@@ -48,7 +50,7 @@ class AdaptiveParticles:
     def __post_init__(self) -> None:
         check_int("adaptive.min_particles", self.min_particles, 1, "Use at least one particle.")
         cure = "Give at least min_particles."
-        check_int("adaptive.max_particles", self.max_particles, self.min_particles, cure)
+        check_int("adaptive.max_particles", self.max_particles, self.min_particles, cure, MOST_PARTICLES)
         check_float("adaptive.error", self.error, "Fox uses 0.05.", above=0.0)
         check_float("adaptive.quantile", self.quantile, "Fox uses 0.99.", at_least=0.5, at_most=1.0 - 1e-9)
         check_float("adaptive.bin_position", self.bin_position, "Give a width in metres.", above=0.0)

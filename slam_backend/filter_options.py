@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
-from slam_backend.adaptation import AdaptiveParticles
+from slam_backend.adaptation import MOST_PARTICLES, AdaptiveParticles
 from slam_backend.camera import StereoCamera
 from slam_backend.errors import bad_argument, check_choice, check_float, check_int
 from slam_backend.existence import ExistenceModel
@@ -12,6 +12,7 @@ from slam_backend.resampling import RESAMPLING
 from slam_backend.smoothing.options import SmoothingOptions
 
 PROPOSALS = ("fastslam2", "fastslam1")
+MOST_ROBOTS = 1_000  # memory ends before
 CALIBRATED_NOISE = 0.005  # [m]; chosen on simulated stereo runs, see docs/smoothing.md
 
 
@@ -78,7 +79,8 @@ class FilterOptions:
     smoothing: SmoothingOptions = field(default_factory=SmoothingOptions)
 
     def __post_init__(self) -> None:
-        check_int("num_particles", self.num_particles, 1, "Use at least one particle; 100 is a good start.")
+        cure = "Use at least one particle; 100 is a good start."
+        check_int("num_particles", self.num_particles, 1, cure, MOST_PARTICLES)
         for name, kind in (("camera", StereoCamera), ("motion", OdometryModel)):
             if not isinstance(getattr(self, name), kind):
                 raise bad_argument(name, f"a {kind.__name__}", getattr(self, name), f"Build one: {kind.__name__}(...).")

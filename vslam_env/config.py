@@ -21,6 +21,7 @@ SENSORS = ("landmark", "stereo")
 MAX_ROBOTS = 8
 TICK = 0.1  # [s]
 GOAL_DECISION_TICKS = 10
+MOST_TICKS = 10**9  # in a step; they would last three years
 PARTS = {
     "landmarks": LandmarkConfig,
     "odometry": OdometryNoise,
@@ -112,7 +113,7 @@ class EnvConfig:
         check_choice("action_type", self.action_type, ACTION_TYPES)
         check_choice("observation_type", self.observation_type, OBSERVATION_TYPES)
         if self.decision_ticks is not None:
-            check_int("decision_ticks", self.decision_ticks, 1, "Give a number of ticks of 0.1 s.")
+            check_int("decision_ticks", self.decision_ticks, 1, "Give a number of ticks of 0.1 s.", MOST_TICKS)
         check_int("max_cycles", self.max_cycles, 1, "Give a number of steps.")
         if self.stop_at_recall is not None:
             check_float("stop_at_recall", self.stop_at_recall, "Give a share or None.", above=0.0, at_most=1.0)

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from slam_backend._step_input import check_step
 from slam_backend.errors import FloatArray, IntArray, bad_argument, check_array, check_choice, check_int, check_seed
-from slam_backend.filter_options import FilterOptions
+from slam_backend.filter_options import MOST_ROBOTS, FilterOptions
 from slam_backend.geometry import compose
 from slam_backend.landmark_map import LandmarkMap
 from slam_backend.measurements import Measurements
@@ -54,7 +54,7 @@ class PlainFastSlam:
         seed: int | np.random.SeedSequence | np.random.Generator = 0,
         initial_poses: ArrayLike | None = None,
     ) -> None:
-        k = check_int("num_robots", num_robots, 1, "Use at least one robot.")
+        k = check_int("num_robots", num_robots, 1, "Use at least one robot.", MOST_ROBOTS)
         if options.adaptive is not None:
             cure = "The plain filter keeps its number of particles: use FastSlam for one that adapts it."
             raise bad_argument("options.adaptive", "None", options.adaptive, cure)

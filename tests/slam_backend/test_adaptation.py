@@ -158,6 +158,7 @@ def test_poses_beyond_all_bins_do_no_harm() -> None:
     ("change", "message"),
     [
         ({"min_particles": 0}, r"adaptive\.min_particles: expected an int >= 1, got 0"),
+        ({"max_particles": 10**9}, r"adaptive\.max_particles: expected an int <= 1000000, got 1000000000"),
         ({"max_particles": 49}, r"adaptive\.max_particles: expected an int >= 50, got 49"),
         ({"error": 0.0}, r"adaptive\.error: expected a finite number > 0, got 0\.0"),
         ({"quantile": 1.0}, r"adaptive\.quantile: expected a finite number >= 0\.5 and <= 1, got 1\.0"),

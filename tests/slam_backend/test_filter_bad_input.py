@@ -19,6 +19,8 @@ ARGUMENTS = [
     ({"num_robots": 0}, r"num_robots: expected an int >= 1, got 0\. Use at least one robot\."),
     ({"num_robots": 1.0}, r"num_robots: expected an int >= 1, got 1\.0"),
     ({"num_particles": 0}, r"num_particles: expected an int >= 1, got 0\. Use at least one particle"),
+    ({"num_robots": 10**400}, r"num_robots: expected an int <= 1000, got 1000"),
+    ({"num_particles": 2**62}, r"num_particles: expected an int <= 1000000, got 46116"),
     ({"num_particles": True}, r"num_particles: expected an int >= 1, got True"),
     ({"camera": 320.0}, r"camera: expected a StereoCamera, got 320\.0"),
     ({"motion": StereoCamera()}, r"motion: expected a OdometryModel, got StereoCamera"),

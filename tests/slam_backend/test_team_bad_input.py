@@ -23,6 +23,7 @@ FRAMES = [GOOD] * 3
     [
         ({"num_robots": 0}, r"num_robots: expected an int >= 1, got 0\. A team has at least one robot\."),
         ({"num_robots": -2}, r"num_robots: expected an int >= 1, got -2"),
+        ({"num_robots": 10**400}, r"num_robots: expected an int <= 1000, got 1000"),
         ({"num_robots": 2.5}, r"num_robots: expected an int >= 1, got 2\.5"),
         ({"num_robots": True}, r"num_robots: expected an int >= 1, got True"),
         ({"num_robots": None}, r"num_robots: expected an int >= 1, got None"),

@@ -93,6 +93,18 @@ CASES: dict[str, tuple[Callable[[], Any], str]] = {
     "unknown render mode": (lambda: small_env(render_mode="ansi"), "render_mode: expected one of 'human', 'rgb_array'"),
     "no cycles": (lambda: small_env(max_cycles=0), "max_cycles: expected an int >= 1, got 0"),
     "no ticks": (lambda: small_env(decision_ticks=0), "decision_ticks: expected an int >= 1, got 0"),
+    "too many particles": (
+        lambda: small_env(num_particles=10**9),
+        "num_particles: expected an int <= 1000000, got 1000000000",
+    ),
+    "too many rays": (
+        lambda: small_env().config.replace(scan={"num_rays": 10**9}),
+        r"scan\.num_rays: expected an int <= 100000, got 1000000000",
+    ),
+    "ticks without end": (
+        lambda: small_env(decision_ticks=10**400),
+        "decision_ticks: expected an int <= 1000000000, got 1000",
+    ),
     "recall above one": (
         lambda: small_env(stop_at_recall=1.5),
         "stop_at_recall: expected a finite number > 0 and <= 1",

@@ -81,6 +81,15 @@ def test_plans_without_room_are_refused(tmp_path: Path, image: Any, message: str
         load_floorplan(write(tmp_path / "bad.png", image))
 
 
+def test_a_tolerance_that_leaves_no_walls_is_refused(tmp_path: Path) -> None:
+    """Outlines that are straightened until nothing is left are refused by the tolerance."""
+    room = write(tmp_path / "room.png", np.pad(np.full((40, 60), 255), 10))
+    with pytest.raises(
+        ValueError, match=r"tolerance_px: expected less than the free part of .* is wide, got 1000000000\.0"
+    ):
+        load_floorplan(room, tolerance_px=1e9)
+
+
 def test_what_is_no_image_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A file that is not an image, and a file that is not there, give one clear error each."""
     monkeypatch.chdir(tmp_path)  # errors shorten long paths
@@ -89,6 +98,8 @@ def test_what_is_no_image_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyP
         load_floorplan("text.png")
     with pytest.raises(ValueError, match=r"world: expected a file, got .*none\.png"):
         load_floorplan("none.png")
+    with pytest.raises(ValueError, match=r"world: expected a file, got 'xxx.*Check the path: [^.]*too long"):
+        load_floorplan("x" * 5000 + ".png")
     with pytest.raises(ValueError, match="metres_per_pixel: expected a finite number > 0, got -1"):
         load_floorplan("text.png", metres_per_pixel=-1)
 

@@ -8,6 +8,8 @@ from slam_backend.camera import StereoCamera
 from slam_backend.errors import FloatArray, check_array, check_float, check_int
 from vslam_env.world.sight_kernels import cast_scans, rays_at
 
+MOST_RAYS = 100_000  # of a robot; memory ends before
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScanConfig:
@@ -26,7 +28,7 @@ class ScanConfig:
     sigma: float = 0.01
 
     def __post_init__(self) -> None:
-        check_int("scan.num_rays", self.num_rays, 2, "Use at least two rays.")
+        check_int("scan.num_rays", self.num_rays, 2, "Use at least two rays; 32 are a good start.", MOST_RAYS)
         check_float("scan.half_fov", self.half_fov, "Give radians.", above=0.0, at_most=np.pi)
         check_float("scan.max_range", self.max_range, "Give metres.", above=0.0)
         check_float("scan.sigma", self.sigma, "Give a share of the distance.", at_least=0.0)

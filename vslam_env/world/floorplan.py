@@ -55,7 +55,7 @@ def trace(free: Any, metres_per_pixel: float, tolerance_px: float, robot_radius:
         Walls (S, 4) float64 [m]. The origin is the image's lower left corner, y upwards.
 
     Raises:
-        ValueError: If no robot fits.
+        ValueError: If no robot fits, or the tolerance leaves no outline.
     """
     x, y, width, height = cv2.boundingRect(free)
     cropped = np.pad(free[y : y + height, x : x + width], 1)
@@ -70,6 +70,9 @@ def trace(free: Any, metres_per_pixel: float, tolerance_px: float, robot_radius:
     corner = np.array([x - 1, y - 1])  # of the cropped part in the image
     to_metres = metres_per_pixel * np.array([1.0, -1.0])  # rows count downwards, y upwards
     outlines = [(line + corner - (0, len(free))) * to_metres for line in _outlines(cropped, tolerance_px)]
+    if not outlines:
+        expected = f"less than the free part of {path} is wide"
+        raise bad_argument("tolerance_px", expected, tolerance_px, "Give a pixel or two.")
     return np.vstack([np.hstack([line, np.roll(line, -1, axis=0)]) for line in outlines])
 
 
@@ -85,7 +88,7 @@ def load_walls_json(path: str | Path) -> World:
     path = existing(path)
     cure = 'Write {"walls": [[x1, y1, x2, y2], ...]}, in metres; "start_poses" and "name" are optional.'
     try:
-        content: Any = json.loads(path.read_text(encoding="utf-8"))
+        content: Any = json.loads(path.read_text(encoding="utf-8-sig"))
     except (ValueError, RecursionError) as error:
         raise bad_argument("world", "a JSON file", f"a syntax error in {path}: {error}", cure) from error
     if not isinstance(content, dict) or "walls" not in content:
@@ -142,7 +145,12 @@ def existing(path: str | Path) -> Path:
         ValueError: If there is no such file.
     """
     path = Path(path)
-    if not path.is_file():
+    try:
+        is_there = path.is_file()
+    except OSError as error:  # e.g. a name too long for the system
+        cure = f"Check the path: {error.strerror}."
+        raise bad_argument("world", "a file", str(path), cure) from error
+    if not is_there:
         raise bad_argument("world", "a file", str(path), "Check the path: there is no such file.")
     return path
 
