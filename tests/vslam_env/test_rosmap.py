@@ -52,6 +52,27 @@ def test_negated_and_strict_maps(tmp_path: Path) -> None:
     assert lax[2] - lax[0] == pytest.approx(60 * 0.05)
 
 
+@pytest.mark.parametrize("mode", ["trinary", "scale"])
+def test_what_is_free_is_so_in_both_modes_of_probability(tmp_path: Path, mode: str) -> None:
+    """Between the thresholds `scale` knows degrees, none of which is free."""
+    changed = {"mode": mode, "occupied_thresh": 0.65}
+    assert load_ros_map(write_map(tmp_path, **changed)).bounds == load_ros_map(write_map(tmp_path)).bounds
+
+
+def test_raw_maps_hold_percentages(tmp_path: Path) -> None:
+    """A raw pixel is the probability in per cent, and unknown above 100; `negate` counts from 255 down."""
+    image = np.full((80, 100), 255)
+    image[9:51, 19:81] = 100
+    image[10:50, 20:80] = 0
+    image[10:50, 50:80] = 15
+    for negate in (0, 1):
+        pixels = 255 - image if negate else image
+        changed = {"mode": "raw", "negate": negate}
+        strict, lax = (load_ros_map(write_map(tmp_path, pixels, free_thresh=t, **changed)) for t in (0.1, 0.2))
+        assert strict.bounds[2] - strict.bounds[0] == pytest.approx(30 * 0.05)
+        assert lax.bounds[2] - lax.bounds[0] == pytest.approx(60 * 0.05)
+
+
 def test_a_folder_counts_a_map_once(tmp_path: Path) -> None:
     """The image of a YAML file is no plan of its own in a folder; names ending in .yaml are maps."""
     path = write_map(tmp_path)
@@ -79,6 +100,10 @@ def test_an_imported_map_comes_back(tmp_path: Path) -> None:
         ({"resolution": "fine"}, "resolution: expected a finite number"),
         ({"origin": [1, 2]}, r"origin: expected an array of shape \(3,\)"),
         ({"free_thresh": 3}, "free_thresh: expected a finite number > 0 and <= 1"),
+        ({"occupied_thresh": 5}, "occupied_thresh: expected a finite number >= 0.196 and <= 1, got 5"),
+        ({"free_thresh": 0.7, "occupied_thresh": 0.65}, "occupied_thresh: expected a finite number >= 0.7 and <= 1"),
+        ({"mode": "fancy"}, "world: map.yaml mode: expected one of 'trinary', 'scale', 'raw', got 'fancy'"),
+        ({"mode": 1}, "mode: expected one of 'trinary', 'scale', 'raw', got 1"),
         ({"free_thresh": 0.001}, "expected a map with free space"),
         ({"resolution": 0.001}, r"expected free space for robots of radius 0\.2 m"),
         ({"negate": "'false'"}, "negate: expected 0 or 1, got 'false'"),

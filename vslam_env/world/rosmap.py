@@ -7,20 +7,22 @@ import cv2
 import numpy as np
 import yaml
 
-from slam_backend.errors import bad_argument, check_array, check_float
+from slam_backend.errors import bad_argument, check_array, check_choice, check_float
 from slam_backend.geometry import transform_points
 from vslam_env.world.floorplan import existing, largest_part, read_image, trace
 from vslam_env.world.spec import World
 
+MODES = ("trinary", "scale", "raw")
 CURE = "Write image, resolution, origin, negate, occupied_thresh and free_thresh, as map_server's map_saver does."
 
 
 def load_ros_map(path: str | Path, tolerance_px: float = 1.0, robot_radius: float = 0.2) -> World:
     """Trace the walls of a map that ROS's map_server reads.
 
-    A pixel of value v is occupied with probability (255 - v) / 255, or v / 255 if `negate` is set; it is free below
-    `free_thresh`. All else, unknown space included, is wall. The largest free part is kept. The world's frame is that
-    of the map: `origin` is the pose of the image's lower left corner (http://wiki.ros.org/map_server).
+    A pixel of value v is occupied with probability (255 - v) / 255, or v / 255 if `negate` is set; with `mode: raw` it
+    is v per cent, or 255 - v, and unknown above 100. It is free below `free_thresh`; the modes `trinary` and `scale`
+    differ only in what is not. All else, unknown space included, is wall. The largest free part is kept. The world's
+    frame is that of the map: `origin` is the pose of the image's lower left corner (http://wiki.ros.org/map_server).
 
     Args:
         path: Of the YAML file; `image` in it is a path beside it or an absolute one.
@@ -38,10 +40,11 @@ def load_ros_map(path: str | Path, tolerance_px: float = 1.0, robot_radius: floa
         raise bad_argument("world", "a YAML file", f"a syntax error in {path}", CURE) from error
     settings = _checked(content, str(path))
     image = read_image(existing(path.parent / settings["image"]), cv2.IMREAD_GRAYSCALE).astype(np.float64)
-    occupied = (image if settings["negate"] else 255.0 - image) / 255.0
+    levels = 255.0 - image if settings["negate"] else image
+    occupied = levels / 100.0 if settings["mode"] == "raw" else (255.0 - levels) / 255.0
     free = occupied < settings["free_thresh"]
     if not free.any():
-        cure = "Check negate and free_thresh."
+        cure = "Check mode, negate and free_thresh."
         raise bad_argument("world", "a map with free space", f"no free space in {path}", cure)
     walls = trace(largest_part(free), settings["resolution"], tolerance_px, robot_radius, str(path))
     return World(path.stem, transform_points(settings["origin"], walls.reshape(-1, 2)).reshape(-1, 4))
@@ -59,12 +62,17 @@ def _checked(content: Any, path: str) -> dict[str, Any]:
     negate = content.get("negate", 0)
     if negate not in (0, 1):  # True and False are such numbers; a text is true whatever it says
         raise bad_argument(f"{name} negate", "0 or 1", negate, CURE)
+    free_thresh = check_float(
+        f"{name} free_thresh", content.get("free_thresh", 0.196), "Give a probability.", above=0.0, at_most=1.0
+    )
+    if "occupied_thresh" in content:  # between the two a pixel is unknown, or partly occupied: a wall, too
+        cure = "Give a probability that is not below free_thresh."
+        check_float(f"{name} occupied_thresh", content["occupied_thresh"], cure, at_least=free_thresh, at_most=1.0)
     return {
         "image": content["image"],
         "resolution": check_float(f"{name} resolution", content["resolution"], "Give metres per pixel.", above=0.0),
         "origin": check_array(f"{name} origin", content.get("origin", [0.0, 0.0, 0.0]), (3,), "Give x, y, yaw."),
         "negate": bool(negate),
-        "free_thresh": check_float(
-            f"{name} free_thresh", content.get("free_thresh", 0.196), "Give a probability.", above=0.0, at_most=1.0
-        ),
+        "mode": check_choice(f"{name} mode", content.get("mode", "trinary"), MODES),
+        "free_thresh": free_thresh,
     }
