@@ -220,9 +220,22 @@ class ExplorationEnv(EnvKnowledge):
             state: Of `get_state`; it can be used again.
 
         Raises:
-            ValueError: If it is no state, one of another version of the package or of another configuration.
+            ValueError: If it is no state, one of another version of the package or of another configuration; or if a
+                part of it is damaged: then nothing but a reset or another state goes on.
         """
         state = check_state(state, self.config)
+        try:
+            self._restore(state)
+        except Exception as error:
+            self._episode, self.agents = None, []
+            said, cure = (
+                f"{type(error).__name__}: {error}",
+                "Pass it unchanged; until then the environment has to be reset.",
+            )
+            raise bad_argument("state", "what get_state returned", f"a damaged one ({said})", cure) from error
+
+    def _restore(self, state: Mapping[str, Any]) -> None:
+        """Take over the parts of a state."""
         self._root = restored_sequence(state["root"])
         self.agents = []
         if state["episode"] is None:
@@ -230,6 +243,8 @@ class ExplorationEnv(EnvKnowledge):
             return
         if self._episode is None:
             self._episode = Episode(self.config, state["episode"]["setting"], self._tap)
+        if not (set(state["agents"]) <= set(self.possible_agents) and isinstance(state["standing"], Standing)):
+            raise TypeError("agents or standing are of another kind")
         self._episode.set_state(state["episode"])
         self._drivers = Drivers(self.config)
         self._drivers.set_state(state["drivers"])

@@ -1,6 +1,7 @@
 """Snapshots of an environment: their version, their check, and their form on disk."""
 
 import dataclasses
+import hashlib
 import pickle
 from collections.abc import Mapping
 from functools import cache
@@ -49,7 +50,7 @@ def check_state(state: Any, config: EnvConfig) -> Mapping[str, Any]:
 def save_state(state: Mapping[str, Any], path: str | Path) -> None:
     """Write a state of `get_state` to a file; an interrupted write leaves no file, or the old one.
 
-    The file is a marked pickle: like any pickle, load it only from where you would run code from.
+    The file is a pickle, marked and with its SHA-256: like any pickle, load it only from where you would run code from.
 
     Raises:
         ValueError: If it is no state of this version, or the file cannot be written.
@@ -60,8 +61,8 @@ def save_state(state: Mapping[str, Any], path: str | Path) -> None:
         with NamedTemporaryFile(dir=path.parent, prefix=path.name, suffix=".part", delete=False) as file:
             part = Path(file.name)
             try:
-                file.write(MAGIC + f"{state['version']}\n".encode())
-                pickle.dump(dict(state), file, protocol=5)
+                body = pickle.dumps(dict(state), protocol=5)
+                file.write(MAGIC + f"{state['version']}\n{_fingerprint(body)}\n".encode() + body)
                 file.close()
                 replace(part, path)
             except BaseException:
@@ -75,7 +76,7 @@ def load_state(path: str | Path) -> EnvState:
     """Read a state that `save_state` wrote.
 
     Raises:
-        ValueError: If there is no such file, it holds no state, is cut off, or is of another version.
+        ValueError: If there is no such file, it holds no state, a byte of it has changed, or it is of another version.
     """
     try:
         content = Path(path).read_bytes()
@@ -85,12 +86,14 @@ def load_state(path: str | Path) -> EnvState:
     if not head.startswith(MAGIC):
         raise bad_argument("path", "the file of a state", str(path), "Write one with save_state.")
     _check_version(str(path), head[len(MAGIC) :].decode(errors="replace"))  # before anything of it is unpickled
-    try:
-        state = pickle.loads(body)
-    except Exception as error:
-        cure = f"Save it again; reading says: {error}."
-        raise bad_argument("path", "a whole file of a state", f"a damaged file {path}", cure) from error
-    return dict(_checked(str(path), state))
+    mark, _, body = body.partition(b"\n")
+    if mark.decode(errors="replace") != _fingerprint(body):
+        raise bad_argument("path", "a whole file of a state", f"a damaged file {path}", "Save it again.")
+    return dict(_checked(str(path), pickle.loads(body)))
+
+
+def _fingerprint(body: bytes) -> str:
+    return hashlib.sha256(body).hexdigest()
 
 
 def sequence_state(sequence: np.random.SeedSequence | None) -> dict[str, Any] | None:

@@ -229,6 +229,24 @@ def test_a_refused_state_leaves_the_environment_alone() -> None:
     assert _go_on(env, 20) == _go_on(quiet, 20)
 
 
+@pytest.mark.parametrize("part", ["episode", "drivers", "root", "agents", "standing"])
+def test_a_state_of_which_a_part_is_damaged_is_refused(part: str) -> None:
+    """With the reason; the environment has to be reset, or set to another state, and then is as good as ever."""
+    env, quiet = _begun(), _begun()
+    state = env.get_state()
+    with pytest.raises(ValueError, match=r"state: expected what get_state returned, got a damaged one \(\w+: "):
+        env.set_state(state | {part: {"setting": 3}})
+    with pytest.raises(RuntimeError, match="reset"):
+        env.step({})
+    env.set_state(state)
+    assert _go_on(env, 20) == _go_on(quiet, 20)
+
+
+def _marked(content: bytes, body: bytes) -> bytes:
+    """Return a file of the same version with another body, as if it had been written so."""
+    return content[: content.index(b"\n") + 1] + hashlib.sha256(body).hexdigest().encode() + b"\n" + body
+
+
 @pytest.mark.parametrize(
     ("spoil", "says"),
     [
@@ -238,10 +256,10 @@ def test_a_refused_state_leaves_the_environment_alone() -> None:
             lambda content: content.replace(f"state {STATE_FORMAT}/".encode(), b"state 999/", 1),
             r"expected a state of version .*got '999/",
         ),
-        (
-            lambda content: content[: content.index(b"\n") + 1] + pickle.dumps(3),
-            "expected what get_state returned, got a int",
-        ),
+        (lambda content: content[:-9] + bytes([content[-9] ^ 1]) + content[-8:], "a damaged file"),
+        (lambda content: content + b".", "a damaged file"),
+        (lambda content: content[: content.index(b"\n") + 1] + pickle.dumps(3), "a damaged file"),
+        (lambda content: _marked(content, pickle.dumps(3)), "expected what get_state returned, got a int"),
         (None, "path: expected the file of a state, .*no such file|No such file"),
     ],
 )
