@@ -11,7 +11,7 @@ from slam_backend._step_table import are_kinds, in_one_table, read_by_team, seen
 from slam_backend.camera import StereoCamera
 from slam_backend.errors import FloatArray, IntArray, bad_argument, check_array
 from slam_backend.input_log import StepInput
-from slam_backend.measurements import Measurements, TeamMeasurements
+from slam_backend.measurements import LARGEST_DESCRIPTOR, Measurements, TeamMeasurements
 
 FARTHEST_MOVE = 1e4  # [m, rad]; no robot moves so far between two steps
 FARTHEST_POINT = 1e4  # [m]; no camera measures so far; at a million times this, covariances overflow
@@ -63,6 +63,10 @@ def _cut_out(frames: TeamMeasurements) -> list[Measurements]:
         got = f"ends {ends} of {count} points and {len(frames.descriptors)} descriptors"
         cure = "Say per robot where its points end."
         raise bad_argument("measurements", "a descriptor per point, and rising ends up to the last one", got, cure)
+    largest = float(np.abs(frames.descriptors).max(initial=0.0))
+    if not largest <= LARGEST_DESCRIPTOR:
+        expected = f"numbers within +-{LARGEST_DESCRIPTOR:g}"
+        raise bad_argument("measurements.descriptors", expected, largest, "Scale them, best to unit length.")
     return frames.of_each()
 
 

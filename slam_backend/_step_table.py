@@ -8,7 +8,7 @@ import numpy as np
 from slam_backend import _kernels
 from slam_backend.errors import BoolArray, Float32Array, FloatArray, IntArray
 from slam_backend.input_log import StepInput
-from slam_backend.measurements import Measurements, TeamMeasurements
+from slam_backend.measurements import LARGEST_DESCRIPTOR, Measurements, TeamMeasurements
 
 NO_SIGHTINGS = np.zeros((0, 9))
 NO_DESCRIPTORS = np.zeros((0, 0), dtype=np.float32)
@@ -49,7 +49,8 @@ def read_by_team(
         return None
     moves, looks = odometry.copy(), descriptors.copy()
     table, sightings = np.empty((k, 6), np.int64), np.empty((count, 9))
-    if not _kernels.read_team(moves, points, ends, farthest_move, farthest_point, table, sightings):
+    limits = farthest_move, farthest_point, LARGEST_DESCRIPTOR
+    if not _kernels.read_team(moves, points, looks, ends, *limits, table, sightings):
         return None
     return StepInput(table.tolist(), table, moves, {}, sightings, looks, NO_NAMES, frozenset())
 

@@ -68,7 +68,9 @@ class Measurements:
 
 
 class TeamMeasurements(NamedTuple):
-    """The frames of several robots in one piece, unchecked, without covariances; cut out for who wants to look at one.
+    """The frames of several robots in one piece, without covariances; cut out for who wants to look at one.
+
+    Nothing is checked before a filter takes them in.
 
     Attributes:
         points: (n, 3) float64 [m]. Each in the frame of its camera, robot by robot.

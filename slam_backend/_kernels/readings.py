@@ -6,7 +6,7 @@ import numpy as np
 
 from slam_backend._jit import in_place
 from slam_backend._kernels.layout import ACT, BEGIN, COUNT, END, GIVEN, MIN_DEPTH, MOVED, NAMED
-from slam_backend.errors import FloatArray, IntArray
+from slam_backend.errors import Float32Array, FloatArray, IntArray
 
 
 @in_place
@@ -47,18 +47,30 @@ def noises_to_robot_axes(covariances: FloatArray, sightings: FloatArray) -> None
 
 
 @in_place
+def _are_within(vectors: Float32Array, limit: float) -> bool:
+    """Return whether no component of vectors (n, d) is larger, by magnitude, or NaN."""
+    within, most = True, np.float32(limit)
+    for i in range(len(vectors)):
+        for j in range(vectors.shape[1]):
+            within &= abs(vectors[i, j]) <= most
+    return within
+
+
+@in_place
 def read_team(
-    moves: FloatArray, points: FloatArray, ends: IntArray, farthest_move: float, farthest_point: float,
-    table: IntArray, sightings: FloatArray,
+    moves: FloatArray, points: FloatArray, looks: Float32Array, ends: IntArray, farthest_move: float,
+    farthest_point: float, largest_look: float, table: IntArray, sightings: FloatArray,
 ) -> bool:  # fmt: skip
     """Write what N robots read that have all moved and looked, without covariances and names, if nothing is amiss.
 
     Args:
         moves: (N, 3) [m, m, rad] odometry.
         points: (n, 3) [m], camera frames, one robot's after the other's.
+        looks: (n, d) their descriptors.
         ends: (N,) where the points of each end.
         farthest_move: [m, rad] limit to the odometry.
         farthest_point: [m] limit to coordinates.
+        largest_look: Limit to components of descriptors.
         table, sightings: (N, 6), (n, 9), written as in `StepInput`.
 
     Returns:
@@ -77,4 +89,5 @@ def read_team(
         begin = end
     to_robot_axes(points, sightings)
     nearest, farthest = extent(points)
-    return begin == len(points) and nearest >= MIN_DEPTH and farthest <= farthest_point
+    near = nearest >= MIN_DEPTH and farthest <= farthest_point
+    return begin == len(points) and near and _are_within(looks, largest_look)

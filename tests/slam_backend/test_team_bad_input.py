@@ -112,6 +112,14 @@ BAD_STEPS: list[tuple[dict[str, Any], str]] = [
             {"ends": np.array([1.0, 2.0, 3.0])},
         )
     ),
+    *(
+        (
+            {"measurements": TOGETHER._replace(descriptors=TOGETHER.descriptors * factor), "odometry": moves},
+            r"measurements\.descriptors: expected numbers within \+-1e\+06, got",
+        )
+        for factor in (np.float32(np.nan), np.float32(1e20))
+        for moves in (STILL, np.zeros((3, 3)))
+    ),
     ({"identities": [[1], [1]]}, r"identities: expected a sequence with one entry per robot \(3\)"),
     ({"identities": [[1], [1], [1, 2]]}, r"identities\[2\]: expected an array of shape"),
     ({"poses": [None, None, [0.0, np.inf, 0.0]]}, r"poses\[2\]: expected finite numbers, got NaN or infinity at"),

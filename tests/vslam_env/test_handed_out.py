@@ -96,3 +96,13 @@ def test_a_belief_keeps_nothing_that_the_caller_may_write_to() -> None:
     assert states[0]["grids"]["strokes"]
     for one, other in zip(*map(_arrays, states), strict=True):
         np.testing.assert_array_equal(one, other)
+
+
+def test_true_ids_are_not_those_of_the_books() -> None:
+    """The simulator's books may look at what was measured again, when robots return; who writes to frames changes none."""
+    env = small_env()
+    env.reset(seed=5, options={"start_poses": MEETING})
+    names = env.episode._frames.names
+    frames = env.episode.frames
+    assert any(len(frame.true_ids) for frame in frames)
+    assert not any(np.shares_memory(frame.true_ids, names) for frame in frames)

@@ -72,9 +72,9 @@ class Frames(NamedTuple):
 
     @property
     def true_ids(self) -> list[IntArray]:
-        """Per robot as of its `Frame`."""
+        """Per robot as of its `Frame`. Copies: the books go by `names`."""
         ends = self.measurements.ends.tolist()
-        return [row[: end - begin] for row, begin, end in zip(self.names, [0, *ends[:-1]], ends, strict=True)]
+        return [row[: end - begin].copy() for row, begin, end in zip(self.names, [0, *ends[:-1]], ends, strict=True)]
 
     def of_each(self) -> list[Frame]:
         """Return the frame of each robot."""

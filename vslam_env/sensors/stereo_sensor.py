@@ -95,8 +95,8 @@ class EyeFrames(NamedTuple):
         return self.true_ids
 
     def of_each(self) -> list[EyeFrame]:
-        """Return the frame of each robot."""
-        return list(map(EyeFrame, *self))
+        """Return the frame of each robot; its true ids are copies."""
+        return list(map(EyeFrame, *self._replace(true_ids=[own.copy() for own in self.true_ids])))
 
 
 class StereoSensor:
