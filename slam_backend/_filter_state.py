@@ -155,6 +155,10 @@ class FilterState(FilterArrays):
         Raises:
             ValueError: If `state` is not one of `get_state`.
         """
+        if not isinstance(state, Mapping):
+            raise bad_argument(
+                "state", "a dict from FastSlam.get_state", f"a {type(state).__name__}", "Pass it unchanged."
+            )
         missing = [name for name in (*KEPT, *OTHERS_KEPT) if name not in state]
         missing = missing or [f"maps.{name}" for name in MAPS_KEPT if name not in state["maps"]]
         if not missing and state["options"].rejuvenate_every is not None:

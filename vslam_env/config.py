@@ -180,14 +180,21 @@ class EnvConfig:
         What the file leaves out, in nested tables as well, has the value of the `standard` preset.
         """
         try:
-            return cls.from_toml_text(Path(path).read_text(encoding="utf-8"))
-        except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+            values = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:  # of the path, of the encoding and of the syntax
             raise bad_argument("config", "a readable TOML file", str(path), f"The reader says: {error}.") from error
+        return cls.from_dict(nested.with_none(values))
 
     @classmethod
     def from_toml_text(cls, text: str) -> Self:
         """Build a configuration from what `to_toml` returned."""
-        return cls.from_dict(nested.with_none(tomllib.loads(text)))
+        if not isinstance(text, str):
+            raise bad_argument("config", "TOML as text", text, "Pass what to_toml returned, or use from_toml.")
+        try:
+            values = tomllib.loads(text)
+        except tomllib.TOMLDecodeError as error:
+            raise bad_argument("config", "TOML", text, f"The reader says: {error}.") from error
+        return cls.from_dict(nested.with_none(values))
 
     def to_toml(self) -> str:
         """Return the configuration as TOML; None is left out where it is the standard, else it is the text "none"."""

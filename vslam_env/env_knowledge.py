@@ -7,7 +7,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
-from slam_backend.errors import FloatArray, bad_argument
+from slam_backend.errors import FloatArray, bad_argument, check_int
 from slam_backend.reports import MergeEvent
 from vslam_env.belief import Belief
 from vslam_env.episode import Episode, Recorder, Tap
@@ -39,6 +39,7 @@ class EnvKnowledge(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # Pe
     _tap: Tap
     _episode: Episode | None
     _standing: Standing
+    _max_cycles: int
 
     def observation_space(self, agent: AgentID) -> spaces.Space[Any]:
         """Return the space of an agent's observations; always the same object."""
@@ -114,7 +115,18 @@ class EnvKnowledge(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # Pe
 
     @recorder.setter
     def recorder(self, recorder: Recorder | None) -> None:
+        if recorder is not None and not callable(recorder):
+            raise bad_argument("recorder", "a function or None", recorder, "It is called with a tuple of Readings.")
         self._tap.recorder = recorder
+
+    @property
+    def max_cycles(self) -> int:
+        """After so many steps the episode is truncated; may be assigned."""
+        return self._max_cycles
+
+    @max_cycles.setter
+    def max_cycles(self, max_cycles: int) -> None:
+        self._max_cycles = check_int("max_cycles", max_cycles, 1, "Give a number of steps.")
 
     def scene(self) -> Scene:
         """Return what a picture shows now."""
@@ -126,6 +138,6 @@ class EnvKnowledge(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # Pe
         return self._episode
 
     def _index(self, agent: AgentID) -> int:
-        if agent not in self.possible_agents:
+        if not isinstance(agent, str) or agent not in self.possible_agents:
             raise bad_argument("agent", f"one of {self.possible_agents}", agent, "Use a name of possible_agents.")
         return self.possible_agents.index(agent)

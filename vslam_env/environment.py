@@ -36,7 +36,6 @@ class ExplorationEnv(EnvKnowledge):
 
     Attributes:
         config: All that defines this environment.
-        max_cycles: After so many steps the episode is truncated; may be assigned.
     """
 
     metadata: ClassVar[dict[str, Any]] = {
@@ -159,7 +158,7 @@ class ExplorationEnv(EnvKnowledge):
         terms = evaluate(self._terms, before, self._standing, self.config.shared_reward)
         goal = self.config.stop_at_recall
         terminated = goal is not None and bool(self._standing.map_recalls.min() >= goal)
-        truncated = not terminated and self._cycle >= self.max_cycles
+        truncated = not terminated and self._cycle >= self._max_cycles
         observations, infos = self._told(episode, terms, invalid)
         results = (
             observations,

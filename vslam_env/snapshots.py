@@ -6,9 +6,9 @@ import pickle
 from collections.abc import Mapping
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
-from os import replace
+from os import PathLike, replace
 from pathlib import Path
-from tempfile import NamedTemporaryFile
+from secrets import token_hex
 from typing import Any
 
 import numpy as np
@@ -50,16 +50,19 @@ def check_state(state: Any, config: EnvConfig) -> Mapping[str, Any]:
 def save_state(state: Mapping[str, Any], path: str | Path) -> None:
     """Write a state of `get_state` to a file; an interrupted write leaves no file, or the old one.
 
-    The file is a pickle, marked and with its SHA-256: like any pickle, load it only from where you would run code from.
+    A file of that name is replaced; what is there and no file is refused. The file is a pickle, marked and with its
+    SHA-256: like any pickle, load it only from where you would run code from.
 
     Raises:
         ValueError: If it is no state of this version, or the file cannot be written.
     """
     _checked("state", state)
-    path = Path(path)
+    path = _checked_path(path)
     try:
-        with NamedTemporaryFile(dir=path.parent, prefix=path.name, suffix=".part", delete=False) as file:
-            part = Path(file.name)
+        if path.exists() and not path.is_file():
+            raise bad_argument("path", "a file that can be written", str(path), "There is something else, no file.")
+        part = path.with_name(f"{path.name}.{token_hex(8)}.part")
+        with part.open("xb") as file:  # readable to whom the process lets read, which temporary files are not
             try:
                 body = pickle.dumps(dict(state), protocol=5)
                 file.write(MAGIC + f"{state['version']}\n{_fingerprint(body)}\n".encode() + body)
@@ -78,8 +81,9 @@ def load_state(path: str | Path) -> EnvState:
     Raises:
         ValueError: If there is no such file, it holds no state, a byte of it has changed, or it is of another version.
     """
+    path = _checked_path(path)
     try:
-        content = Path(path).read_bytes()
+        content = path.read_bytes()
     except OSError as error:
         raise bad_argument("path", "the file of a state", str(path), f"The system says: {error}.") from error
     head, _, body = content.partition(b"\n")
@@ -107,6 +111,13 @@ def sequence_state(sequence: np.random.SeedSequence | None) -> dict[str, Any] | 
 def restored_sequence(state: Mapping[str, Any] | None) -> np.random.SeedSequence | None:
     """Return the seed sequence that `sequence_state` described."""
     return None if state is None else np.random.SeedSequence(**state)
+
+
+def _checked_path(path: Any) -> Path:
+    """Return a path that can name a file."""
+    if not isinstance(path, (str, PathLike)) or "\0" in str(path):
+        raise bad_argument("path", "the path of a file", path, "Give a text or a Path, without NUL characters.")
+    return Path(path)
 
 
 def _check_version(name: str, found: Any) -> None:

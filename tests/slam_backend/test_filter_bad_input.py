@@ -126,6 +126,9 @@ def test_unknown_estimates_and_states_are_refused() -> None:
         part = {key: value for key, value in state.items() if key != name}
         with pytest.raises(ValueError, match=rf"^state: expected a dict from FastSlam\.get_state, got no '{name}'\."):
             slam.set_state(part)
+    for other in (None, 3, [1]):
+        with pytest.raises(ValueError, match=r"state: expected a dict from FastSlam\.get_state, got a "):
+            slam.set_state(other)
     for name in state["maps"]:
         maps = {key: value for key, value in state["maps"].items() if key != name}
         with pytest.raises(ValueError, match=rf"^state: expected a dict from .*, got no 'maps\.{name}'\."):

@@ -77,6 +77,23 @@ CASES: dict[str, tuple[Callable[[], Any], str]] = {
     "missing world in a config": (lambda: ExplorationEnv(EnvConfig(world="nowhere.json")), r"nowhere\.json"),
     "world of a wrong type": (lambda: small_env(world=3), "world: expected a name, a path, .*, got 3"),
     "function that makes no world": (_reset(world=lambda rng: 5), "world: expected a function that returns a World"),
+    "function without an argument": (
+        lambda: small_env(world=lambda: CLOSET),
+        "world: expected a function of one argument, a random generator, got <function .*too many positional",
+    ),
+    "class as a function": (
+        lambda: small_env(world=World),
+        "world: expected a function of one argument, .*missing a required argument: 'walls'",
+    ),
+    "path too long": (lambda: small_env(world="x" * 5000), "world: expected .*, got 'xxx"),
+    "path of a file too long": (
+        lambda: small_env(world="x" * 5000 + ".json"),
+        "world: expected a file, got 'xxx.*Check the path: File name too long",
+    ),
+    "robots fit, but on no cell": (
+        _reset(world=World("box", [[0, 0, 0.5, 0], [0.5, 0, 0.5, 0.5], [0.5, 0.5, 0, 0.5], [0, 0.5, 0, 0]])),
+        "a disc of radius 0.2 m fits anywhere in a 0.1 m cell, got no such cell in 'box'.* make rooms 0.7 m wide",
+    ),
     "robots do not fit": (_reset(world=NARROW), "a disc of radius 0.2 m fits"),
     "starts do not fit": (_reset(world=CLOSET, num_robots=8), "num_robots: expected as many as can start 5 m apart"),
     "no robots": (lambda: small_env(num_robots=0), "num_robots: expected an int >= 1, got 0"),
@@ -117,6 +134,27 @@ CASES: dict[str, tuple[Callable[[], Any], str]] = {
     "missing config": (
         lambda: small_env(config="nowhere.toml"),
         r"config: expected a readable TOML file.*nowhere\.toml",
+    ),
+    "config that is no TOML": (
+        lambda: EnvConfig.from_toml_text("[x"),
+        r"config: expected TOML, got '\[x'\. The reader says: ",
+    ),
+    "config of no text": (lambda: EnvConfig.from_toml_text(3), "config: expected TOML as text, got 3"),
+    "config file with a NUL": (
+        lambda: EnvConfig.from_toml("a\0.toml"),
+        "config: expected a readable TOML file, got .*null",
+    ),
+    "cycles as text": (
+        lambda: setattr(small_env(), "max_cycles", "x"),
+        "max_cycles: expected an int >= 1, got 'x'",
+    ),
+    "no number of cycles": (
+        lambda: setattr(small_env(), "max_cycles", None),
+        "max_cycles: expected an int >= 1, got None",
+    ),
+    "recorder that records nothing": (
+        lambda: setattr(small_env(), "recorder", 5),
+        "recorder: expected a function or None, got 5",
     ),
     "unknown field": (lambda: small_env().config.replace(robots=2), "robots: expected a known field, got 2"),
     "unknown nested field": (
@@ -323,6 +361,10 @@ CASES: dict[str, tuple[Callable[[], Any], str]] = {
     "belief of a stranger": (
         lambda: (env := small_env(), env.reset(seed=0), env.belief("robot_9")),
         r"agent: expected one of \['robot_0', 'robot_1'\], got 'robot_9'",
+    ),
+    "belief of an array": (
+        lambda: (env := small_env(), env.reset(seed=0), env.belief(np.zeros(3))),
+        r"agent: expected one of \['robot_0', 'robot_1'\], got array",
     ),
 }
 

@@ -2,6 +2,7 @@ import copy
 import hashlib
 import os
 import pickle
+import stat
 import subprocess
 import sys
 from collections.abc import Callable
@@ -285,6 +286,30 @@ def test_files_are_whole_or_not_there(tmp_path: Path) -> None:
     assert [file.name for file in tmp_path.iterdir()] == ["state"]
     with pytest.raises(ValueError, match="path: expected a file that can be written"):
         save_state(state, tmp_path / "nowhere" / "state")
+    for other in (None, 3, "a\0b", Path("a\0b")):
+        with pytest.raises(ValueError, match="path: expected the path of a file, got "):
+            save_state(state, other)
+        with pytest.raises(ValueError, match="path: expected the path of a file, got "):
+            load_state(other)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="modes of files are POSIX")
+def test_files_are_those_that_open_makes(tmp_path: Path) -> None:
+    """Who may read the file follows from the process' umask; a pipe, a device or a folder is not replaced."""
+    state = _begun(steps=1).get_state()
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    former = os.umask(0o027)
+    try:
+        save_state(state, tmp_path / "state")
+    finally:
+        os.umask(former)
+    assert stat.S_IMODE((tmp_path / "state").stat().st_mode) == 0o640
+    for other in (pipe, tmp_path, "."):
+        with pytest.raises(ValueError, match=r"path: expected a file that can be written, got .*something else"):
+            save_state(state, other)
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["pipe", "state"]
+    assert stat.S_ISFIFO(pipe.stat().st_mode)
 
 
 @pytest.mark.parametrize(

@@ -56,9 +56,9 @@ class FreeSpace:
         if not fits.any():
             raise bad_argument(
                 "world",
-                f"walls that enclose a space in which a disc of radius {radius:g} m fits",
-                f"no such space in {world.name!r}",
-                "Close the outer walls, widen the rooms, or check that the unit is metres.",
+                f"walls that enclose a space in which a disc of radius {radius:g} m fits anywhere in a {CELL:g} m cell",
+                f"no such cell in {world.name!r}",
+                f"Close the outer walls, make rooms {2 * radius + 0.3:g} m wide, or check that the unit is metres.",
             )
         self.reachable: BoolArray = fits == self._main_part(fits)
         self.open_space: BoolArray = labels == labels[self.reachable][0]

@@ -2,13 +2,15 @@
 
 from collections.abc import Callable
 from functools import lru_cache
+from inspect import signature
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from slam_backend.errors import bad_argument
 from vslam_env.world.fig5 import fig5
-from vslam_env.world.floorplan import load_floorplan, load_walls_json
+from vslam_env.world.floorplan import existing, load_floorplan, load_walls_json
 from vslam_env.world.hall import hall
 from vslam_env.world.loops import loops
 from vslam_env.world.maze import maze
@@ -61,9 +63,26 @@ def check_source(world: object) -> None:
     if isinstance(world, (str, Path)):
         if not (isinstance(world, str) and world in WORLD_FAMILIES):
             _files(world)
-    elif not isinstance(world, World) and not callable(world):
+    elif isinstance(world, World):
+        return
+    elif callable(world):
+        _check_maker(world)
+    else:
         cure = f"Names: {', '.join(WORLD_FAMILIES)}."
         raise bad_argument("world", "a name, a path, a World or a function", world, cure)
+
+
+def _check_maker(maker: Callable[..., Any]) -> None:
+    """Refuse a function that cannot be called with a random generator alone."""
+    try:
+        taken = signature(maker)
+    except (TypeError, ValueError):  # some built-in functions do not tell
+        return
+    try:
+        taken.bind(None)
+    except TypeError as error:
+        cure = f"Define it as def make(rng); the call says: {error}."
+        raise bad_argument("world", "a function of one argument, a random generator", maker, cure) from error
 
 
 def is_one_building(world: WorldSource) -> bool:
@@ -98,7 +117,11 @@ def _read(path: Path, changed: int) -> World:
 def _files(world: str | Path) -> list[Path]:
     """Return the file at a path, or those of a folder, at least one; an image of a YAML file counts with it."""
     path = Path(world)
-    if path.is_dir() and world != "":  # the path of no characters would be the current folder
+    try:
+        is_folder = path.is_dir()
+    except OSError as error:  # e.g. a name too long for the system
+        raise bad_argument("world", "a file", str(path), f"Check the path: {error.strerror}.") from error
+    if is_folder and world != "":  # the path of no characters would be the current folder
         files = sorted(p for p in path.iterdir() if p.suffix.lower() in FILE_SUFFIXES)
         maps = {file.stem for file in files if file.suffix.lower() in MAP_SUFFIXES}
         files = [file for file in files if file.stem not in maps or file.suffix.lower() not in IMAGE_SUFFIXES]
@@ -114,6 +137,4 @@ def _files(world: str | Path) -> list[Path]:
             str(world),
             "Check the spelling, or that the file ends in .png, .jpg, .pgm, .yaml or .json.",
         )
-    if not path.is_file():
-        raise bad_argument("world", "a file", str(path), "Check the path: there is no such file.")
-    return [path]
+    return [existing(path)]
