@@ -99,7 +99,7 @@ def test_a_belief_keeps_nothing_that_the_caller_may_write_to() -> None:
 
 
 def test_true_ids_are_not_those_of_the_books() -> None:
-    """The simulator's books may look at what was measured again, when robots return; who writes to frames changes none."""
+    """The simulator looks at those again when robots return; who writes to frames changes nothing there."""
     env = small_env()
     env.reset(seed=5, options={"start_poses": MEETING})
     names = env.episode._frames.names
