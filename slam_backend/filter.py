@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from slam_backend._journal import tell_refused
 from slam_backend._rejuvenation_step import RejuvenationStep
-from slam_backend._step_input import check_step
+from slam_backend._step_input import FARTHEST_POSE, check_step
 from slam_backend._turns import take_turns
 from slam_backend.adaptation import AdaptiveParticles, next_num_particles
 from slam_backend.camera import StereoCamera
@@ -109,7 +109,8 @@ class FastSlam(FilterKnowledge):
         self._set_up(num_robots, options, seed)
         if initial_poses is not None:
             cure = "Give one pose (x, y, theta) per robot."
-            self._poses[:] = check_array("initial_poses", initial_poses, (num_robots, 3), cure)[:, :, None]
+            starts = check_array("initial_poses", initial_poses, (num_robots, 3), cure, within=FARTHEST_POSE)
+            self._poses[:] = starts[:, :, None]
             self._poses[:, 2] = wrap_angle(self._poses[:, 2])
             self._starts[:] = self._means[:] = self._poses
             self._look_at_starts()

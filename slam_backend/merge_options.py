@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
+from slam_backend.adaptation import MOST_PARTICLES
 from slam_backend.errors import bad_argument, check_choice, check_float, check_int
 
 METHODS = ("particles", "mixture")
@@ -42,7 +43,8 @@ class MergeOptions:
     def __post_init__(self) -> None:
         check_choice("merging.method", self.method, METHODS)
         if self.merged_particles is not None:
-            check_int("merging.merged_particles", self.merged_particles, 1, "Use None for the larger of the two.")
+            cure = "Use None for the larger of the two."
+            check_int("merging.merged_particles", self.merged_particles, 1, cure, MOST_PARTICLES)
         if not isinstance(self.straighten, bool):
             raise bad_argument("merging.straighten", "True or False", self.straighten, "Give a bool.")
         check_float("merging.sure", self.sure, "Use 5, or 0 to merge however uncertain it is.", at_least=0.0)

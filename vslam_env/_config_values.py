@@ -18,8 +18,12 @@ NONE = "none"  # what TOML, which has no word for it, says for None
 def validated(cls: type[T], values: Mapping[str, Any]) -> T:
     """Build `cls` from nested dicts, or raise the project's one error for the first thing that is wrong."""
     try:
+        text = json.dumps(plain(values), default=str)
+    except (ValueError, RecursionError) as error:  # an int of 5000 digits, or a part that holds itself
+        raise bad_argument("config", "values that JSON can hold", "no such values", f"It says: {error}.") from error
+    try:
         # Strict on JSON refuses 2.0, "2" and True as ints, but takes dicts for parts, lists for tuples, int for float.
-        return TypeAdapter(cls).validate_json(json.dumps(plain(values), default=str), strict=True)
+        return TypeAdapter(cls).validate_json(text, strict=True)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         own = first.get("ctx", {}).get("error")

@@ -181,7 +181,7 @@ class EnvConfig:
         """
         try:
             values = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:  # of the path, of the encoding and of the syntax
+        except (OSError, TypeError, ValueError) as error:  # of the path, of the encoding and of the syntax
             raise bad_argument("config", "a readable TOML file", str(path), f"The reader says: {error}.") from error
         return cls.from_dict(nested.with_none(values))
 

@@ -41,6 +41,7 @@ ARGUMENTS = [
     ({"recovery_position": np.inf}, r"recovery_position: expected a finite number >= 0, got inf"),
     ({"one_to_one": 1}, r"one_to_one: expected a bool, got 1"),
     ({"initial_poses": [0.0, 0.0, 0.0]}, r"initial_poses: expected an array of shape \(1, 3\), got shape \(3,\)"),
+    ({"initial_poses": [[1e308, 0.0, 0.0]]}, r"initial_poses: expected numbers within \+-1e\+06, got 1e\+308"),
     ({"initial_poses": [[0.0, 0.0, np.inf]]}, r"initial_poses: expected finite numbers, got NaN or infinity at"),
 ]
 

@@ -114,6 +114,7 @@ def test_a_team_merges_by_mixtures_and_goes_on() -> None:
     [
         ({"method": "best"}, r"merging\.method: expected one of 'particles', 'mixture', got 'best'"),
         ({"merged_particles": 0}, r"merging\.merged_particles: expected an int >= 1, got 0\. Use None for the larger"),
+        ({"merged_particles": 10**9}, r"merging\.merged_particles: expected an int <= 1000000, got 1000000000"),
         ({"watch_steps": -1}, r"merging\.watch_steps: expected an int >= 0, got -1\. Use 0 to make merges final"),
         ({"watch_every": 0}, r"merging\.watch_every: expected an int >= 1, got 0"),
         ({"barred_steps": 1.5}, r"merging\.barred_steps: expected an int >= 0, got 1\.5"),

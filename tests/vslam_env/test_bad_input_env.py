@@ -9,7 +9,7 @@ from small_env import MEETING, WALLS, small_env
 
 from vslam_env import EnvConfig, ExplorationEnv, World, vslam_v0
 from vslam_env.solo import SoloExplorationEnv
-from vslam_env.world import Landmarks
+from vslam_env.world import Landmarks, load_floorplan, load_walls_json, save_walls_json
 
 NARROW = World("narrow", [[0, 0, 9, 0], [9, 0, 9, 0.3], [9, 0.3, 0, 0.3], [0, 0.3, 0, 0]])
 CLOSET = World("closet", [[0, 0, 2, 0], [2, 0, 2, 2], [2, 2, 0, 2], [0, 2, 0, 0]])
@@ -338,7 +338,30 @@ CASES: dict[str, tuple[Callable[[], Any], str]] = {
     "oracle as number": (lambda: small_env(oracle_pose=1), "oracle_pose: expected a valid boolean, got 1"),
     "landmarks too dense": (
         lambda: small_env().config.replace(landmarks={"density": -1.0}),
-        "landmarks.density: expected a finite number > 0, got -1",
+        "landmarks.density: expected a finite number > 0 and <= 10000, got -1",
+    ),
+    "descriptors without end": (
+        lambda: small_env().config.replace(landmarks={"descriptor_size": 10**9}),
+        "landmarks.descriptor_size: expected an int <= 10000, got 1000000000",
+    ),
+    "field that JSON cannot hold": (
+        lambda: small_env().config.replace(num_robots=10**5000),
+        "config: expected values that JSON can hold, got no such values",
+    ),
+    "floor plan at no path": (lambda: load_floorplan(None), "world: expected a path, got None"),
+    "walls at no path": (lambda: load_walls_json(3), "world: expected a path, got 3"),
+    "config at no path": (lambda: EnvConfig.from_toml(None), "config: expected a readable TOML file, got 'None'"),
+    "walls to no path": (
+        lambda: save_walls_json(CLOSET, None),
+        "path: expected a file that can be written, got 'None'",
+    ),
+    "landmarks beyond all maps": (
+        lambda: _blank_world(np.array([[1e308, 0.0, 0.0]])),
+        r"landmarks\.positions: expected numbers within \+-1e\+08, got 1e\+308",
+    ),
+    "looks of endless length": (
+        lambda: Landmarks([[0, 0, 0]], [[1, 0]], [0], [[1e30]]),
+        r"landmarks\.descriptors: expected numbers within \+-1e\+06, got 1",
     ),
     "no state": (lambda: small_env().set_state([]), "state: expected what get_state returned, got a list"),
     "negative seed in a solo environment": (

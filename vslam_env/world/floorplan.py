@@ -1,6 +1,7 @@
 """A floor plan, drawn as an image or written as JSON, becomes a `World`."""
 
 import json
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -115,7 +116,7 @@ def save_walls_json(world: World, path: str | Path) -> None:
         content["start_poses"] = world.start_poses.tolist()
     try:
         Path(path).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-    except OSError as error:
+    except (OSError, TypeError, ValueError) as error:  # the latter two are of what is no path
         raise bad_argument("path", "a file that can be written", str(path), f"The system says: {error}.") from error
 
 
@@ -144,6 +145,8 @@ def existing(path: str | Path) -> Path:
     Raises:
         ValueError: If there is no such file.
     """
+    if not isinstance(path, (str, PathLike)):
+        raise bad_argument("world", "a path", path, "Give a text or a Path.")
     path = Path(path)
     try:
         is_there = path.is_file()

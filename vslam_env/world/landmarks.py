@@ -37,11 +37,11 @@ class LandmarkConfig:
     repeated: float = 0.0
 
     def __post_init__(self) -> None:
-        check_float("landmarks.density", self.density, "Give landmarks per metre of wall face.", above=0.0)
+        check_float("landmarks.density", self.density, "Give landmarks per metre of wall face.", above=0.0, at_most=1e4)
         check_float("landmarks.min_height", self.min_height, "Give metres.")
         check_float("landmarks.max_height", self.max_height, "Give metres, above min_height.", at_least=self.min_height)
         check_float("landmarks.min_spacing", self.min_spacing, "Give metres.", at_least=0.0)
-        check_int("landmarks.descriptor_size", self.descriptor_size, 2, "Use 64 for u-SURF.")
+        check_int("landmarks.descriptor_size", self.descriptor_size, 2, "Use 64 for u-SURF.", 10_000)
         cure = "Unrelated unit vectors differ by 1.41."
         check_float("landmarks.distinctness", self.distinctness, cure, above=0.0, at_most=2**0.5)
         check_float("landmarks.repeated", self.repeated, "Give a share.", at_least=0.0, at_most=1.0)

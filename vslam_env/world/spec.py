@@ -10,6 +10,7 @@ from slam_backend.errors import FloatArray, IntArray, bad_argument, check_array
 
 SHORTEST_WALL = 1e-3  # [m] anything shorter has no direction worth the name
 LARGEST_EXTENT = 200.0  # [m] grids of free space grow with its square
+LONGEST = 1e6  # component of a vector whose square is still a float32
 FARTHEST_PLACE = 1e8  # [m] from the origin; no map frame on earth has more, and differences keep their micrometres
 
 
@@ -35,10 +36,10 @@ class Landmarks:
     def __post_init__(self) -> None:
         cure = "Give one row per landmark."
         positions: Any = check_array("landmarks.positions", self.positions, (None, 3), cure, within=FARTHEST_PLACE)
-        normals: Any = check_array("landmarks.normals", self.normals, (len(positions), 2), cure)
+        normals: Any = check_array("landmarks.normals", self.normals, (len(positions), 2), cure, within=LONGEST)
         walls: Any = check_array("landmarks.walls", self.walls, (len(positions),), cure, dtype=np.int64)
         descriptors: Any = check_array(
-            "landmarks.descriptors", self.descriptors, (len(positions), None), cure, dtype=np.float32
+            "landmarks.descriptors", self.descriptors, (len(positions), None), cure, dtype=np.float32, within=LONGEST
         )
         for name, vectors in (("normals", normals), ("descriptors", descriptors)):
             lengths = np.linalg.norm(vectors, axis=1)
