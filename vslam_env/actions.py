@@ -74,6 +74,8 @@ def _continuous_commands(actions: Mapping[str, Any], agents: Sequence[str]) -> F
 
 def _pair(agent: str, action: Any) -> tuple[float, float]:
     """Return two numbers in any form as floats, or raise."""
+    if isinstance(action, (list, tuple)) and len(action) == 2 and all(type(part) is float for part in action):
+        return action[0], action[1]
     name = f"actions[{agent!r}]"
     speed, turn = check_array(name, action, (2,), PAIR_CURE, finite=False).tolist()
     parts = np.asarray(action, dtype=object).tolist()
