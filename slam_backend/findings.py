@@ -68,7 +68,7 @@ class Findings(NamedTuple):
 
     def _names(self, row: int, kind: int) -> list[int]:
         """Return the names among what became of the measurements of a robot."""
-        _, begin, end, _, _, _ = self.turns[row]
+        _, begin, end, _, _, _ = self.turns[row] if row >= 0 else UNHEARD
         found: list[int] = self.told[kind, begin:end].tolist()
         return [name for name in found if name != REJECTED]
 

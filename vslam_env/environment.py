@@ -242,12 +242,13 @@ class ExplorationEnv(EnvKnowledge):
             return
         if self._episode is None:
             self._episode = Episode(self.config, state["episode"]["setting"], self._tap)
-        if not (set(state["agents"]) <= set(self.possible_agents) and isinstance(state["standing"], Standing)):
-            raise TypeError("agents or standing are of another kind")
+        agents, figures, cycle = (state[part] for part in ("agents", "standing", "cycle"))
+        if not (set(agents) <= set(self.possible_agents) and isinstance(figures, Standing) and type(cycle) is int):
+            raise TypeError("agents, standing or cycle are of another kind")
         self._episode.set_state(state["episode"])
         self._drivers = Drivers(self.config)
         self._drivers.set_state(state["drivers"])
-        self._standing, self._cycle, self.agents = state["standing"], state["cycle"], list(state["agents"])
+        self._standing, self._cycle, self.agents = figures, cycle, list(agents)
 
     def clone(self) -> "ExplorationEnv":
         """Return an independent environment in the same state, for looking ahead; without window and recorder."""

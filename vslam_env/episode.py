@@ -157,6 +157,8 @@ class Episode:
         Raises:
             ValueError: If it is of another number of robots, or no state.
         """
+        if type(state["tick"]) is not int or state["streams"].keys() != self._streams.keys():
+            raise TypeError("tick or random streams are of another kind")
         if state["setting"] is not self.setting:
             self._settle(state["setting"])
         self._simulator.set_state(state["simulator"])

@@ -2,7 +2,7 @@
 
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import permutations
+from itertools import islice, permutations
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,9 +13,9 @@ from slam_backend.reports import MapDropped, MergeUndone, Renaming, TeamReport
 from slam_backend.standpoints import Standpoints
 from vslam_env.navigation import SeenGrid, TeamGrids, ray_directions
 from vslam_env.robot_belief import Body
-from vslam_env.strokes import Strokes, Telling, caught_up
+from vslam_env.strokes import Strokes, Telling, caught_up, separated
 
-TOGETHER, STRANGERS = -1, -2  # in place of the tick in which two robots lost each other
+TOGETHER, STRANGERS = -1, -2  # in place of the tick in which two robots lost each other; strangers come first
 LONGEST_ABSENCE = 1000  # [ticks] whoever is away for longer comes back as a stranger: to paint takes 10 us a tick
 
 
@@ -27,12 +27,14 @@ class Kept(NamedTuple):
         sides: The robots of either group.
         maps: Numbers of a's map, of b's and of the joint one.
         grids: State of each robot's grid.
+        strokes: What was known then of the ticks before, of which somebody may miss something.
     """
 
     tick: int
     sides: tuple[tuple[int, ...], tuple[int, ...]]
     maps: tuple[int, int, int]
     grids: dict[int, dict[str, Any]]
+    strokes: tuple[Strokes, ...]
 
 
 class SharedGrids:
@@ -40,10 +42,10 @@ class SharedGrids:
 
     Robots that go by one filter paint what each of them scans into all of their grids. Those that come together for
     the first time, by a merge, absorb each other's grids. Those that lost each other and return paint what their grids
-    miss of what was scanned meanwhile, so that no scan is painted twice: to absorb whole grids each time would add all
-    walls anew, a little thicker, to what came from the same scans. While a merge can be undone the grids from before
-    it are kept, with what was painted since; an undo restores them and paints again what the robots of each side
-    scanned.
+    miss of what was scanned meanwhile, so that no scan is painted twice, but for what strangers hold in common: to
+    absorb whole grids each time would add all walls anew, a little thicker, to what came from the same scans. While a
+    merge can be undone the grids from before it are kept, with what was painted since; an undo restores them and paints
+    again what the robots of each side scanned or told each other.
 
     Args:
         num_robots: K.
@@ -74,7 +76,7 @@ class SharedGrids:
         """
         sides = renaming.robots_a, renaming.robots_b
         grids = {robot: self._grids[robot].get_state() for robot in sides[0] + sides[1]}
-        self._kept.append(Kept(tick, sides, renaming.maps, grids))
+        self._kept.append(Kept(tick, sides, renaming.maps, grids, tuple(self._strokes)))
 
     def step(
         self,
@@ -119,7 +121,9 @@ class SharedGrids:
                 self._kept = [kept for kept in self._kept if entry.number not in kept.maps[:2]]
         if self._oldest_parting is not None and self._oldest_parting < tick - LONGEST_ABSENCE:
             self._look_for_parted(tick)
-        oldest = self._kept[0].tick if self._kept else tick  # both stand in order of time
+        oldest = tick
+        if self._kept:  # in order of time; what somebody missed then may be told since
+            oldest = self._kept[0].strokes[0].tick if self._kept[0].strokes else self._kept[0].tick
         if self._oldest_parting is not None:
             oldest = min(oldest, self._oldest_parting)
         while self._strokes and self._strokes[0].tick < oldest:
@@ -131,12 +135,11 @@ class SharedGrids:
         if kept is None:
             return  # it was made and undone within a tick
         self._kept.remove(kept)
-        for side in kept.sides:
-            for robot in side:
-                self._grids[robot].set_state(kept.grids[robot])
-            for strokes in self._strokes:
-                if strokes.tick >= kept.tick:
-                    self.team.paint_readings(*strokes.within(side)[1:], *self._hardware)
+        for robot in kept.sides[0] + kept.sides[1]:
+            self._grids[robot].set_state(kept.grids[robot])
+        self._strokes, again = map(deque, separated(self._strokes, kept.strokes, kept.sides))
+        for strokes in again:
+            self.team.paint_readings(*strokes[1:], *self._hardware)
         one, two = kept.sides
         self._parted[np.ix_(one, two)] = self._parted[np.ix_(two, one)] = STRANGERS
         side_of = {robot: side for side in kept.sides for robot in side}
@@ -160,8 +163,10 @@ class SharedGrids:
             for telling in tellings:
                 if telling.is_whole:
                     self._grids[telling.taker].absorb(grids[telling.giver], telling.motion)
-            history, missed = caught_up(self._strokes, tellings)
-            self._strokes = deque(history)
+            first = max(0, len(self._strokes) - max(tick - telling.since for telling in tellings))
+            after, missed = caught_up(list(islice(self._strokes, first, None)), tellings)
+            for row, strokes in enumerate(after, first):
+                self._strokes[row] = strokes
             for strokes in missed:
                 self.team.paint_readings(*strokes[1:], *self._hardware)
         self._settle(tick, mates)
@@ -171,9 +176,10 @@ class SharedGrids:
         before = sorted({tuple(mate for mate in self._mates[robot] if mate in now) for robot in now})
         for part, other in permutations(before, 2):
             # Robots that were together have seen the same already, so that one of each part stands for all of it.
-            are_strangers = bool((self._parted[np.ix_(part, other)] == STRANGERS).any())
+            since = int(self._parted[np.ix_(part, other)].min())
             for robot in part:
-                yield Telling(other[0], robot, compose(starts[robot], inverse(starts[other[0]])), are_strangers)
+                motion = compose(starts[robot], inverse(starts[other[0]]))
+                yield Telling(other[0], robot, motion, since, since == STRANGERS)
 
     def _settle(self, tick: int, mates: Sequence[tuple[int, ...]]) -> None:
         """Take note of who goes by the same filter as whom from a tick on."""

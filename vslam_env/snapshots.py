@@ -16,7 +16,7 @@ import numpy as np
 from slam_backend.errors import bad_argument
 from vslam_env.config import EnvConfig
 
-STATE_FORMAT = 25  # raised when what a state holds changes; a state goes on bit by bit only with what made it
+STATE_FORMAT = 26  # raised when what a state holds changes; a state goes on bit by bit only with what made it
 MAGIC = b"vslam_env state "
 KEYS = ("version", "config", "root", "agents", "cycle", "episode", "drivers", "standing")
 
@@ -93,7 +93,12 @@ def load_state(path: str | Path) -> EnvState:
     mark, _, body = body.partition(b"\n")
     if mark.decode(errors="replace") != _fingerprint(body):
         raise bad_argument("path", "a whole file of a state", f"a damaged file {path}", "Save it again.")
-    return dict(_checked(str(path), pickle.loads(body)))
+    try:
+        state = pickle.loads(body)
+    except Exception as error:
+        cure = f"Read it where it was written; reading says: {error}."
+        raise bad_argument("path", "the file of a state that can be read here", str(path), cure) from error
+    return dict(_checked(str(path), state))
 
 
 def _fingerprint(body: bytes) -> str:

@@ -26,11 +26,6 @@ class Strokes(NamedTuple):
     scans: FloatArray
     bumps: BoolArray
 
-    def within(self, side: Sequence[int]) -> "Strokes":
-        """Return those of some robots' readings that went into these robots' grids."""
-        own = np.isin(np.arange(len(self.shared)), side)
-        return self._replace(shared=self.shared * own * own[:, None])
-
 
 class Telling(NamedTuple):
     """That one robot's grid takes what another's has.
@@ -38,12 +33,14 @@ class Telling(NamedTuple):
     Attributes:
         giver, taker: These robots.
         motion: (3,) [m, m, rad]. The giver's start pose in the taker's start frame.
+        since: The taker may miss what was read from this tick on.
         is_whole: Whether the taker absorbs the whole of it, strokes that are forgotten included.
     """
 
     giver: int
     taker: int
     motion: FloatArray
+    since: int
     is_whole: bool
 
 
@@ -61,15 +58,39 @@ def caught_up(history: Sequence[Strokes], tellings: Iterable[Telling]) -> tuple[
         return [], []
     before = np.array([strokes.shared for strokes in history])
     shared, missed, poses = before.copy(), np.zeros_like(before), np.array([strokes.poses for strokes in history])
-    for giver, taker, motion, is_whole in tellings:
+    for giver, taker, motion, _, is_whole in tellings:
         ticks, readers = np.nonzero(before[:, giver] > shared[:, taker])
         shared[ticks, taker, readers] = 1
         missed[ticks, taker, readers] = not is_whole
         poses[ticks, taker, readers] = compose(motion, poses[ticks, giver, readers])
     rows = (shared != before).any(axis=(1, 2))
     after = [
-        strokes._replace(shared=shared[row], poses=poses[row]) if rows[row] else strokes
+        strokes._replace(shared=shared[row].copy(), poses=poses[row].copy()) if rows[row] else strokes
         for row, strokes in enumerate(history)
     ]
     late = np.flatnonzero(missed.any(axis=(1, 2)))
     return after, [after[row]._replace(shared=missed[row]) for row in late.tolist()]
+
+
+def separated(
+    history: Iterable[Strokes], before: Iterable[Strokes], sides: Sequence[Sequence[int]]
+) -> tuple[list[Strokes], list[Strokes]]:
+    """Return a history in which two sides were never together, and what is to be painted into their grids of before.
+
+    Args:
+        history: With all that either side took from the other.
+        before: The history when they came together; what stands there is in the grids.
+        sides: The robots of either; others keep what they have.
+    """
+    then, after, again = {strokes.tick: strokes.shared for strokes in before}, [], []
+    for strokes in history:
+        own = np.zeros_like(strokes.shared)
+        for side in sides:
+            own[np.ix_(side, side)] = strokes.shared[np.ix_(side, side)]
+        held = then.get(strokes.tick, np.zeros_like(own))
+        shared, robots = strokes.shared.copy(), [robot for side in sides for robot in side]
+        shared[robots] = held[robots] | own[robots]
+        after.append(strokes._replace(shared=shared))
+        if (missing := own & ~held).any():
+            again.append(strokes._replace(shared=missing))
+    return after, again

@@ -7,7 +7,7 @@ from small_env import MEETING, small_env, turning
 
 from slam_backend.findings import Findings
 from slam_backend.geometry import between, compose, inverse
-from slam_backend.reports import TeamReport
+from slam_backend.reports import MergeUndone, Renaming, TeamReport
 from slam_backend.standpoints import Standpoints
 from vslam_env.navigation import OCCUPIED, UNKNOWN
 from vslam_env.robot_belief import Body
@@ -18,7 +18,7 @@ BODY = Body(radius=0.2, ray_angles=ANGLES, scan_range=MAX_RANGE)
 STARTS = np.array([[7.3, 2.5, 1.5], [8.6, 1.8, 2.1], [6.2, 2.9, -2.0]])  # of three robots, in one room of the building
 NEAR, FAR = [5.4, 0.4, -4.0], [9.6, 4.1, 4.0]  # corners of that room; headings as they come
 ALL, NONE = ((0, 1, 2),) * 3, ((0,), (1,), (2,))
-NOTHING = np.empty(0, np.int64)
+NOTHING, NO_MOTION = np.empty(0, np.int64), np.zeros(3)
 Mates = tuple[tuple[int, ...], ...]
 
 
@@ -43,15 +43,16 @@ class Drive:
         self.grids, self.tick = SharedGrids(3, BODY), 0
         self._rng, self._path = np.random.default_rng(seed), STARTS.copy()
 
-    def on(self, mates: Mates) -> None:
-        """Drive on for a tick, with these in contact."""
+    def on(self, mates: Mates, *entries: Renaming | MergeUndone, off: np.ndarray = NO_MOTION) -> None:
+        """Drive on for a tick, with these in contact, after what became of maps; 0 and 1 see each other `off`."""
         way = self._rng.uniform([-0.05, -0.05, -0.2], [0.15, 0.05, 0.2], (3, 3))
         self._path = np.clip(compose(self._path, way), NEAR, FAR)
         scans = np.array([cast(building(), pose) for pose in self._path])
-        report = TeamReport(
-            self.tick, Findings.gathered([NOTHING], [NOTHING]), mates, (), (), (0, 0, 0), (), self.tick + 1
-        )
-        self.grids.step(self.tick, report, mates, stand(self._path), scans, np.zeros(3, np.bool_))
+        points, merges = stand(self._path), tuple(entry for entry in entries if isinstance(entry, Renaming))
+        points.poses[0, 1], points.poses[1, 0] = compose(off, points.poses[0, 1]), compose(off, points.poses[1, 0])
+        told = Findings.gathered([NOTHING], [NOTHING])
+        report = TeamReport(self.tick, told, mates, (), merges, (0, 0, 0), entries, self.tick + 1)
+        self.grids.step(self.tick, report, mates, points, scans, np.zeros(3, np.bool_))
         self.tick += 1
 
     def cells(self) -> np.ndarray:
@@ -124,17 +125,63 @@ def test_what_is_told_is_told_once() -> None:
     shared = np.array([[1, 1, 0], [1, 1, 0], [0, 0, 1]])
     strokes = Strokes(7, shared, np.zeros((3, 3, 3)), np.ones((3, 2)), np.zeros(3, np.bool_))
     motion = np.array([1.0, 2.0, 0.5])
-    tellings = [Telling(0, 2, motion, False), Telling(1, 2, motion, False), Telling(2, 0, -motion, True)]
+    tellings = [Telling(0, 2, motion, 0, False), Telling(1, 2, motion, 0, False), Telling(2, 0, -motion, 0, True)]
     (after,), (missed,) = caught_up([strokes], tellings)
     assert missed.shared.tolist() == [[0, 0, 0], [0, 0, 0], [1, 1, 0]]
     assert after.shared.tolist() == [[1, 1, 1], [1, 1, 0], [1, 1, 1]]
     np.testing.assert_array_equal(missed.poses[2, :2], [motion, motion])
-    (later,), (missed,) = caught_up([after], [Telling(0, 1, motion, False)])
+    (later,), (missed,) = caught_up([after], [Telling(0, 1, motion, 0, False)])
     assert later.shared.all()
     assert missed.shared.tolist() == [[0, 0, 0], [0, 0, 1], [0, 0, 0]]
     assert strokes.shared is shared
     assert shared.sum() == 5
     assert caught_up([], tellings) == ([], [])
+
+
+MERGED = Renaming((0, 2), (1,), np.empty((0, 2), np.int64), (0, 1, 3))
+UNDONE = MergeUndone(MERGED.maps)
+PAIR, WITHOUT = ((0, 2), (1,), (0, 2)), ((0, 1), (0, 1), (2,))
+
+
+def test_nothing_of_an_undone_merge_reaches_who_was_away() -> None:
+    """Whoever was away when a merge was made and undone is told what its mates scanned, as if it had never been."""
+    drives = Drive(100), Drive(100)
+    for drive, was_merged in zip(drives, (True, False), strict=True):
+        for mates in [PAIR] * 5 + [NONE] * 5:
+            drive.on(mates)
+        for i in range(15):
+            merges = [MERGED] if was_merged and i == 0 else []
+            drive.on(WITHOUT if was_merged else NONE, *merges, off=np.array([3.0, -2.0, 1.0]))
+        for mates, *undos in [(NONE, UNDONE), (NONE,), (PAIR,), (PAIR,)]:
+            drive.on(mates, *(undos if was_merged else ()))
+    assert (drives[0].cells() == drives[1].cells()).all()
+
+
+def test_what_was_told_within_a_side_outlives_an_undo() -> None:
+    """What robots of a side told each other of the time before the merge is painted again after its undo."""
+    drives = Drive(101), Drive(101)
+    for drive, was_merged in zip(drives, (True, False), strict=True):
+        for mates in [PAIR] * 5 + [NONE] * 20:
+            drive.on(mates)
+        for i in range(6):
+            merges = [MERGED] if was_merged and i == 0 else []
+            apart = i < 3
+            drive.on((WITHOUT if apart else ALL) if was_merged else (NONE if apart else PAIR), *merges)
+        for i in range(5):
+            drive.on(PAIR, *([UNDONE] if was_merged and i == 0 else []))
+    ours, theirs = (drive.cells() for drive in drives)
+    assert ((ours == UNKNOWN) == (theirs == UNKNOWN)).all()
+    assert (ours != theirs).sum() < 0.01 * (theirs != UNKNOWN).sum()
+
+
+def test_a_history_keeps_nothing_but_itself() -> None:
+    """Strokes that were added to own their arrays: views would keep the whole history of each meeting alive."""
+    rng, drive = np.random.default_rng(100), Drive(100)
+    for mates in [ALL] * 2 + [((0,), (1,), (2,)), ((0, 1), (0, 1), (2,))] * 20 + [parted(rng) for _ in range(20)]:
+        drive.on(mates)
+    strokes = drive.grids.get_state()["strokes"]
+    assert strokes
+    assert all(own.shared.base is None and own.poses.base is None for own in strokes)
 
 
 def test_radios_that_lose_half_leave_walls_as_thin_as_they_are() -> None:

@@ -162,6 +162,9 @@ def test_poses_share_no_memory() -> None:
         np.array([[0.0, 0.0], [0.0, np.nan]]),
         np.array([[0.0, np.inf], [0.0, 0.0]]),
         np.array([[0.0, 0.0], [-np.inf, 0.0]]),
+        np.array([[1e300, 0.0], [0.0, 0.0]]),
+        np.array([[0.0, 0.0], [0.0, -1e4]]),
+        np.zeros((2, 2), complex),
     ],
 )
 def test_bad_commands_are_refused(commands: object) -> None:

@@ -230,7 +230,7 @@ def test_a_refused_state_leaves_the_environment_alone() -> None:
     assert _go_on(env, 20) == _go_on(quiet, 20)
 
 
-@pytest.mark.parametrize("part", ["episode", "drivers", "root", "agents", "standing"])
+@pytest.mark.parametrize("part", ["episode", "drivers", "root", "agents", "standing", "cycle"])
 def test_a_state_of_which_a_part_is_damaged_is_refused(part: str) -> None:
     """With the reason; the environment has to be reset, or set to another state, and then is as good as ever."""
     env, quiet = _begun(), _begun()
@@ -241,6 +241,15 @@ def test_a_state_of_which_a_part_is_damaged_is_refused(part: str) -> None:
         env.step({})
     env.set_state(state)
     assert _go_on(env, 20) == _go_on(quiet, 20)
+
+
+@pytest.mark.parametrize("part", ["tick", "streams", "simulator", "belief", "ledger", "coverage", "paths"])
+def test_an_episode_of_which_a_part_is_damaged_is_refused(part: str) -> None:
+    """As a state is."""
+    env = _begun()
+    state = env.get_state()
+    with pytest.raises(ValueError, match=r"state: expected what get_state returned, got a damaged one \(\w+: "):
+        env.set_state(state | {"episode": state["episode"] | {part: {}}})
 
 
 def _marked(content: bytes, body: bytes) -> bytes:
@@ -260,6 +269,10 @@ def _marked(content: bytes, body: bytes) -> bytes:
         (lambda content: content[:-9] + bytes([content[-9] ^ 1]) + content[-8:], "a damaged file"),
         (lambda content: content + b".", "a damaged file"),
         (lambda content: content[: content.index(b"\n") + 1] + pickle.dumps(3), "a damaged file"),
+        (
+            lambda content: _marked(content, b"cnowhere\nat_all\n."),
+            "expected the file of a state that can be read here",
+        ),
         (lambda content: _marked(content, pickle.dumps(3)), "expected what get_state returned, got a int"),
         (None, "path: expected the file of a state, .*no such file|No such file"),
     ],
