@@ -139,7 +139,7 @@ class SharedGrids:
             self._grids[robot].set_state(kept.grids[robot])
         self._strokes, again = map(deque, separated(self._strokes, kept.strokes, kept.sides))
         for strokes in again:
-            self.team.paint_readings(*strokes[1:], *self._hardware)
+            self._paint(strokes)
         one, two = kept.sides
         self._parted[np.ix_(one, two)] = self._parted[np.ix_(two, one)] = STRANGERS
         side_of = {robot: side for side in kept.sides for robot in side}
@@ -168,7 +168,7 @@ class SharedGrids:
             for row, strokes in enumerate(after, first):
                 self._strokes[row] = strokes
             for strokes in missed:
-                self.team.paint_readings(*strokes[1:], *self._hardware)
+                self._paint(strokes)
         self._settle(tick, mates)
 
     def _tellings(self, now: tuple[int, ...], starts: FloatArray) -> Iterator[Telling]:
@@ -180,6 +180,11 @@ class SharedGrids:
             for robot in part:
                 motion = compose(starts[robot], inverse(starts[other[0]]))
                 yield Telling(other[0], robot, motion, since, since == STRANGERS)
+
+    def _paint(self, strokes: Strokes) -> None:
+        """Paint what was read in an earlier tick."""
+        strokes.bumps.setflags(write=False)  # as the world gives them: kernels are compiled for one of both
+        self.team.paint_readings(*strokes[1:], *self._hardware)
 
     def _settle(self, tick: int, mates: Sequence[tuple[int, ...]]) -> None:
         """Take note of who goes by the same filter as whom from a tick on."""
