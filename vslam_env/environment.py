@@ -227,10 +227,8 @@ class ExplorationEnv(EnvKnowledge):
             self._restore(state)
         except Exception as error:
             self._episode, self.agents = None, []
-            said, cure = (
-                f"{type(error).__name__}: {error}",
-                "Pass it unchanged; until then the environment has to be reset.",
-            )
+            said = f"{type(error).__name__}: {error}"
+            cure = "Pass it unchanged; until then the environment has to be reset."
             raise bad_argument("state", "what get_state returned", f"a damaged one ({said})", cure) from error
 
     def _restore(self, state: Mapping[str, Any]) -> None:

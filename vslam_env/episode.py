@@ -113,7 +113,7 @@ class Episode:
         """Drive all robots with velocity commands (K, 2) [m/s, rad/s] for a tick, and let them perceive and believe.
 
         Raises:
-            ValueError: If the shape is wrong or a number is not finite; nothing has changed then.
+            ValueError: If `Simulator.step` refuses them; nothing has changed then.
         """
         simulator, noise, stream = self._simulator, self._config.odometry, self._streams["odometry"]
         before = simulator.poses

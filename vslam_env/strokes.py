@@ -82,13 +82,14 @@ def separated(
         before: The history when they came together; what stands there is in the grids.
         sides: The robots of either; others keep what they have.
     """
-    then, after, again = {strokes.tick: strokes.shared for strokes in before}, [], []
+    robots, then = [robot for side in sides for robot in side], {strokes.tick: strokes.shared for strokes in before}
+    after, again = [], []
     for strokes in history:
         own = np.zeros_like(strokes.shared)
         for side in sides:
             own[np.ix_(side, side)] = strokes.shared[np.ix_(side, side)]
         held = then.get(strokes.tick, np.zeros_like(own))
-        shared, robots = strokes.shared.copy(), [robot for side in sides for robot in side]
+        shared = strokes.shared.copy()
         shared[robots] = held[robots] | own[robots]
         after.append(strokes._replace(shared=shared))
         if (missing := own & ~held).any():
