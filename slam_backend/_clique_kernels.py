@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend._jit import jit
+from slam_backend._jit import device, jit
 from slam_backend.errors import BoolArray, FloatArray, IntArray
 
 Bits = NDArray[np.uint64]
@@ -114,6 +114,7 @@ def largest_clique(agrees: BoolArray, max_nodes: int) -> IntArray:
     return np.sort(names[best[:size]])
 
 
+@device
 @jit
 def _colour(
     vertices: Bits, friends: Bits, least: int, order: IntArray, colours: IntArray, rest: Bits, free: Bits

@@ -9,13 +9,13 @@ their cache would not notice a change of it.
 
 import numpy as np
 
-from slam_backend._jit import fused, in_place, inlined, jit, lanes
+from slam_backend._jit import device, fused, in_place, jit, lanes, lanes_inlined
 from slam_backend.errors import Float32Array, FloatArray, Int32Array, IntArray
 
 ROUNDED = 1.0 + 1e-9  # no rounding decides what is looked at in detail
 
 
-@inlined
+@lanes_inlined
 def in_view(
     depth: float, lateral: float, vertical: float, nearest: float, side: float, rise: float, reach_squared: float
 ) -> bool:
@@ -33,7 +33,7 @@ def in_view(
     )
 
 
-@inlined
+@lanes_inlined
 def updated_log_odds(log_odds: float, seen: bool, expected: bool, sighting: float, miss: float, cap: float) -> float:
     """Return a landmark's log-odds after a frame: Bayes' rule in logarithms, up to the cap.
 
@@ -105,6 +105,7 @@ def landmarks_told_of(
     return slots[:num]
 
 
+@device
 @lanes
 def _is_expected(
     places: Int32Array, values: FloatArray, counts: Int32Array, poses: FloatArray, cosines: FloatArray,

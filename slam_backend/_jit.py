@@ -11,10 +11,12 @@ import numpy as np
 from llvmlite import ir
 from numba.core import cgutils, types
 from numba.core.cpu import CPUTargetOptions
+from numba.core.registry import CPUDispatcher
 from numba.extending import intrinsic
 from numba.np import arrayobj
 from numpy.typing import NDArray
 
+from slam_backend._kernel_cache import KernelCacheFile
 from slam_backend.errors import FloatArray
 
 P = ParamSpec("P")
@@ -32,10 +34,27 @@ LANE_MATH = Path(__file__).parent / KERNELS / "lane_math.py"  # which those of o
 # looks for that. The option is numba's own; in a version that does not know it references are counted everywhere.
 CAN_LEAVE_UNCOUNTED = hasattr(CPUTargetOptions, "_nrt")
 
+# A kernel inherits `fastmath`, `error_model`, `forceinline` and `_nrt` from the kernel whose compilation first
+# asked for it, where it does not set them: results would depend on the order. Each kind of kernel sets all four.
+_STRICT: dict[str, Any] = {"fastmath": False, "error_model": "python"}
+
 # Lane kernels run the same arithmetic over a fixed number of particles, so that the compiler turns it into vector
 # instructions. Two things it needs: a product and a sum may be fused into one instruction (`contract`; sums are not
 # reordered, so the same machine gives the same bytes), and a division by zero gives inf instead of an exception.
 _LANES: dict[str, Any] = {"fastmath": {"contract"}, "error_model": "numpy"}
+_ANY_ORDER: dict[str, Any] = {"fastmath": {"contract", "reassoc", "nsz"}, "error_model": "numpy"}
+
+
+class DeviceKernel(CPUDispatcher):
+    """Kernel that has no wrapper for Python: only other kernels can call it."""
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        """Refuse a call from Python, which would end in a segmentation fault.
+
+        Raises:
+            TypeError: Always.
+        """
+        raise TypeError(f"{self.py_func.__qualname__} can be called by kernels only: remove @device to call it here")
 
 
 def jit(function: Callable[P, T]) -> Callable[P, T]:
@@ -46,12 +65,12 @@ def jit(function: Callable[P, T]) -> Callable[P, T]:
     an edit of any file is noticed, as is one of `LANE_MATH`. `parallel=True` is left out on purpose, because it breaks
     forked workers.
     """
-    return _compiled(function, counted=True)
+    return _compiled(function, counted=True, forceinline=False, **_STRICT)
 
 
 def fused(function: Callable[P, T]) -> Callable[P, T]:
     """Compile a kernel that may make arrays and does little but add products: each is rounded once, as by `lanes`."""
-    return _compiled(function, counted=True, **_LANES)
+    return _compiled(function, counted=True, forceinline=False, **_LANES)
 
 
 def in_place(function: Callable[P, T]) -> Callable[P, T]:
@@ -59,43 +78,64 @@ def in_place(function: Callable[P, T]) -> Callable[P, T]:
 
     It makes no arrays, returns none, and calls none that returns some. So do all kernels compiled by the following.
     """
-    return _compiled(function, counted=False)
+    return _compiled(function, counted=False, forceinline=False, **_STRICT)
 
 
 def inlined(function: Callable[P, T]) -> Callable[P, T]:
     """Compile a small building block into each kernel that calls it: passing arrays costs more than its arithmetic."""
-    return _compiled(function, counted=False, forceinline=True)
+    return device(_compiled(function, counted=False, forceinline=True, **_STRICT))
 
 
 def lanes(function: Callable[P, T]) -> Callable[P, T]:
     """Compile a kernel whose loops over lanes are to become vector instructions, or one as of `fused` in place."""
-    return _compiled(function, counted=False, **_LANES)
+    return _compiled(function, counted=False, forceinline=False, **_LANES)
 
 
 def lanes_inlined(function: Callable[P, T]) -> Callable[P, T]:
     """Compile the arithmetic of one lane into the loops that call it."""
-    return _compiled(function, counted=False, forceinline=True, **_LANES)
+    return device(_compiled(function, counted=False, forceinline=True, **_LANES))
 
 
 def any_order(function: Callable[P, T]) -> Callable[P, T]:
     """Compile a sum over an array that may be taken in any order, the same one each time, so that it is vectorised."""
-    order = {"contract", "reassoc", "nsz"}
-    return _compiled(function, counted=False, forceinline=True, fastmath=order, error_model="numpy")
+    return device(_compiled(function, counted=False, forceinline=True, **_ANY_ORDER))
+
+
+def device(kernel: Callable[P, T]) -> Callable[P, T]:
+    """Leave out the Python wrapper of a kernel that only other kernels call; stands above the kernel's own decorator.
+
+    The wrapper takes as long to compile as a small kernel. A call from Python raises TypeError.
+    """
+    if isinstance(kernel, CPUDispatcher):  # a plain function where NUMBA_DISABLE_JIT is set
+        kernel.targetoptions["no_cpython_wrapper"] = True
+        kernel.__class__ = DeviceKernel
+        _stamp(kernel)
+    return kernel
 
 
 def _compiled(function: Callable[P, T], counted: bool, **options: Any) -> Callable[P, T]:
     """Compile without the interpreter lock and with the cache on disk, if there is a place for it."""
     if CAN_LEAVE_UNCOUNTED:
-        options["_nrt"] = counted  # said of each: numba would take that of the kernel that calls it first
+        options["_nrt"] = counted
+    options |= {"nogil": True, "no_cfunc_wrapper": True}  # no C code calls a kernel
     try:
-        kernel = numba.njit(cache=True, nogil=True, **options)(function)
+        kernel = numba.njit(cache=True, **options)(function)
     except RuntimeError:  # neither the package's folder nor the user's can be written: each process compiles anew
-        return cast(Callable[P, T], numba.njit(nogil=True, **options)(function))
-    folder = Path(function.__code__.co_filename).parent
-    if folder.name.endswith(KERNELS) and hasattr(kernel, "_cache"):  # it has none where NUMBA_DISABLE_JIT is set
-        file = kernel._cache._cache_file
-        file._source_stamp = (file._source_stamp, _contents(folder))
+        kernel = numba.njit(**options)(function)
+    _stamp(kernel)
     return cast(Callable[P, T], kernel)
+
+
+def _stamp(kernel: Any) -> None:
+    """Let entries of the disk cache be stale once the options or the files that a kernel was compiled from change."""
+    cache: Any = getattr(kernel, "_cache", None)
+    if not hasattr(cache, "_impl"):  # compilation, or its cache, is switched off
+        return
+    folder = Path(kernel.py_func.__code__.co_filename).parent
+    callees = _contents(folder) if folder.name.endswith(KERNELS) else b""
+    options = sorted((name, sorted(x) if isinstance(x, set) else x) for name, x in kernel.targetoptions.items())
+    stamp = (cache._impl.locator.get_source_stamp(), callees, options)
+    cache._cache_file = KernelCacheFile(cache._cache_path, cache._impl.filename_base, stamp)
 
 
 @lru_cache

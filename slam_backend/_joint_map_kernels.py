@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend._jit import inlined, jit
+from slam_backend._jit import device, inlined, jit
 from slam_backend.errors import FloatArray, IntArray
 
 
@@ -67,6 +67,7 @@ def _move(landmark: Any, x: float, y: float, c: float, s: float) -> None:
     landmark[7] = s * xz + c * yz
 
 
+@device
 @jit
 def _fuse(one: FloatArray, two: FloatArray, work: FloatArray) -> bool:
     """Fuse landmark `two` (9,) into `one` (9,), Eqs. 13-15 *, with room (5, 3, 3); False if their sum is singular."""

@@ -6,7 +6,7 @@ whose threads stall for milliseconds when another process holds a core, and whos
 
 import numpy as np
 
-from slam_backend._jit import jit
+from slam_backend._jit import device, jit
 from slam_backend.errors import BoolArray, Float32Array, FloatArray, IntArray
 
 BLOCK = 256  # columns whose products are held at once: with 64 numbers each they fit a core's own cache
@@ -14,6 +14,7 @@ HEAD = 40  # numbers of a descriptor that are compared first, enough to tell mos
 SLACK = np.float32(1e-5)  # of squared lengths, far more than sums of their products are rounded
 
 
+@device
 @jit
 def _squared_lengths(columns: Float32Array) -> Float32Array:
     """Return the squared length (m,) of each column of `columns` (d, m)."""
@@ -24,6 +25,7 @@ def _squared_lengths(columns: Float32Array) -> Float32Array:
     return result
 
 
+@device
 @jit
 def _add_products(
     row: Float32Array, first: int, last: int, b_columns: Float32Array, start: int, stop: int, out: Float32Array
@@ -42,6 +44,7 @@ def _add_products(
             out[j] += a0 * b0[j]
 
 
+@device
 @jit
 def _squared_length(row: Float32Array, first: int) -> np.float32:
     """Return the squared length of a row from its number `first` on."""
@@ -51,6 +54,7 @@ def _squared_length(row: Float32Array, first: int) -> np.float32:
     return length
 
 
+@device
 @jit
 def _squared_distances(
     row: Float32Array, b_columns: Float32Array, lengths_b: Float32Array, start: int, stop: int, out: Float32Array
@@ -63,6 +67,7 @@ def _squared_distances(
         out[j] = length + lengths_b[start + j] - np.float32(2.0) * out[j]
 
 
+@device
 @jit
 def _nearest(a: Float32Array, b_columns: Float32Array) -> tuple[IntArray, Float32Array, IntArray]:
     """Return each a's nearest b (n,), its squared distance (n,), and each b's nearest a (m,); the first if equal."""
@@ -130,6 +135,7 @@ def stands_out(
     return passed
 
 
+@device
 @jit
 def _alike(a: Float32Array, b_columns: Float32Array, limit: float, most: int) -> tuple[IntArray, IntArray, IntArray]:
     """Return the b within a squared distance `limit` of each a (n, most), and how many each a (n,) and b (m,) has.
@@ -162,6 +168,7 @@ def _alike(a: Float32Array, b_columns: Float32Array, limit: float, most: int) ->
     return found, of_a, of_b
 
 
+@device
 @jit
 def _may_be_near(
     products: Float32Array, length: np.float32, tail: np.float32, lengths: Float32Array, tails: Float32Array,

@@ -6,7 +6,7 @@ import numpy as np
 
 from slam_backend import _kernels
 from slam_backend._best_map import slots_held
-from slam_backend._jit import any_order, jit, lanes_inlined
+from slam_backend._jit import any_order, device, jit, lanes_inlined
 from slam_backend._kernels import LANES
 from slam_backend._kernels.layout import IDS, MAP_OF, ROW_OF
 from slam_backend._particle_maps import ParticleMaps
@@ -78,6 +78,7 @@ def widen(scatter: FloatArray, x: float, y: float, covariance: FloatArray) -> No
     covariance[1, 0] += both
 
 
+@device
 @jit
 def _weigh_places(ancestors: Any, weights: FloatArray, places: FloatArray) -> None:
     """Write the weight of each place (P,) of a row: that of all particles that read there by a map of ancestors."""

@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from slam_backend._jit import in_place, jit, lanes
+from slam_backend._jit import device, in_place, jit, lanes
 from slam_backend.errors import BoolArray, FloatArray, IntArray
 
 WIDTH = 16  # pairs in a block
@@ -24,6 +24,7 @@ STATE = 17
 LOG_2PI = math.log(2.0 * math.pi)
 
 
+@device
 @lanes
 def _add(records: FloatArray, at: int, state: FloatArray) -> None:
     """Add a landmark, whose record begins at `at`, to the sums of all pairs of a block."""
@@ -65,6 +66,7 @@ def _add(records: FloatArray, at: int, state: FloatArray) -> None:
         state[DET + i] = det
 
 
+@device
 @in_place
 def _gather(
     landmarks_a: FloatArray, held_a: BoolArray, landmarks_b: FloatArray, held_b: BoolArray, from_a: IntArray,
@@ -88,6 +90,7 @@ def _gather(
         shared[pair] = count
 
 
+@device
 @in_place
 def _sum(records: FloatArray, motions: FloatArray, first: int, state: FloatArray, log_dets: FloatArray) -> None:
     """Sum over all landmarks of a block at its motions; the logs of |2 pi S|, too, where they are asked for."""
@@ -104,6 +107,7 @@ def _sum(records: FloatArray, motions: FloatArray, first: int, state: FloatArray
                     log_dets[first + p] += math.log(state[DET + p]) + 3.0 * LOG_2PI
 
 
+@device
 @in_place
 def _step(state: FloatArray, first: int, shared: IntArray, motions: FloatArray) -> None:
     """Do a step of Gauss and Newton with the pairs of a block that share enough."""

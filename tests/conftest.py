@@ -2,17 +2,25 @@
 
 import gc
 import os
+import subprocess
+import sys
 from pathlib import Path
-
-if worker := os.environ.get("PYTEST_XDIST_WORKER"):  # before numba: two processes cannot write to one cache safely
-    caches = Path(os.environ.get("NUMBA_CACHE_DIR", Path(__file__).parents[1] / ".pytest_cache" / "numba"))
-    os.environ["NUMBA_CACHE_DIR"] = str(caches / worker)
 
 import pytest
 from hypothesis import settings
 
 settings.register_profile("default", deadline=None, derandomize=True, max_examples=60)
 settings.load_profile("default")
+
+
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Compile the kernels once, before workers start that would each compile them; all share one cache."""
+    if session.config.getoption("dist", "no") != "no" and not hasattr(session.config, "workerinput"):
+        code = "import vslam_env; print(f'Kernels compiled in {vslam_env.warm_up():.0f} s.')"
+        root = Path(__file__).parents[1]
+        done = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True, check=False)
+        if reporter := session.config.pluginmanager.getplugin("terminalreporter"):
+            reporter.write_line(done.stdout.strip() or done.stderr)
 
 
 def pytest_collection_finish() -> None:

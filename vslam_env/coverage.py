@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend._jit import in_place
+from slam_backend._jit import device, in_place
 from slam_backend.errors import FloatArray
 from slam_backend.geometry import inverse, transform_points
 from vslam_env.navigation import FREE, GRID_SIZE, TeamGrids, cell_of
@@ -15,6 +15,7 @@ PLACE, CELL = 0, 1  # rows of what is laid
 SEERS, EVER = 0, 1  # rows of the floor
 
 
+@device
 @in_place
 def _recount(changes: Any, cells: Any, places: Any, laid: Any, seen: Any, floor: Any, fresh: Any) -> int:
     """Bring up to date what one robot sees of the floor.
@@ -53,6 +54,7 @@ def _recount(changes: Any, cells: Any, places: Any, laid: Any, seen: Any, floor:
     return more
 
 
+@device
 @in_place
 def _find(fresh: Any, floor: Any, area: Any, positions: Any, found: Any) -> None:
     """Count floor cells that are seen for the first time for the robot nearest to them.

@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from slam_backend._alignment_kernels.residuals import residual, squared_distances, support
-from slam_backend._jit import jit
+from slam_backend._jit import device, jit
 from slam_backend.errors import BoolArray, FloatArray
 
 MIN_VARIANCE = 1e-8  # [m^2], (0.1 mm)^2: keeps exact landmarks (Sigma = 0) solvable
@@ -47,6 +47,7 @@ def information(table: FloatArray, members: BoolArray, pose: FloatArray, floor: 
     return h, g
 
 
+@device
 @jit
 def gauss_newton_step(table: FloatArray, members: BoolArray, pose: FloatArray, floor: float) -> FloatArray:
     """Return `pose` after one weighted Gauss-Newton step; unchanged if the members leave the rotation open."""
@@ -67,6 +68,7 @@ def gauss_newton_step(table: FloatArray, members: BoolArray, pose: FloatArray, f
     return np.array([pose[0] + vx - ux * turn, pose[1] + vy - uy * turn, heading])
 
 
+@device
 @jit
 def fitted_variance(table: FloatArray, members: BoolArray, pose: FloatArray, floor: float) -> float:
     """Return the added variance, at most `floor`, under which the members' median D is that of 3 degrees of freedom.
@@ -105,6 +107,7 @@ def unexplained(table: FloatArray, members: BoolArray, pose: FloatArray, floor: 
     return ratio if ratio > 1.0 + CHANCE_EXCESS / math.sqrt(k) else 1.0
 
 
+@device
 @jit
 def drop_unverified(table: FloatArray, members: BoolArray, pose: FloatArray, floor: float) -> None:
     """Take out, one after the other, members of which one to three say more about the rotation than all others.

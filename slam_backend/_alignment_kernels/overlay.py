@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from slam_backend._alignment_kernels.residuals import squared_distances
-from slam_backend._jit import jit
+from slam_backend._jit import device, jit
 from slam_backend.errors import BoolArray, FloatArray, IntArray
 
 FITS = 10  # rounds of fitting a rigid motion to the landmarks within the gate
@@ -30,6 +30,7 @@ def moved_share(
     return 0.0 if len(table) < least else _moved_away(table, floor, gate) / len(table)
 
 
+@device
 @jit
 def _matched(
     means: FloatArray, covariances: FloatArray, ids: IntArray, old_means: FloatArray, old_covariances: FloatArray,
@@ -49,6 +50,7 @@ def _matched(
     return table[:k]
 
 
+@device
 @jit
 def _write(mean: FloatArray, covariance: FloatArray, place: FloatArray, packed: FloatArray) -> None:
     """Write a mean (3,), and the upper triangle (6,) of its covariance (3, 3)."""
@@ -60,6 +62,7 @@ def _write(mean: FloatArray, covariance: FloatArray, place: FloatArray, packed: 
             entry += 1
 
 
+@device
 @jit
 def _moved_away(table: FloatArray, floor: float, gate: float) -> int:
     """Return how many landmarks lie beyond the gate at the rigid motion that those within it agree on."""
@@ -74,6 +77,7 @@ def _moved_away(table: FloatArray, floor: float, gate: float) -> int:
     return outside
 
 
+@device
 @jit
 def _rigid_motion(table: FloatArray, inside: BoolArray) -> FloatArray:
     """Return the planar motion (3,) = a_from_b of least squares, those not `inside` (k,) with hardly a weight."""

@@ -8,12 +8,13 @@ import math
 
 import numpy as np
 
-from slam_backend._jit import jit
+from slam_backend._jit import device, jit
 from slam_backend.errors import BoolArray, FloatArray, IntArray
 
 MATCH_COLUMNS = 18
 
 
+@device
 @jit
 def residual(
     table: FloatArray, i: int, cos: float, sin: float, tx: float, ty: float, floor: float
@@ -55,6 +56,7 @@ def squared_distances(table: FloatArray, pose: FloatArray, floor: float) -> Floa
     return result
 
 
+@device
 @jit
 def support(table: FloatArray, pose: FloatArray, floor: float, gate: float, members: BoolArray) -> tuple[int, float]:
     """Mark the candidates within `gate`; return their number and the score, sum of 1 - D / gate over them."""

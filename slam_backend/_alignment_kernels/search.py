@@ -6,13 +6,14 @@ import numpy as np
 
 from slam_backend._alignment_kernels.fitting import gauss_newton_step
 from slam_backend._alignment_kernels.residuals import support
-from slam_backend._jit import jit
+from slam_backend._jit import device, jit
 from slam_backend.alignment_types import FEWEST_INLIERS
 from slam_backend.errors import FloatArray, IntArray
 
 SAME_DISTANCE, SAME_ANGLE = 0.25, math.radians(2.5)  # half of what makes two alignments differ
 
 
+@device
 @jit
 def _pose_from_two(table: FloatArray, i: int, j: int, gate: float, floor: float, min_baseline: float) -> FloatArray:
     """Return the rigid motion (3,) that two candidates suggest; NaN if their distances disagree or are too short."""
@@ -36,6 +37,7 @@ def _pose_from_two(table: FloatArray, i: int, j: int, gate: float, floor: float,
     return np.array([tx, ty, theta])
 
 
+@device
 @jit
 def _same(pose: FloatArray, other: FloatArray, x: float, y: float) -> bool:
     """Tell whether two poses agree so well about the point (x, y) of map b that refining both would waste time."""
@@ -45,6 +47,7 @@ def _same(pose: FloatArray, other: FloatArray, x: float, y: float) -> bool:
     return turned < SAME_ANGLE and apart < SAME_DISTANCE
 
 
+@device
 @jit
 def _samples_needed(share: float, log_failure: float) -> float:
     """Return how many pairs to draw so that one stems from a consensus set that holds `share` of the candidates.

@@ -2,13 +2,14 @@
 
 import numpy as np
 
-from slam_backend._jit import any_order, jit, lanes
+from slam_backend._jit import any_order, device, fused, lanes
 from slam_backend._kernels.layout import REJECTED
 from slam_backend.errors import Float32Array, FloatArray, IntArray
 
 RUN = 64  # descriptors looked at together
 
 
+@device
 @lanes
 def _head_distances(
     measured: Float32Array, b: int, heads: Float32Array, stride: int, n: int, out: Float32Array
@@ -42,6 +43,7 @@ def _squared_distance(measured: Float32Array, b: int, stored: Float32Array, slot
     return total
 
 
+@device
 @lanes
 def _hits(partial: Float32Array, limit: float, hits: IntArray) -> int:
     """Write the indices of the entries up to `limit`, ascending; return how many. Runs without one are skipped."""
@@ -60,7 +62,8 @@ def _hits(partial: Float32Array, limit: float, hits: IntArray) -> int:
     return count
 
 
-@jit
+@device
+@fused
 def find_candidates(
     measured: Float32Array, stored: Float32Array, heads: Float32Array, ids: IntArray, names: IntArray,
     identities: IntArray, named: bool, gate: float,

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from slam_backend._jit import lanes
+from slam_backend._jit import device, lanes
 from slam_backend._kernels.innovations import match_terms
 from slam_backend._kernels.lane_math import log_of
 from slam_backend._kernels.layout import (
@@ -27,6 +27,7 @@ from slam_backend._kernels.pose_system import add_terms
 from slam_backend.errors import FloatArray, Int32Array, IntArray
 
 
+@device
 @lanes
 def decide_alone(
     work: FloatArray, tile: FloatArray, seen: Int32Array, match: FloatArray, q: float,
@@ -50,6 +51,7 @@ def decide_alone(
         count_likelihood(work, i, ok, square, det, depth)
 
 
+@device
 @lanes
 def begin_choice(work: FloatArray) -> None:
     for i in range(LANES):
@@ -60,18 +62,21 @@ def begin_choice(work: FloatArray) -> None:
         work[LOG_BEST + i] = 0.0
 
 
+@device
 @lanes
 def mark_taken(work: FloatArray, earlier: FloatArray, p: float) -> None:
     for i in range(len(earlier)):
         work[TAKEN + i] = 1.0 if earlier[i] == p else work[TAKEN + i]
 
 
+@device
 @lanes
 def clear_taken(work: FloatArray) -> None:
     for i in range(LANES):
         work[TAKEN + i] = 0.0
 
 
+@device
 @lanes
 def consider_again(
     work: FloatArray, record: FloatArray, q: float, look: float, cap: float, gate: float, dead_zone: float,
@@ -100,6 +105,7 @@ def consider_again(
         work[LOG_BEST + i] = -0.5 * (distance + log_det + 3.0 * LOG_2PI) if better else work[LOG_BEST + i]
 
 
+@device
 @lanes
 def decide(work: FloatArray, match: FloatArray, ambiguity: float, log_clutter: float) -> None:
     """Write the candidate matched, -1 for rejected or -2 for new, and the log-likelihood of what is not matched."""
@@ -112,6 +118,7 @@ def decide(work: FloatArray, match: FloatArray, ambiguity: float, log_clutter: f
         work[CLUTTER + i] += (work[LOG_BEST + i] if held_back else 0.0) if matched else log_clutter
 
 
+@device
 @lanes
 def mask_of(match: FloatArray, code: float, mask: FloatArray) -> int:
     """Write 1 where `match` equals `code`, else 0; return how many."""
@@ -123,12 +130,14 @@ def mask_of(match: FloatArray, code: float, mask: FloatArray) -> int:
     return count
 
 
+@device
 @lanes
 def mark_held(record: FloatArray, seen: Int32Array) -> None:
     for i in range(len(seen)):
         record[Q_HELD + i] = 1.0 if seen[i] > 0 else 0.0
 
 
+@device
 @lanes
 def admit(chosen: FloatArray, seen: Int32Array, mask: FloatArray) -> None:
     """Write 1 where the measurement is still without a match and the particle holds the candidate."""
@@ -136,12 +145,14 @@ def admit(chosen: FloatArray, seen: Int32Array, mask: FloatArray) -> None:
         mask[i] = 1.0 if chosen[i] == -2.0 and seen[i] > 0 else 0.0
 
 
+@device
 @lanes
 def bar_taken(earlier: FloatArray, p: float, mask: FloatArray) -> None:
     for i in range(len(earlier)):
         mask[i] = 0.0 if earlier[i] == p else mask[i]
 
 
+@device
 @lanes
 def start_none_beyond(match: FloatArray, real: int) -> None:
     """Let the surplus lanes of the last block start no landmark."""
@@ -150,6 +161,7 @@ def start_none_beyond(match: FloatArray, real: int) -> None:
             match[b, i] = -1.0
 
 
+@device
 @lanes
 def write_found(
     found: Int32Array, distances: FloatArray, first: int, match: FloatArray, starts: IntArray, slots: IntArray,

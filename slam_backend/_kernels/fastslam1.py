@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from slam_backend._jit import fused, room
+from slam_backend._jit import device, fused, room
 from slam_backend._kernels.candidates import find_candidates
 from slam_backend._kernels.choices import admit, bar_taken, mask_of, write_found
 from slam_backend._kernels.innovations import innovate
@@ -16,6 +16,7 @@ from slam_backend._kernels.places import carry_odds, name_new, open_slot, refres
 from slam_backend.errors import Float32Array, FloatArray, Int32Array, IntArray
 
 
+@device
 @fused
 def update_fastslam1(
     poses: FloatArray, means: FloatArray, covariances: FloatArray, moved: bool, odometry: FloatArray,

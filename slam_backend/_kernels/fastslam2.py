@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from slam_backend._jit import fused, room
+from slam_backend._jit import device, fused, room
 from slam_backend._kernels.candidates import find_candidates
 from slam_backend._kernels.choices import mask_of, start_none_beyond, write_found
 from slam_backend._kernels.first_pass import match_first
@@ -18,6 +18,7 @@ from slam_backend._kernels.wide_priors import refine_wide, try_wide_prior
 from slam_backend.errors import Float32Array, FloatArray, Int32Array, IntArray
 
 
+@device
 @fused
 def update_fastslam2(
     poses: FloatArray, means: FloatArray, covariances: FloatArray, blind: bool,

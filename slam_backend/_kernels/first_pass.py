@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from slam_backend._jit import lanes
+from slam_backend._jit import device, lanes
 from slam_backend._kernels.choices import begin_choice, mark_held
 from slam_backend._kernels.innovations import evaluate, innovate, match_terms
 from slam_backend._kernels.lane_math import log_of
@@ -26,6 +26,7 @@ from slam_backend._kernels.recovery import begin_judging, count_unexplained, nea
 from slam_backend.errors import FloatArray, Int32Array, IntArray
 
 
+@device
 @lanes
 def match_first(
     work: FloatArray, records: FloatArray, match: FloatArray, mask: FloatArray, values: FloatArray, counts: Int32Array,
@@ -71,6 +72,7 @@ def match_first(
             count_unexplained(work, position_gate)
 
 
+@device
 @lanes
 def _match_alone(
     work: FloatArray, tile: FloatArray, record: FloatArray, seen: Int32Array, match: FloatArray, q: float,
@@ -91,6 +93,7 @@ def _match_alone(
         work[CONTRADICT + i] += 1.0 if held and not inside else 0.0
 
 
+@device
 @lanes
 def _consider(work: FloatArray, record: FloatArray, q: float, look: float, reach: float) -> None:
     """Let candidate q compete for the measurement in pass A; `look` is what its descriptor costs."""
@@ -107,6 +110,7 @@ def _consider(work: FloatArray, record: FloatArray, q: float, look: float, reach
         work[CHOSEN + i] = q if better else work[CHOSEN + i]
 
 
+@device
 @lanes
 def _end_choice(work: FloatArray, chosen: FloatArray, ambiguity: float) -> None:
     """Write the tentative match of each lane: the best candidate, if no other comes near."""
@@ -116,6 +120,7 @@ def _end_choice(work: FloatArray, chosen: FloatArray, ambiguity: float) -> None:
         chosen[i] = work[CHOSEN + i] if clear else -1.0
 
 
+@device
 @lanes
 def _drop_taken(chosen: FloatArray, q: float, earlier: FloatArray, p: float) -> None:
     """Unmatch lanes in which an earlier measurement took, as its candidate p, the landmark that is candidate q here."""
@@ -123,6 +128,7 @@ def _drop_taken(chosen: FloatArray, q: float, earlier: FloatArray, p: float) -> 
         chosen[i] = -1.0 if chosen[i] == q and earlier[i] == p else chosen[i]
 
 
+@device
 @lanes
 def keep_distance(record: FloatArray) -> None:
     """Keep the squared distance at the predicted pose: it is the NIS."""

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from slam_backend._jit import lanes, lanes_inlined
+from slam_backend._jit import device, lanes, lanes_inlined
 from slam_backend._kernels.layout import (
     C00,
     C01,
@@ -52,6 +52,7 @@ from slam_backend._kernels.layout import (
 from slam_backend.errors import FloatArray
 
 
+@device
 @lanes
 def innovate(
     work: FloatArray, tile: FloatArray, points: FloatArray, noises: FloatArray, n: int, given: bool, camera: FloatArray
@@ -158,6 +159,7 @@ def match_terms(
     )  # fmt: skip
 
 
+@device
 @lanes
 def evaluate(work: FloatArray, tile: FloatArray, record: FloatArray, refined: bool) -> None:
     """Write the terms of a match, see `match_terms`."""

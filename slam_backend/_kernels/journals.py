@@ -1,6 +1,6 @@
 """What robots did, what they measured and what was made of it is noted, to be written into their logs later."""
 
-from slam_backend._jit import in_place
+from slam_backend._jit import device, in_place
 from slam_backend._kernels.layout import (
     ACT,
     ASSOCIATED,
@@ -20,6 +20,7 @@ from slam_backend._kernels.layout import (
 from slam_backend.errors import FloatArray, IntArray
 
 
+@device
 @in_place
 def note_turns(
     rows: IntArray, turns: IntArray, moves: FloatArray, sightings: FloatArray, told: IntArray, means: FloatArray,

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from slam_backend._jit import lanes, lanes_inlined, room
+from slam_backend._jit import device, lanes, lanes_inlined, room
 from slam_backend._kernels.choices import mask_of
 from slam_backend._kernels.innovations import innovate
 from slam_backend._kernels.lane_math import inverted, quadratic_form
@@ -79,6 +79,7 @@ def _inverse_of_sum(
     )  # fmt: skip
 
 
+@device
 @lanes
 def update(work: FloatArray, tile: FloatArray, mask: FloatArray, walk: float) -> None:
     """At a known pose: update the landmark where `mask` is 1 and it lies ahead of the camera (Eqs. 5-10).
@@ -92,6 +93,7 @@ def update(work: FloatArray, tile: FloatArray, mask: FloatArray, walk: float) ->
         _updated(work, tile, i, i00, i01, i02, i11, i12, i22, match, walk)
 
 
+@device
 @lanes
 def gate_and_update(
     work: FloatArray, tile: FloatArray, record: FloatArray, chosen: FloatArray, seen: Int32Array, q: float,
@@ -118,6 +120,7 @@ def gate_and_update(
         seen[i] += np.int32(1) if match else np.int32(0)
 
 
+@device
 @lanes
 def find_young(seen: Int32Array, mask: FloatArray, young: FloatArray) -> int:
     """Write 1 where a matched landmark was seen a few times only; return how many those are."""
@@ -129,6 +132,7 @@ def find_young(seen: Int32Array, mask: FloatArray, young: FloatArray) -> int:
     return count
 
 
+@device
 @lanes
 def relinearise(work: FloatArray, tile: FloatArray, before: FloatArray) -> None:
     """Refer the innovation, taken at the means in `tile`, to those in `before`, which come back (iterated EKF)."""
@@ -140,12 +144,14 @@ def relinearise(work: FloatArray, tile: FloatArray, before: FloatArray) -> None:
         tile[j] = before[j]
 
 
+@device
 @lanes
 def count_matches(seen: Int32Array, mask: FloatArray) -> None:
     for i in range(len(seen)):
         seen[i] += np.int32(1) if mask[i] > 0.0 else np.int32(0)
 
 
+@device
 @lanes
 def update_matched(
     work: FloatArray, match: FloatArray, mask: FloatArray, values: FloatArray, counts: Int32Array, row_of: IntArray,
@@ -173,6 +179,7 @@ def update_matched(
             update(work, tile, mask, walk)
 
 
+@device
 @lanes
 def new_landmark(
     work: FloatArray, values: FloatArray, counts: Int32Array, row: int, block: int, points: FloatArray,

@@ -1,6 +1,6 @@
 """The log-likelihood of a frame, summed match by match without a logarithm (Eq. 11)."""
 
-from slam_backend._jit import lanes, lanes_inlined
+from slam_backend._jit import device, lanes, lanes_inlined
 from slam_backend._kernels.lane_math import log_of, mantissa_exponent
 from slam_backend._kernels.layout import (
     CLUTTER,
@@ -33,6 +33,7 @@ def count_likelihood(work: FloatArray, i: int, on: bool, square: float, det: flo
     work[DEPTHS_EXP + i] += exponent
 
 
+@device
 @lanes
 def add_likelihood(work: FloatArray, record: FloatArray, mask: FloatArray) -> None:
     """Add a match's part of the log-likelihood where `mask` is 1."""
@@ -40,6 +41,7 @@ def add_likelihood(work: FloatArray, record: FloatArray, mask: FloatArray) -> No
         count_likelihood(work, i, mask[i] > 0.0, record[Q_SQUARE + i], record[Q_DET + i], record[Q_DEPTH + i])
 
 
+@device
 @lanes
 def clear_likelihood(work: FloatArray) -> None:
     for i in range(LANES):

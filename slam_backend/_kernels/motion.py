@@ -2,7 +2,7 @@
 
 import math
 
-from slam_backend._jit import lanes, lanes_inlined
+from slam_backend._jit import device, lanes, lanes_inlined
 from slam_backend._kernels.lane_math import sine_cosine, wrapped
 from slam_backend._kernels.layout import (
     C00,
@@ -38,6 +38,7 @@ WIDE_HEADING = 0.03  # [rad]; where the heading is less sure, one step of Gauss-
 ZERO_PIVOT = 1e-12  # relative to the variance: below it a direction is taken to be exact
 
 
+@device
 @lanes
 def load_rows(work: FloatArray, low: int, rows: FloatArray, first: int) -> None:
     """Copy a block of rows (c, P), from lane `first` on, into the rows of the workspace from `low` on."""
@@ -47,6 +48,7 @@ def load_rows(work: FloatArray, low: int, rows: FloatArray, first: int) -> None:
             target[i] = source[i]
 
 
+@device
 @lanes
 def store_rows(work: FloatArray, low: int, rows: FloatArray, first: int) -> None:
     """Copy rows of the workspace from `low` on into a block of rows (c, P), from lane `first` on."""
@@ -56,6 +58,7 @@ def store_rows(work: FloatArray, low: int, rows: FloatArray, first: int) -> None
             target[i] = source[i]
 
 
+@device
 @lanes
 def prior(
     work: FloatArray, poses: FloatArray, means: FloatArray, covariances: FloatArray, blind: bool, first: int
@@ -73,6 +76,7 @@ def prior(
             work[j] = 0.0
 
 
+@device
 @lanes
 def predict(work: FloatArray, move: FloatArray, sigmas: FloatArray) -> None:
     """Move the poses in rows X0 .. N22 to the predicted x0, and write a factor C of its covariance P0 (Eq. 4).
@@ -114,6 +118,7 @@ def predict(work: FloatArray, move: FloatArray, sigmas: FloatArray) -> None:
         _factorise(work, i)
 
 
+@device
 @lanes
 def _to_map_axes(work: FloatArray) -> None:
     """Turn the covariance in rows N00 .. N22 from the robot's axes to the map's: T P T^T."""
@@ -148,6 +153,7 @@ def _factorise(work: FloatArray, i: int) -> None:
     work[C22 + i] = math.sqrt(rest if rest > ZERO_PIVOT * q22 else 0.0)
 
 
+@device
 @lanes
 def enter_pose(work: FloatArray, poses: FloatArray, first: int) -> None:
     load_rows(work, X, poses, first)
@@ -155,6 +161,7 @@ def enter_pose(work: FloatArray, poses: FloatArray, first: int) -> None:
         work[SIN + i], work[COS + i] = sine_cosine(work[T + i])
 
 
+@device
 @lanes
 def take_draws(work: FloatArray, normals: FloatArray, first: int) -> None:
     """Write a block's normal draws (M, 3) into the rows DRAW0 .. DRAW2, zeros for surplus lanes."""
@@ -164,6 +171,7 @@ def take_draws(work: FloatArray, normals: FloatArray, first: int) -> None:
             work[DRAW0 + c * LANES + i] = normals[m, c] if m < len(normals) else 0.0
 
 
+@device
 @lanes
 def sample_motion(
     work: FloatArray, poses: FloatArray, first: int, odometry: FloatArray, sigmas: FloatArray, normals: FloatArray
@@ -180,6 +188,7 @@ def sample_motion(
         poses[2, first + i] = wrapped(work[T + i] + odometry[2] + work[DRAW2 + i] * sigmas[2])
 
 
+@device
 @lanes
 def take_as_exact(poses: FloatArray, means: FloatArray, covariances: FloatArray) -> None:
     """Write N(x^, P^), (3, P) and (6, P), of poses (3, P) that are exactly where their particles have them."""
@@ -189,6 +198,7 @@ def take_as_exact(poses: FloatArray, means: FloatArray, covariances: FloatArray)
     covariances[:] = 0.0
 
 
+@device
 @lanes
 def move_blind(
     poses: FloatArray, means: FloatArray, covariances: FloatArray, blind: bool, odometry: FloatArray,

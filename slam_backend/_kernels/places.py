@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from slam_backend._jit import in_place, jit, lanes, lanes_inlined
+from slam_backend._jit import device, fused, lanes, lanes_inlined
 from slam_backend._kernels.layout import BLOCK, LANES, TILE
 from slam_backend.errors import Float32Array, FloatArray, Int32Array, IntArray
 
@@ -14,6 +14,7 @@ def tile_of(padded: int, row: int, block: int) -> slice:
     return slice(start, start + TILE)
 
 
+@device
 @lanes
 def _copy_row(
     source: FloatArray, target: FloatArray, before: Int32Array, seen: Int32Array, ancestors: Int32Array
@@ -65,7 +66,7 @@ def refresh(
         map_of[slot] = 0
 
 
-@jit
+@fused
 def carry_odds(slots: IntArray, odds: FloatArray, map_of: IntArray, maps: Int32Array) -> None:
     """Copy log-odds from where each particle's ancestor left them to its own place; `refresh` does the rest.
 
@@ -86,7 +87,8 @@ def carry_odds(slots: IntArray, odds: FloatArray, map_of: IntArray, maps: Int32A
             odds[slot, m] = before[m]
 
 
-@in_place
+@device
+@lanes
 def open_slot(
     b: int, new_slots: IntArray, new_rows: IntArray, row_of: IntArray, map_of: IntArray, values: FloatArray,
     counts: Int32Array, free_rows: IntArray, free_slots: IntArray, tops: IntArray,
@@ -103,7 +105,8 @@ def open_slot(
     map_of[new_slots[b]] = 0
 
 
-@in_place
+@device
+@lanes
 def name_new(
     new_slots: IntArray, measured: Float32Array, names: IntArray, named: bool, ids: IntArray,
     identities: IntArray, stored: Float32Array, heads: Float32Array, tops: IntArray,

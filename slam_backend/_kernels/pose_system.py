@@ -2,7 +2,7 @@
 
 import math
 
-from slam_backend._jit import lanes, lanes_inlined
+from slam_backend._jit import device, lanes, lanes_inlined
 from slam_backend._kernels.lane_math import inverted, log_of, quadratic_form, sine_cosine, wrapped
 from slam_backend._kernels.layout import (
     C00,
@@ -58,6 +58,7 @@ from slam_backend._kernels.likelihoods import total_log_likelihood
 from slam_backend.errors import FloatArray
 
 
+@device
 @lanes
 def begin_pose(work: FloatArray) -> None:
     """Start from xi = 0, at the predicted pose, whose turn is in rows COS and SIN already."""
@@ -70,6 +71,7 @@ def begin_pose(work: FloatArray) -> None:
         work[T + i] = work[T0 + i]
 
 
+@device
 @lanes
 def place(work: FloatArray) -> None:
     """Write the pose rows X .. SIN of x0 + C xi."""
@@ -82,6 +84,7 @@ def place(work: FloatArray) -> None:
         work[SIN + i], work[COS + i] = sine_cosine(theta)
 
 
+@device
 @lanes
 def clear_sums(work: FloatArray) -> None:
     """Start the system of xi from its prior N(0, I)."""
@@ -114,6 +117,7 @@ def add_terms(
     work[G2 + i] += w * g2 if on else 0.0
 
 
+@device
 @lanes
 def sum_matches(work: FloatArray, record: FloatArray, weights: FloatArray) -> None:
     """Add a candidate's share of the Gauss-Newton system, times `weights` (LANES)."""
@@ -125,6 +129,7 @@ def sum_matches(work: FloatArray, record: FloatArray, weights: FloatArray) -> No
         )  # fmt: skip
 
 
+@device
 @lanes
 def robust_weights(record: FloatArray, chosen: FloatArray, q: float, gate: float, weights: FloatArray) -> int:
     """Write Cauchy's weights 1 / (1 + D / gate) where the lane chose candidate q, else 0; return how many chose it."""
@@ -136,6 +141,7 @@ def robust_weights(record: FloatArray, chosen: FloatArray, q: float, gate: float
     return count
 
 
+@device
 @lanes
 def any_wide(work: FloatArray) -> int:
     count = 0
@@ -144,6 +150,7 @@ def any_wide(work: FloatArray) -> int:
     return count
 
 
+@device
 @lanes
 def step_pose(work: FloatArray, only_wide: bool) -> None:
     """Take one step of Gauss-Newton from the sums: xi <- xi - J^-1 G, with covariance J^-1."""
@@ -164,6 +171,7 @@ def step_pose(work: FloatArray, only_wide: bool) -> None:
         work[SPREAD22 + i] = i22 if go else work[SPREAD22 + i]
 
 
+@device
 @lanes
 def posterior(work: FloatArray, log_likelihood: FloatArray, first: int) -> None:
     """Weigh by the predictive likelihood and sample the pose, from the sums of pass B (Laplace's formula).

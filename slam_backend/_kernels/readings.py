@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from slam_backend._jit import in_place
+from slam_backend._jit import device, in_place
 from slam_backend._kernels.layout import ACT, BEGIN, COUNT, END, GIVEN, MIN_DEPTH, MOVED, NAMED
 from slam_backend.errors import Float32Array, FloatArray, IntArray
 
@@ -46,6 +46,7 @@ def noises_to_robot_axes(covariances: FloatArray, sightings: FloatArray) -> None
         noise[3], noise[4], noise[5] = own[0, 0], own[0, 1], own[1, 1]
 
 
+@device
 @in_place
 def _are_within(vectors: Float32Array, limit: float) -> bool:
     """Return whether no component of vectors (n, d) is larger, by magnitude, or NaN."""

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from slam_backend._jit import lanes
+from slam_backend._jit import device, lanes
 from slam_backend._kernels.layout import (
     BEST,
     C00,
@@ -38,6 +38,7 @@ from slam_backend.errors import FloatArray
 MIN_CONTRADICTIONS = 3.0  # three points fix a pose with one to spare
 
 
+@device
 @lanes
 def begin_judging(work: FloatArray) -> None:
     for i in range(LANES):
@@ -45,6 +46,7 @@ def begin_judging(work: FloatArray) -> None:
         work[CONTRADICT + i] = 0.0
 
 
+@device
 @lanes
 def nearest(work: FloatArray, record: FloatArray, begin: bool) -> None:
     """Fold candidate after candidate: BEST = least D at hand of those held, SECOND = least of the D kept before."""
@@ -56,6 +58,7 @@ def nearest(work: FloatArray, record: FloatArray, begin: bool) -> None:
         work[CHOSEN + i] = 1.0 if held else (0.0 if begin else work[CHOSEN + i])
 
 
+@device
 @lanes
 def count_unexplained(work: FloatArray, gate: float) -> None:
     """Count a measurement that has candidates, none of which explains it at the predicted pose."""
@@ -63,6 +66,7 @@ def count_unexplained(work: FloatArray, gate: float) -> None:
         work[CONTRADICT + i] += 1.0 if work[CHOSEN + i] > 0.0 and not work[BEST + i] <= gate else 0.0
 
 
+@device
 @lanes
 def count_explained(work: FloatArray, gate: float) -> None:
     """Count a measurement that the wide prior explains, and whether the narrow one did not."""
@@ -72,6 +76,7 @@ def count_explained(work: FloatArray, gate: float) -> None:
         work[CONTRADICT + i] += 1.0 if sure and not work[SECOND + i] <= gate else 0.0
 
 
+@device
 @lanes
 def any_suspect(work: FloatArray) -> int:
     """Return in how many lanes enough is unexplained."""
@@ -81,6 +86,7 @@ def any_suspect(work: FloatArray) -> int:
     return count
 
 
+@device
 @lanes
 def widen_suspects(work: FloatArray, recovery: FloatArray) -> None:
     """Keep the factor C, and where enough is unexplained try T diag(recovery), T the turn by the predicted heading."""
@@ -102,6 +108,7 @@ def widen_suspects(work: FloatArray, recovery: FloatArray) -> None:
         work[C22 + i] = recovery[2] if suspect else work[C22 + i]
 
 
+@device
 @lanes
 def acquit(work: FloatArray) -> int:
     """Give the kept factor back to suspects that are not lost after all; return how many those are."""

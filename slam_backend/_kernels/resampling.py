@@ -5,11 +5,12 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend._jit import in_place
+from slam_backend._jit import device, in_place
 from slam_backend._kernels.layout import FAR, FREE_SLOTS, IDS, LOG_WEIGHTS, MAP_OF, PATH_LOG_WEIGHTS, ROW_OF
 from slam_backend.errors import Float32Array, FloatArray, Int32Array, IntArray
 
 
+@device
 @in_place
 def settle(ancestors: IntArray, moved: Any) -> int:
     """Arrange resampled particles so that most stay in place.

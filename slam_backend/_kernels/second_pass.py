@@ -2,7 +2,7 @@
 
 import math
 
-from slam_backend._jit import lanes
+from slam_backend._jit import device, lanes
 from slam_backend._kernels.choices import (
     begin_choice,
     clear_taken,
@@ -20,6 +20,7 @@ from slam_backend._kernels.pose_system import clear_sums, sum_matches
 from slam_backend.errors import FloatArray, Int32Array, IntArray
 
 
+@device
 @lanes
 def match_again(
     work: FloatArray, records: FloatArray, match: FloatArray, mask: FloatArray, values: FloatArray, counts: Int32Array,
@@ -58,6 +59,7 @@ def match_again(
                 add_likelihood(work, records[q], mask)
 
 
+@device
 @lanes
 def _mark_all_taken(
     work: FloatArray, match: FloatArray, owners: IntArray, same: IntArray, q: int, one_to_one: bool

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from slam_backend._jit import in_place, inlined, jit
+from slam_backend._jit import device, in_place, inlined, jit
 from slam_backend._kernels.layout import COVARIANCES, MEANS, STARTS
 from slam_backend._kernels.weights import mixture
 from slam_backend.errors import FloatArray, IntArray
@@ -13,6 +13,7 @@ from slam_backend.standpoints import COVARIANCE, ESS, OWN, SIGMAS, START
 AT_ORIGIN, KNOWN, SPREAD = 0, 1, 2  # what starts of particles can be
 
 
+@device
 @in_place
 def start_kind(starts: FloatArray, count: int) -> int:
     """Tell whether the starts (3, P) of `count` particles are all the origin, all the same, or differ."""
@@ -40,6 +41,7 @@ def _see(start: FloatArray, pose: FloatArray, spread: FloatArray, seen: FloatArr
     seen_spread[5] = spread[5]
 
 
+@device
 @in_place
 def see_from_starts(
     starts: FloatArray, means: FloatArray, covariances: FloatArray, count: int, seen: FloatArray, spread: FloatArray
@@ -57,6 +59,7 @@ def see_from_starts(
         _see(starts[:, m], means[:, m], covariances[:, m], seen[:, m], spread[:, m])
 
 
+@device
 @jit
 def _see_own(
     starts: FloatArray, means: FloatArray, covariances: FloatArray, weights: FloatArray, best: int, kind: int,

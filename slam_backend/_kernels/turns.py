@@ -2,7 +2,7 @@
 
 import math
 
-from slam_backend._jit import in_place, room
+from slam_backend._jit import device, in_place, room
 from slam_backend._kernels.fastslam1 import update_fastslam1
 from slam_backend._kernels.fastslam2 import update_fastslam2
 from slam_backend._kernels.journals import note_turns
@@ -48,6 +48,7 @@ from slam_backend._kernels.weights import conclude
 from slam_backend.errors import Float32Array, FloatArray, Int32Array, IntArray
 
 
+@device
 @in_place
 def write_sigmas(noise: FloatArray, move: FloatArray, sigmas: FloatArray) -> None:
     """Write the standard deviations (3,) [m, m, rad] of an odometry reading (3,), as `OdometryModel.sigmas` says."""

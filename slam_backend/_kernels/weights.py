@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from slam_backend._jit import in_place, lanes, lanes_inlined, room
+from slam_backend._jit import device, in_place, lanes, lanes_inlined, room
 from slam_backend._kernels.lane_math import sine_cosine, wrapped
 from slam_backend._kernels.layout import (
     ASSOCIATED,
@@ -23,6 +23,7 @@ from slam_backend._kernels.layout import (
 from slam_backend.errors import FloatArray, Int32Array, IntArray
 
 
+@device
 @in_place
 def weigh(
     log_likelihood: FloatArray, log_weights: FloatArray, path_log_weights: FloatArray, weights: FloatArray
@@ -139,6 +140,7 @@ def add_share(scatter: FloatArray, poses: FloatArray, covariances: FloatArray) -
         c[2, 2] += scatter[2, 2]
 
 
+@device
 @in_place
 def summarise(
     rows: IntArray, turns: IntArray, found: Int32Array, distances: FloatArray, told: IntArray, best: int, ids: IntArray,
@@ -193,6 +195,7 @@ def summarise(
     return num_long_unseen, num_created, num_new, num_matched, num_rejected, squares / judged if judged > 0 else np.nan
 
 
+@device
 @in_place
 def conclude(
     weights: FloatArray, count: int, means: FloatArray, covariances: FloatArray, frame: FloatArray,

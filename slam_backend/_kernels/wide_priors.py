@@ -1,6 +1,6 @@
 """What few frames need: a wide prior tried where poses are in doubt, and more than one step of Gauss-Newton."""
 
-from slam_backend._jit import lanes
+from slam_backend._jit import device, lanes
 from slam_backend._kernels.choices import mark_held, mask_of
 from slam_backend._kernels.first_pass import keep_distance
 from slam_backend._kernels.innovations import evaluate, innovate
@@ -13,6 +13,7 @@ from slam_backend.errors import FloatArray, Int32Array, IntArray
 MORE_STEPS = 3  # a wide prior is a long way for one iteration
 
 
+@device
 @lanes
 def try_wide_prior(
     work: FloatArray, records: FloatArray, values: FloatArray, counts: Int32Array, row_of: IntArray, block: int,
@@ -38,6 +39,7 @@ def try_wide_prior(
     acquit(work)
 
 
+@device
 @lanes
 def refine_wide(
     work: FloatArray, records: FloatArray, match: FloatArray, mask: FloatArray, values: FloatArray, counts: Int32Array,

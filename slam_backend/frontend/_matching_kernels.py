@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from slam_backend._jit import fused, jit, lanes
+from slam_backend._jit import device, fused, jit, lanes
 from slam_backend.errors import BoolArray, Float32Array, FloatArray, IntArray
 from slam_backend.frontend.images import Image
 
@@ -64,6 +64,7 @@ def match_rows(
     return partner, mutual, nearest
 
 
+@device
 @lanes
 def _lay_over(
     source: Image,

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from slam_backend._jit import in_place, jit, lanes, room
+from slam_backend._jit import device, in_place, jit, lanes, room
 from slam_backend.errors import FloatArray, IntArray
 from slam_backend.smoothing._kernels import LANES
 from slam_backend.smoothing.graph import LEVER
@@ -86,6 +86,7 @@ def hold(
     return True
 
 
+@device
 @in_place
 def share(squares: FloatArray, weights: FloatArray, shares: FloatArray) -> None:
     """Write weights of landmarks (n,) that sum to 1, by the inverse of the mean of squares (n, M), weighed by (M,)."""
@@ -100,6 +101,7 @@ def share(squares: FloatArray, weights: FloatArray, shares: FloatArray) -> None:
         shares[n] /= total
 
 
+@device
 @in_place
 def fit(points: FloatArray, targets: FloatArray, shares: FloatArray, motions: FloatArray) -> None:
     """Write the rigid motions (M, 3) that bring points (n, 2, M) to targets (n, 2 or 3) best, weighed by (n,)."""
@@ -125,6 +127,7 @@ def fit(points: FloatArray, targets: FloatArray, shares: FloatArray, motions: Fl
         motions[i, 2] = turn
 
 
+@device
 @in_place
 def add_scatter(motions: FloatArray, weights: FloatArray, scatter: FloatArray) -> None:
     """Add the mean square (3, 3) of the inverses of motions (M, 3), weighed by (M,)."""
@@ -137,6 +140,7 @@ def add_scatter(motions: FloatArray, weights: FloatArray, scatter: FloatArray) -
                 scatter[row, column] += weights[i] * back[row] * back[column]  # (9)
 
 
+@device
 @in_place
 def look_at(
     tiles: FloatArray, seen: IntArray, targets: FloatArray, points: FloatArray, squares: FloatArray
@@ -180,6 +184,7 @@ def wrap(poses: FloatArray) -> None:
             poses[robot, 2, i] = (poses[robot, 2, i] + math.pi) % (2.0 * math.pi) - math.pi
 
 
+@device
 @in_place
 def measure_off(poses: FloatArray, means: FloatArray, lever: float, squares: FloatArray) -> None:
     """Write how far off particles are.
@@ -198,6 +203,7 @@ def measure_off(poses: FloatArray, means: FloatArray, lever: float, squares: Flo
             squares[i] = squares[i] + dx * dx + dy * dy + turn * turn
 
 
+@device
 @jit
 def bring_nearer(
     poses: FloatArray, motions: FloatArray, means: FloatArray, lever: float, weights: FloatArray, moved: FloatArray

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from python_entry import python_entry
 
 from slam_backend import _alignment_kernels as kernels
 from slam_backend import _clique_kernels as cliques
@@ -201,7 +202,7 @@ def test_the_influence_of_a_match_is_what_leaving_it_out_does() -> None:
     def fit(members: np.ndarray) -> np.ndarray:
         pose = TURNED
         for _ in range(20):
-            pose = kernels.gauss_newton_step(table, members, pose, 1e-8)
+            pose = python_entry(kernels.gauss_newton_step)(table, members, pose, 1e-8)
         return pose
 
     everyone = np.ones(12, np.bool_)
@@ -250,7 +251,7 @@ def test_members_without_extent_are_left_alone() -> None:
     table = np.zeros((5, 18))
     table[:, 6] = table[:, 9] = table[:, 11] = 0.01
     members = np.ones(5, np.bool_)
-    kernels.drop_unverified(table, members, np.zeros(3), 0.01)
+    python_entry(kernels.drop_unverified)(table, members, np.zeros(3), 0.01)
     assert members.all()
 
 

@@ -8,12 +8,15 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from python_entry import python_entry
 from scipy import stats
 
 from slam_backend._existence_kernels import in_view, updated_log_odds
 from slam_backend.camera import StereoCamera
 from slam_backend.errors import FloatArray
 from slam_backend.existence import ExistenceModel
+
+in_view, updated_log_odds = map(python_entry, (in_view, updated_log_odds))
 
 MODELS = [
     ExistenceModel(),

@@ -4,8 +4,10 @@ from typing import Any
 import numpy as np
 import pytest
 from numba.core.errors import NumbaError
+from python_entry import python_entry
 
 from slam_backend import _jit
+from slam_backend._kernel_cache import KernelCacheFile
 
 
 def test_this_version_of_numba_can_leave_references_uncounted() -> None:
@@ -23,7 +25,7 @@ def test_kernels_that_work_in_place_can_make_no_array(compiled: Callable[[Any], 
         return float(row[0])
 
     with pytest.raises(NumbaError, match=r"zeros|NRT"):
-        compiled(makes_one)(1.0)
+        python_entry(compiled(makes_one))(1.0)
 
 
 def test_kernels_that_count_may_call_those_that_do_not_and_the_other_way_round() -> None:
@@ -101,3 +103,64 @@ def test_the_size_of_a_room_is_a_constant() -> None:
 
     with pytest.raises(NumbaError):
         _jit.in_place(fill)(3)
+
+
+def test_the_result_of_a_kernel_does_not_depend_on_which_kernel_asks_for_it_first() -> None:
+    """A division by zero raises in a strict kernel, even if a lane kernel, where it gives inf, called it first."""
+
+    def quotient(x: float, y: float) -> float:
+        return x / y
+
+    for decorated in (_jit.jit, _jit.in_place):
+        strict = decorated(quotient)
+
+        assert _called_first_by_a_lane_kernel(strict)
+        with pytest.raises(ZeroDivisionError):
+            strict(1.0, 0.0)
+
+
+def _called_first_by_a_lane_kernel(strict: Any) -> bool:
+    def lane(x: float) -> float:
+        return strict(x, 2.0) * x
+
+    return bool(_jit.lanes(lane)(3.0) == 4.5)
+
+
+def test_a_device_kernel_refuses_a_call_from_python_and_serves_other_kernels() -> None:
+    """It has no wrapper for Python, without which a call would end the process."""
+
+    def double(x: float) -> float:
+        return 2.0 * x
+
+    def outer(x: float) -> float:
+        return kernel(x) + 1.0
+
+    kernel = _jit.device(_jit.in_place(double))
+    assert _jit.in_place(outer)(3.0) == 7.0
+    with pytest.raises(TypeError, match=r"double can be called by kernels only: remove @device"):
+        kernel(3.0)
+
+
+def test_entries_of_two_processes_that_save_at_the_same_time_are_never_mixed_up(tmp_path: Any) -> None:
+    """Whatever the order of their writes, an entry holds what was compiled for it, or is missing."""
+    one, other = (KernelCacheFile(str(tmp_path), "kernel-1", "stamp") for _ in range(2))
+    one._load_index = lambda: {}  # both have read the index before either wrote
+    other._load_index = lambda: {}
+    one.save("float64", "code of float64")
+    other.save("int64", "code of int64")
+    reader = KernelCacheFile(str(tmp_path), "kernel-1", "stamp")
+    assert reader.load("int64") == "code of int64"
+    assert reader.load("float64") in (None, "code of float64")
+    assert KernelCacheFile(str(tmp_path), "kernel-1", "another stamp").load("int64") is None
+
+
+def test_options_are_part_of_what_an_entry_of_the_cache_is_checked_for() -> None:
+    """A kernel that is compiled in another way is not loaded from the entry of before."""
+
+    def double(x: float) -> float:
+        return 2.0 * x
+
+    stamps = [kind(double)._cache._cache_file._source_stamp for kind in (_jit.jit, _jit.fused, _jit.in_place)]
+    stamps.append(_jit.device(_jit.jit(double))._cache._cache_file._source_stamp)
+    assert all(stamps.count(stamp) == 1 for stamp in stamps)
+    assert stamps[0] == _jit.jit(double)._cache._cache_file._source_stamp

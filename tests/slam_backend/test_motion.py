@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from python_entry import python_entry
 from scipy import stats
 
 from slam_backend import _kernels
@@ -28,7 +29,7 @@ def test_kernels_assume_the_same_standard_deviations(sigmas: list[float], move: 
     """The compiled form of the model is the model."""
     model = OdometryModel(**dict(zip(OdometryModel.__slots__, sigmas, strict=True)))
     compiled = np.empty(3)
-    _kernels.write_sigmas(np.array(astuple(model)), np.array(move), compiled)
+    python_entry(_kernels.write_sigmas)(np.array(astuple(model)), np.array(move), compiled)
     np.testing.assert_allclose(compiled, model.sigmas(np.array(move)), rtol=1e-14)
 
 

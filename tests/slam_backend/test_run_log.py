@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from python_entry import python_entry
 from same_bits import assert_same
 
 from slam_backend._journal import LONGEST, ROOM
@@ -20,6 +21,8 @@ from slam_backend.filter import FastSlam
 from slam_backend.log_arrays import EXACT, ODOMETRY, STOOD
 from slam_backend.measurements import Measurements
 from slam_backend.run_log import MEASUREMENTS, ROWS, RobotLog
+
+note_turns = python_entry(note_turns)
 
 Step = dict[str, Any]
 

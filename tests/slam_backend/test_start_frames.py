@@ -1,4 +1,5 @@
 import numpy as np
+from python_entry import python_entry
 
 from slam_backend._kernels import LANES
 from slam_backend._kernels.start_frames import AT_ORIGIN, KNOWN, SPREAD, see_from_starts, stand, start_kind
@@ -8,6 +9,8 @@ from slam_backend.filter import FastSlam
 from slam_backend.geometry import between, compose, inverse, rotate_covariances, rotation, wrap_angle
 from slam_backend.measurements import Measurements
 from slam_backend.standpoints import Standpoints
+
+see_from_starts, start_kind = map(python_entry, (see_from_starts, start_kind))
 
 STARTS = np.array([[1.0, -2.0, 0.7], [4.0, 3.0, -2.0]])
 

@@ -1,10 +1,13 @@
 """Which of the frontiers found now are candidates that there were already: those of the least total distance."""
 
 import numpy as np
+from python_entry import python_entry
 from scipy.optimize import linear_sum_assignment
 
 from vslam_env.navigation._search_kernels import SAME_GOAL, weigh_pairs
 from vslam_env.navigation.candidate_slots import NUM_SLOTS, _of_least_total
+
+weigh_pairs = python_entry(weigh_pairs)
 
 
 def test_pairs_that_are_clear_are_those_of_the_least_total() -> None:

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 from navigation_rooms import ANGLES, building, clearance, drive, in_start_frame, scan
+from python_entry import python_entry
 
 from slam_backend.errors import FloatArray
 from slam_backend.geometry import inverse, transform_points
@@ -20,6 +21,8 @@ from vslam_env.navigation import (
 from vslam_env.navigation._painting_kernels import known_bounds
 from vslam_env.navigation._search_kernels.boxes import OUTSIDE, PAD, known_box
 from vslam_env.navigation._search_kernels.frontiers import _unseen_edges
+
+_unseen_edges, known_box = map(python_entry, (_unseen_edges, known_box))
 
 
 def room(doors: tuple[float, ...] = (), width: float = 1.2) -> np.ndarray:

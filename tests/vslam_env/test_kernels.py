@@ -83,6 +83,15 @@ def test_kernels_that_work_in_place_neither_return_arrays_nor_call_kernels_that_
         assert not any(may_return_arrays(callee) for callee in called_by(kernel)), kernel
 
 
+def test_every_kernel_sets_all_options_that_it_could_inherit() -> None:
+    """What numba passes on from the first caller to a kernel that leaves it unset would depend on the order."""
+    every = list(kernels())
+    assert len(every) > 300
+    for kernel in every:
+        assert kernel.targetoptions.keys() >= {"fastmath", "error_model", "forceinline", "_nrt", "nogil"}, kernel
+        assert kernel.targetoptions["no_cfunc_wrapper"], kernel
+
+
 def test_every_array_that_kernels_make_is_freed() -> None:
     """References that are not counted are missing nowhere."""
     done = subprocess.run([sys.executable, "-c", COUNT_ARRAYS], capture_output=True, text=True, check=False)

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from python_entry import python_entry
 
 from slam_backend import FastSlam
 from slam_backend._kernels import MIN_DEPTH
@@ -15,6 +16,8 @@ from vslam_env.sensors._landmark_kernels import NEAREST, make_up, measure, mix_i
 from vslam_env.world import FreeSpace, Landmarks, World, make_world, place_landmarks
 from vslam_env.world.sight_kernels import choose, detect
 from vslam_env.world.visibility import marks_of, view_limits, visible_landmarks
+
+choose = python_entry(choose)
 
 SHARP = StereoCamera(sigma_px=1e-9, sigma_disparity_px=1e-9)
 PERFECT = LandmarkSensorConfig(

@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from python_entry import python_entry
 from scipy.ndimage import distance_transform_edt
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
@@ -26,6 +27,8 @@ from vslam_env.navigation._painting_kernels import known_bounds
 from vslam_env.navigation._search_kernels.boxes import OUTSIDE, PAD, known_box
 from vslam_env.navigation._search_kernels.ways import UNREACHED, parents_of, wavefront
 from vslam_env.navigation._search_kernels.weights import CLOSE, NEAR, OPEN, weigh
+
+known_box, wavefront, weigh = map(python_entry, (known_box, wavefront, weigh))
 
 
 def floor(low: tuple[float, float], high: tuple[float, float], walls: list[tuple[float, ...]]) -> np.ndarray:

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend._jit import in_place
+from slam_backend._jit import device, in_place
 from slam_backend.standpoints import COVARIANCE, ESS, OWN, SIGMAS
 
 MOST_TEAMMATES = 7
@@ -14,12 +14,14 @@ FAR = 90.0  # [m] more than the diagonal of the seen grid
 MAP_STATS_LIMIT = np.array([10_000.0, 10.0, 10.0, 10_000.0, 1.0, 1.0 + MOST_TEAMMATES])
 
 
+@device
 @in_place
 def _clip(value: float, low: float, high: float) -> np.float32:
     """Clip to bounds that are rounded as those of the space are."""
     return min(max(np.float32(value), np.float32(low)), np.float32(high))
 
 
+@device
 @in_place
 def write_pose(belief: Any, pose: Any, sigmas: Any) -> None:
     """Write `pose` and `pose_std`, each (3,) float32, of a robot that believes this, see `Standpoints`."""
@@ -28,6 +30,7 @@ def write_pose(belief: Any, pose: Any, sigmas: Any) -> None:
         sigmas[i] = _clip(math.sqrt(belief[COVARIANCE + 4 * i]), 0.0, POSE_LIMIT[i])
 
 
+@device
 @in_place
 def write_map_stats(places: Any, names: Any, belief: Any, group_size: int, stats: Any) -> None:
     """Write `map_stats` of a robot.
@@ -54,6 +57,7 @@ def write_map_stats(places: Any, names: Any, belief: Any, group_size: int, stats
     stats[5] = _clip(group_size, 0.0, MAP_STATS_LIMIT[5])
 
 
+@device
 @in_place
 def write_teammates(robot: int, poses: Any, belief: Any, teammates: Any, present: Any) -> int:
     """Write where a robot believes the others of its group to be; return how many these are.
@@ -81,6 +85,7 @@ def write_teammates(robot: int, poses: Any, belief: Any, teammates: Any, present
     return known
 
 
+@device
 @in_place
 def clip_candidates(features: Any) -> None:
     """Clip the features (16, 5) float32 of a robot's candidates."""

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend._jit import in_place, room_of
+from slam_backend._jit import device, in_place, room_of
 from slam_backend.standpoints import OWN, START
 from vslam_env.navigation import CELL, FREE, GRID_SIZE, OCCUPIED, UNKNOWN
 
@@ -15,6 +15,7 @@ MARK = 255
 REACH = 0.75 * SIZE  # [cells] more than from the robot to a corner of its picture
 
 
+@device
 @in_place
 def paint(cells: Any, belief: Any, places: Any, local: Any) -> None:
     """Sample the seen grid at the centres of the local cells, and mark the cells that hold landmarks.

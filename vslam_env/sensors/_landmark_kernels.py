@@ -3,13 +3,14 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend._jit import in_place
+from slam_backend._jit import device, in_place
 from slam_backend.errors import FloatArray, IntArray
 
 NEAREST_FALSE_POINT = 0.5  # [m]
 NEAREST, FARTHEST = 0.05, 1e3  # [m] no matcher reports depths beyond these; filters take none that are nearer
 
 
+@device
 @in_place
 def _bring_to(length: float, vector: FloatArray) -> None:
     """Scale a vector (n,) that is not 0 to a length."""

@@ -8,7 +8,7 @@ sub-columns, each of which meets one wall.
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend._jit import fused, in_place, jit, lanes
+from slam_backend._jit import device, fused, jit, lanes
 from slam_backend.errors import Float32Array, FloatArray, IntArray
 
 NOTHING, ROBOT = -1, -2  # instead of a wall
@@ -20,7 +20,8 @@ ULP = 1e-9
 BYTES_MEAN, BYTES_SIGMA = 510.0, 147.8005  # of the sum of four uniform bytes
 
 
-@in_place
+@device
+@lanes
 def _nearest(slope: float, local: FloatArray, robots: FloatArray, radius: float) -> tuple[int, float, float]:
     """Follow the ray (1, slope) from the origin of the camera's frame.
 
@@ -75,6 +76,7 @@ def trace(
     return walls, depths, along
 
 
+@device
 @lanes
 def _fill_column(
     sums: NDArray[np.int32],
@@ -122,6 +124,7 @@ def _fill_column(
         before = after
 
 
+@device
 @lanes
 def _up_to(y: float, rows: int, width: np.float32, cumulative: Float32Array) -> np.float32:
     """Return the sum of a strip of `width` texels from the ceiling down to `y`; ceiling and floor have no texture."""

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from slam_backend._jit import in_place, inlined, jit, room
+from slam_backend._jit import device, in_place, inlined, jit, room
 from slam_backend.errors import BoolArray, FloatArray, IntArray
 from slam_backend.smoothing._kernels.forms import _spun
 
@@ -38,6 +38,7 @@ def _turned(c: float, s: float, a: FloatArray, out: FloatArray) -> None:
     out[1, 0], out[2, 0], out[2, 1] = out[0, 1], out[0, 2], out[1, 2]
 
 
+@device
 @in_place
 def chain(first: FloatArray, first_noise: FloatArray, motion: FloatArray, noise: FloatArray) -> None:
     """Put a motion before another, in place, and its covariance, to first order.
@@ -84,6 +85,7 @@ def look_at_keys(
             fresh[b], raw[b] = True, frames[b] <= most_frames
 
 
+@device
 @in_place
 def to_freeze(frozen: BoolArray, keys: IntArray, raw: BoolArray, rows: IntArray, sighted: BoolArray) -> int:
     """Say which sightings are frozen from now on: those that are, and those of keys that do not stay raw.
@@ -106,6 +108,7 @@ def to_freeze(frozen: BoolArray, keys: IntArray, raw: BoolArray, rows: IntArray,
     return num
 
 
+@device
 @jit
 def join_keys(
     fresh: BoolArray, sighted: BoolArray, most_keys: int, roots: IntArray, numbers: IntArray, offsets: FloatArray,
@@ -198,6 +201,7 @@ def join_keys(
     return number
 
 
+@device
 @in_place
 def add_sightings(
     rows: IntArray, keys: IntArray, landmarks: IntArray, centres: FloatArray, infos: FloatArray, slopes: FloatArray,

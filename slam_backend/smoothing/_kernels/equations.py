@@ -7,7 +7,7 @@ the information of a sighting turned into these, a sighting adds A^T L A to the 
 
 import math
 
-from slam_backend._jit import in_place, room
+from slam_backend._jit import device, in_place, room
 from slam_backend.errors import FloatArray, IntArray
 from slam_backend.smoothing._kernels.forms import FREE, _inverse, _spun
 
@@ -16,6 +16,7 @@ from slam_backend.smoothing._kernels.forms import FREE, _inverse, _spun
 WEAK = 1e-6
 
 
+@device
 @in_place
 def _wrapped(angle: float) -> float:
     """Return an angle [rad] in [-pi, pi)."""
@@ -144,6 +145,7 @@ def form(
     return cost, eased
 
 
+@device
 @in_place
 def advance(
     change: FloatArray, vector: FloatArray, columns: IntArray, poses: FloatArray, landmarks: FloatArray,

@@ -8,11 +8,11 @@ import math
 
 import numpy as np
 
-from slam_backend._jit import fused, inlined, lanes
+from slam_backend._jit import device, fused, lanes, lanes_inlined
 from slam_backend.errors import FloatArray, IntArray
 
 
-@inlined
+@lanes_inlined
 def _added(values: FloatArray, place: int, block: FloatArray) -> None:
     """Add a block (3, 3) where `lay_out` says."""
     if place == 0:
@@ -99,6 +99,7 @@ def factorise(
     return True
 
 
+@device
 @fused
 def solve(
     pivots: FloatArray, values: FloatArray, order: IntArray, tops: IntArray, rows: IntArray, vector: FloatArray
@@ -157,6 +158,7 @@ def covariance(
     return result
 
 
+@device
 @fused
 def _sweep(
     pivots: FloatArray, values: FloatArray, tops: IntArray, rows: IntArray, columns: IntArray, x: FloatArray

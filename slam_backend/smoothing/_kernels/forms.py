@@ -8,7 +8,7 @@ as their upper triangles by rows (6).
 
 import math
 
-from slam_backend._jit import in_place, inlined, room
+from slam_backend._jit import device, in_place, inlined, room
 from slam_backend.errors import BoolArray, FloatArray, IntArray
 
 FREE = -1  # column of a pose that is given, not sought
@@ -27,7 +27,7 @@ def _spun(c: float, s: float, a: FloatArray, out: FloatArray) -> None:
     out[5] = a22
 
 
-@in_place
+@inlined
 def _inverse(a: FloatArray, out: FloatArray) -> float:
     """Write the inverse of a symmetric matrix (6); return its determinant."""
     p = a[3] * a[5] - a[4] * a[4]
@@ -43,6 +43,7 @@ def _inverse(a: FloatArray, out: FloatArray) -> float:
     return det
 
 
+@device
 @in_place
 def seek(previous: IntArray, columns: IntArray) -> int:
     """Give each pose that is sought the rows after those of the one before.
@@ -61,6 +62,7 @@ def seek(previous: IntArray, columns: IntArray) -> int:
     return num
 
 
+@device
 @in_place
 def invert(matrices: FloatArray, columns: IntArray, out: FloatArray) -> bool:
     """Write the inverses of symmetric matrices (n, 3, 3) to `out`, likewise; return whether all are positive definite.

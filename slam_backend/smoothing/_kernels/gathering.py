@@ -2,10 +2,11 @@
 
 import numpy as np
 
-from slam_backend._jit import in_place, jit
+from slam_backend._jit import device, in_place, jit
 from slam_backend.errors import BoolArray, FloatArray, IntArray
 
 
+@device
 @jit
 def _sorted_by(codes: IntArray, order: IntArray, num_codes: int) -> IntArray:
     """Return an order (n,) by codes in [0, num_codes), that of equal ones as it was."""

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from slam_backend._jit import in_place, jit
+from slam_backend._jit import device, in_place, jit
 from slam_backend.errors import FloatArray, IntArray
 
 
@@ -18,6 +18,7 @@ def rename(names: IntArray, aliases: IntArray) -> None:
                 names[n] = new
 
 
+@device
 @in_place
 def number(names: IntArray, order: IntArray, ids: IntArray, first: IntArray) -> int:
     """Number the landmarks of measurements; those that are new come after the known ones.
@@ -51,6 +52,7 @@ def number(names: IntArray, order: IntArray, ids: IntArray, first: IntArray) -> 
     return num
 
 
+@device
 @in_place
 def place(
     poses: FloatArray, frame_keys: IntArray, offsets: FloatArray, frames: IntArray, points: FloatArray,
@@ -77,6 +79,7 @@ def place(
         places[i, 2] = point[2] + mount[2]
 
 
+@device
 @jit
 def start_anew(
     frozen_landmarks: IntArray, counts: IntArray, point_landmarks: IntArray, new_landmarks: IntArray, names: IntArray,

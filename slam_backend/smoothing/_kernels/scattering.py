@@ -4,11 +4,11 @@ import math
 
 import numpy as np
 
-from slam_backend._jit import fused, inlined
+from slam_backend._jit import fused, lanes_inlined
 from slam_backend.errors import FloatArray, IntArray
 
 
-@inlined
+@lanes_inlined
 def _times(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
     """Add the product of two blocks."""
     for i in range(0, 9, 3):
@@ -16,7 +16,7 @@ def _times(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
             out[i + j] += a[i] * b[j] + a[i + 1] * b[3 + j] + a[i + 2] * b[6 + j]
 
 
-@inlined
+@lanes_inlined
 def _times_turned(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
     """Add the product of a block's transpose and a block."""
     for i in range(3):

@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend._jit import in_place, inlined, jit
+from slam_backend._jit import device, in_place, inlined, jit
 from slam_backend.errors import BoolArray, FloatArray, IntArray
 from slam_backend.log_arrays import ODOMETRY, REJECTED
 
@@ -34,6 +34,7 @@ def _chain(chain: FloatArray, noise: FloatArray, move: FloatArray, variances: Fl
     chain[2] = _wrapped(chain[2] + move[2])
 
 
+@device
 @jit
 def walk(
     kinds: NDArray[np.int8],
@@ -110,6 +111,7 @@ def walk(
     return keys, frames
 
 
+@device
 @jit
 def choose(
     ids: IntArray, points: FloatArray, given: BoolArray, covariances: FloatArray, starts: IntArray, num: int,

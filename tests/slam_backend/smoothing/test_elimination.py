@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from python_entry import python_entry
 from small_problems import TIGHT, camera_of, graph_of, small_run
 
 from slam_backend.errors import FloatArray
@@ -18,6 +19,8 @@ from slam_backend.smoothing.graph import LEVER, PathGraph
 from slam_backend.smoothing.options import SmoothingOptions
 from slam_backend.smoothing.sightings import Sightings
 from slam_backend.smoothing.solving import Mode, find_mode
+
+solve = python_entry(solve)
 
 
 class Problem(NamedTuple):

@@ -2,6 +2,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from python_entry import python_entry
 from small_problems import small_run
 
 from slam_backend._kernels import add_share
@@ -26,6 +27,10 @@ from slam_backend.smoothing.holding import (
     share,
 )
 from training.stereo_runs import RunSpec, simulate_run
+
+add_scatter, bring_nearer, fit, look_at, measure_off, share, widen = map(
+    python_entry, (add_scatter, bring_nearer, fit, look_at, measure_off, share, widen)
+)
 
 SCATTER = np.array([[0.04, 0.01, -0.02], [0.01, 0.09, 0.03], [-0.02, 0.03, 0.05]])
 UPPER = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])

@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from python_entry import python_entry
 from small_problems import (
     TIGHT,
     camera_of,
@@ -24,6 +25,8 @@ from slam_backend.smoothing.options import SmoothingOptions
 from slam_backend.smoothing.solving import find_mode
 from training.batch_ml import batch_ml
 from training.stereo_runs import NoisePreset, RunSpec, simulate_run
+
+advance, invert, seek = map(python_entry, (advance, invert, seek))
 
 
 @pytest.mark.parametrize("robots", [1, 2])

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from python_entry import python_entry
 from small_problems import camera_of, graph_of, logs_of, small_run
 
 from slam_backend.geometry import between, compose, transform_points, wrap_angle
@@ -16,6 +17,8 @@ from slam_backend.smoothing.graph import LEVER, PathGraph
 from slam_backend.smoothing.options import SmoothingOptions
 from slam_backend.smoothing.rejuvenation import rejuvenate
 from training.stereo_runs import RunSpec, simulate_run
+
+choose, number, place, start_anew, walk = map(python_entry, (choose, number, place, start_anew, walk))
 
 OLD = 4  # keys and frames of others before
 TIP = 2

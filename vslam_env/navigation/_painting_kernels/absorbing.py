@@ -3,7 +3,7 @@
 import math
 from typing import Any
 
-from slam_backend._jit import in_place
+from slam_backend._jit import device, in_place
 from vslam_env.navigation._painting_kernels.evidence import (
     CELL,
     FREE,
@@ -16,6 +16,7 @@ from vslam_env.navigation._painting_kernels.evidence import (
 )
 
 
+@device
 @in_place
 def _bounds_in_frame(other: Any, x: float, y: float, c: float, s: float) -> tuple[float, float, float, float]:
     """Return low x, high x, low y and high y [m] of what a grid knows, seen from pose (x, y) turned by (c, s)."""

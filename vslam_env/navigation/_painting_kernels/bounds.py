@@ -4,9 +4,10 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend._jit import in_place, jit
+from slam_backend._jit import device, in_place, jit
 
 
+@device
 @in_place
 def widen(bounds: Any, row: int, col: int) -> None:
     """Move bounds (4,) int32 so that a cell is within."""

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from slam_backend._jit import in_place, inlined
+from slam_backend._jit import device, in_place, inlined
 from vslam_env.navigation._painting_kernels.bounds import widen
 
 GRID_SIZE = 300
@@ -26,6 +26,7 @@ def bounded(evidence: int) -> int:
     return evidence if evidence != 0 else -1
 
 
+@device
 @in_place
 def judge(cells: Any, changes: Any, bounds: Any, row: int, col: int, verdict: int) -> None:
     """Set a cell's verdict, and note it if it changed or was not known before.

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend._jit import in_place, inlined
+from slam_backend._jit import device, in_place, inlined
 from slam_backend.errors import FloatArray
 from vslam_env.navigation._painting_kernels.evidence import CELL
 from vslam_env.navigation._painting_kernels.surveys import ALONG_X, ALONG_Y, TELLING
@@ -35,6 +35,7 @@ def good_angles(angles: FloatArray) -> bool:
     return bool(angles[-1] - angles[0] < math.pi)
 
 
+@device
 @in_place
 def look_to_side(told: Any, side: float, seen: Any) -> None:
     """Write how rays lead to the rows above the robot, or to those below.

@@ -3,7 +3,7 @@
 import math
 from typing import Any
 
-from slam_backend._jit import in_place
+from slam_backend._jit import device, in_place
 from slam_backend.errors import BoolArray, FloatArray
 from vslam_env.navigation._painting_kernels.evidence import (
     CELL,
@@ -51,6 +51,7 @@ def paint_bump(
         judge(cells, changes, bounds, row, col, OCCUPIED)
 
 
+@device
 @in_place
 def _find_bad(shared: Any, poses: FloatArray, scans: FloatArray) -> tuple[int, int]:
     """Return what `paint_readings` returns."""

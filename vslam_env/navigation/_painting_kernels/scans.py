@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend._jit import in_place, inlined, jit, room_of
+from slam_backend._jit import device, in_place, inlined, jit, room_of
 from slam_backend.errors import FloatArray
 from vslam_env.navigation._painting_kernels.evidence import (
     CELL,
@@ -47,6 +47,7 @@ def _before(told: Any, seen: Any, k: Any, u: float, v: float) -> float:
     return before
 
 
+@device
 @in_place
 def _told_at_jump(told: Any, seen: Any, k: Any, u: float, v: float, change: int) -> int:
     """Return the evidence for a cell between two rays at whose ends the range jumps; seen from the robot at (u, v) [m].
@@ -71,6 +72,7 @@ def room_to_paint(num_rays: int) -> FloatArray:
     return np.empty((NUM_ROWS + NUM_SEEN_ROWS, num_rays + 1))
 
 
+@device
 @in_place
 def paint_survey(
     evidence: Any, cells: Any, changes: Any, bounds: Any, x: float, y: float, theta: float, room: FloatArray

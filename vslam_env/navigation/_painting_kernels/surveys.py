@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend._jit import in_place, jit
+from slam_backend._jit import device, in_place, jit
 from slam_backend.errors import FloatArray
 
 SAME_SURFACE_GAP = 0.4  # [m] no robot fits between two hits this near: they are joined unseen
@@ -35,6 +35,7 @@ def directions_of(angles: FloatArray) -> Any:
     return directions
 
 
+@device
 @in_place
 def _survey_rays(ranges: FloatArray, directions: FloatArray, max_range: float, told: Any) -> None:
     """Write what each ray tells by itself, and whether three hits lie on one line."""
@@ -54,6 +55,7 @@ def _survey_rays(ranges: FloatArray, directions: FloatArray, max_range: float, t
         told[IN_LINE, i] = told[IS_HIT, i - 1] * told[IS_HIT, i] * told[IS_HIT, i + 1] * on_line
 
 
+@device
 @in_place
 def _survey_pairs(told: Any) -> None:
     """Write what neighbouring rays see between them: one surface, a jump in range, or nothing.
@@ -84,6 +86,7 @@ def _survey_pairs(told: Any) -> None:
         told[TELLING_FREE, k] = 0.0 if is_surface else end_of_tangent
 
 
+@device
 @in_place
 def survey(ranges: FloatArray, directions: FloatArray, max_range: float, told: Any) -> None:
     """Find out what a scan of `good_ranges` tells.
@@ -105,6 +108,7 @@ def survey(ranges: FloatArray, directions: FloatArray, max_range: float, told: A
         told[TELLING, i] = telling
 
 
+@device
 @in_place
 def turn(told: Any, theta: float, seen: Any) -> None:
     """Write the rows (4, n + 1) of a survey that turn as they are seen at a heading theta [rad]."""

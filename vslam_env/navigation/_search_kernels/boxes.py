@@ -4,13 +4,14 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend._jit import in_place, jit
+from slam_backend._jit import device, in_place, jit
 from vslam_env.navigation._painting_kernels import GRID_SIZE
 
 PAD = 2  # cells around the known box, so that loops over frontiers and neighbours need no bounds
 OUTSIDE = 3  # beyond the 60 x 60 m: neither known nor worth exploring
 
 
+@device
 @in_place
 def any_above_zero(numbers: Any) -> bool:
     """Tell whether any of some small numbers (n,), >= 0, is above 0."""
@@ -20,6 +21,7 @@ def any_above_zero(numbers: Any) -> bool:
     return bool(seen > 0)
 
 
+@device
 @jit
 def known_box(cells: Any, bounds: Any) -> Any:
     """Cut the known box out of a grid, and pad it with the cells around.

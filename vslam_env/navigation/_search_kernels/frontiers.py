@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend._jit import in_place, jit
+from slam_backend._jit import device, in_place, jit
 from vslam_env.navigation._painting_kernels import CELL, FREE, GRID_SIZE, HALF_WIDTH, UNKNOWN
 from vslam_env.navigation._search_kernels.boxes import any_above_zero
 from vslam_env.navigation._search_kernels.ways import NUM_STRAIGHT, UNREACHED, steps_over, ways_over
@@ -20,6 +20,7 @@ SIGHT_CELLS = 3  # the unknown this near to a goal tells where to look from it
 XY, HEADING, SIZE, LENGTH, NUM_COLUMNS = slice(0, 2), 2, 3, 4, 5  # columns of the rows that describe frontiers
 
 
+@device
 @in_place
 def _flood(mark: Any, level: int, into: int, row: int, col: int, limit: int, queue: Any) -> int:
     """Move up to `limit` connected cells from one level of marks to another, nearest first; return how many.
@@ -41,6 +42,7 @@ def _flood(mark: Any, level: int, into: int, row: int, col: int, limit: int, que
     return tail
 
 
+@device
 @jit
 def _goal_near(members: Any, box: Any, cost: Any, mark: Any) -> tuple[int, int]:
     """Return a reached cell as few steps as possible from a frontier and near its middle; (-1, -1) if none is near.
@@ -80,6 +82,7 @@ def _goal_near(members: Any, box: Any, cost: Any, mark: Any) -> tuple[int, int]:
     return goal_row, goal_col
 
 
+@device
 @in_place
 def _path_length(ways: Any, row: int, col: int) -> float:
     """Measure the way to a reached cell [m]."""
@@ -93,6 +96,7 @@ def _path_length(ways: Any, row: int, col: int) -> float:
     return length
 
 
+@device
 @in_place
 def _heading_to_unknown(box: Any, row: int, col: int) -> float:
     """Return the direction from a cell to the unknown cells around it [rad]."""
@@ -104,6 +108,7 @@ def _heading_to_unknown(box: Any, row: int, col: int) -> float:
     return math.atan2(up, right)
 
 
+@device
 @jit
 def _unseen_edges(box: Any, ignored: Any, row: int, col: int) -> Any:
     """Return (h, w) int8, 1 for unknown cells beside free ones that are not to be ignored; see `_frontier_rows`."""
@@ -121,6 +126,7 @@ def _unseen_edges(box: Any, ignored: Any, row: int, col: int) -> Any:
     return edges
 
 
+@device
 @jit
 def _frontier_rows(box: Any, cost: Any, ways: Any, ignored: Any, row: int, col: int) -> Any:
     """Collect the frontiers of a box.

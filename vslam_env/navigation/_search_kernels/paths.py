@@ -5,10 +5,11 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend._jit import in_place, jit
+from slam_backend._jit import device, in_place, jit
 from vslam_env.navigation._search_kernels.ways import STRAIGHT
 
 
+@device
 @in_place
 def _line_cost(weights: Any, row: float, col: float, to_row: float, to_col: float) -> float:
     """Return the cost of a straight line between two cells, infinite if it leaves the open ones."""

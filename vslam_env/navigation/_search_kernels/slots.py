@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend._jit import in_place, jit
+from slam_backend._jit import device, in_place, jit
 from vslam_env.navigation._painting_kernels import CELL, GRID_SIZE, HALF_WIDTH
 from vslam_env.navigation._search_kernels.frontiers import HEADING, NUM_COLUMNS, frontiers_over
 
@@ -17,6 +17,7 @@ PATIENCE = 16  # visits, after which what is still unseen there never will be se
 GIVEN_UP = 0.8  # [m] radius of what is then left out
 
 
+@device
 @in_place
 def _visit(rows: Any, poses: Any, robot: int, visits: Any, given_up: Any) -> None:
     """Add to the visits (m,) of candidates what a robot and its teammates count; where patience runs out, give up.
@@ -40,6 +41,7 @@ def _visit(rows: Any, poses: Any, robot: int, visits: Any, given_up: Any) -> Non
             visits[i] = 0
 
 
+@device
 @in_place
 def _give_up(goal_x: float, goal_y: float, given_up: Any) -> None:
     """Mark the cells of a grid around a goal that nobody can see."""
@@ -49,6 +51,7 @@ def _give_up(goal_x: float, goal_y: float, given_up: Any) -> None:
             given_up[r, c] |= (x - goal_x) ** 2 + (y - goal_y) ** 2 <= GIVEN_UP**2
 
 
+@device
 @in_place
 def weigh_pairs(goals: Any, places: Any, costs: Any) -> bool:
     """Write the distances (m, n), at most `SAME_GOAL`, between goals (m, 2 or more) and places (n, 2 or more).

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend._jit import in_place, jit
+from slam_backend._jit import device, in_place, jit
 from vslam_env.navigation._painting_kernels import OCCUPIED
 from vslam_env.navigation._search_kernels.boxes import PAD, known_box
 from vslam_env.navigation._search_kernels.weights import weigh
@@ -55,6 +55,7 @@ def nearest_open(box: Any, weights: Any, row: int, col: int, reach: int) -> tupl
     return -1, -1
 
 
+@device
 @in_place
 def steps_over(width: int) -> tuple[int, ...]:
     """Return how far a step in each of the eight directions leads in a flat grid of rows as wide as this."""
@@ -71,6 +72,7 @@ def parents_of(ways: Any) -> Any:
     return parents.reshape(ways.shape)
 
 
+@device
 @jit
 def wavefront(weights: Any, row: int, col: int) -> tuple[Any, Any]:
     """Find the cheapest ways from one cell to all others (Dijkstra's algorithm with Dial's buckets).

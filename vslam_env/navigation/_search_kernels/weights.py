@@ -5,12 +5,13 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend._jit import in_place, jit
+from slam_backend._jit import device, in_place, jit
 from vslam_env.navigation._painting_kernels import FREE, OCCUPIED, UNKNOWN
 
 CLOSE, NEAR, OPEN = 4, 2, 1  # weights of cells by their distance from walls
 
 
+@device
 @in_place
 def _spread(squares: Any, span: int, stride: int, least: Any) -> None:
     """Write the least of each entry and those up to `span` strides before and after it plus the number squared.
@@ -34,6 +35,7 @@ def _spread(squares: Any, span: int, stride: int, least: Any) -> None:
             later[i] = through if through < later[i] else later[i]
 
 
+@device
 @jit
 def _squared_clearance(box: Any, span: int) -> Any:
     """Return each cell's squared distance to the nearest occupied one, (h, w) uint8, if at most `span`; else more.
@@ -56,6 +58,7 @@ def _squared_clearance(box: Any, span: int) -> Any:
     return squares.reshape((height, wide))
 
 
+@device
 @jit
 def weigh(box: Any, reach: float) -> Any:
     """Weigh the cells of a box by how near they are to walls.

@@ -5,13 +5,14 @@ A camera at (x, y) with axis theta looks along its own x axis; `ahead` and `left
 
 import numpy as np
 
-from slam_backend._jit import in_place, jit
+from slam_backend._jit import device, in_place, jit
 from slam_backend.errors import BoolArray, FloatArray, IntArray
 from vslam_env.world.sight_kernels.rays import EPSILON, ray_to_disc, ray_to_wall, those, walls_in_wedge
 
 TOUCH = 1e-6  # [m] what a ray meets this close to its target does not hide the target
 
 
+@device
 @in_place
 def _hidden(x: float, y: float, dx: float, dy: float, own_wall: int, walls: FloatArray, indices: IntArray) -> bool:
     """Tell whether a wall other than `own_wall` crosses the sight line from (x, y) to (x + dx, y + dy)."""
@@ -24,6 +25,7 @@ def _hidden(x: float, y: float, dx: float, dy: float, own_wall: int, walls: Floa
     return False
 
 
+@device
 @in_place
 def _find_visible(
     robot: int,
@@ -84,6 +86,7 @@ def _find_visible(
     return count
 
 
+@device
 @jit
 def _room_to_look(num_walls: int, num_landmarks: int) -> tuple[FloatArray, IntArray, IntArray]:
     """Return what `_find_visible` works in and writes to."""
@@ -123,6 +126,7 @@ def see(
             seen[k, n] = True
 
 
+@device
 @in_place
 def choose(visible: IntArray, keys: FloatArray, detection_probability: float, places: int, chosen: IntArray) -> int:
     """Detect landmarks and choose among the detected ones.

@@ -2,12 +2,13 @@
 
 import numpy as np
 
-from slam_backend._jit import in_place, jit
+from slam_backend._jit import device, in_place, jit
 from slam_backend.errors import FloatArray, IntArray
 
 EPSILON = 1e-9  # walls that share an end point leave no gap between them
 
 
+@device
 @in_place
 def those(rows: IntArray) -> int:
     """Write which of some flags (n,), 0 or 1, are up in their place, first of all, and return how many are.
@@ -71,6 +72,7 @@ def walls_in_wedge(
     return count
 
 
+@device
 @in_place
 def ray_to_wall(dx: float, dy: float, x1: float, y1: float, x2: float, y2: float) -> float:
     """Solve t (dx, dy) = p1 + u (p2 - p1) for t >= 0 with u in [0, 1]; infinity when there is no such t."""
@@ -82,6 +84,7 @@ def ray_to_wall(dx: float, dy: float, x1: float, y1: float, x2: float, y2: float
     return t if meets else np.inf
 
 
+@device
 @in_place
 def ray_to_disc(dx: float, dy: float, x: float, y: float, radius: float) -> float:
     """Return the distance along the unit vector (dx, dy) to a disc at (x, y) ahead; infinity if the ray misses it."""
