@@ -17,9 +17,10 @@ from vslam_env.config import TICK, EnvConfig
 from vslam_env.coverage import Coverage
 from vslam_env.oracle import true_alignment
 from vslam_env.readings import Readings, TeamReadings
+from vslam_env.reward import RUNNING_COST
 from vslam_env.sensors import EyeFrame, EyeFrames, Frame, Frames
 from vslam_env.setting import Setting
-from vslam_env.standing import DISTANCES, FOUND, NUM_FIGURES, Standing
+from vslam_env.standing import DISTANCES, ERROR_INTEGRALS, FOUND, MAP_ERRORS, NUM_FIGURES, Standing
 from vslam_env.world import Simulator, read_odometry
 
 Recorder = Callable[[tuple[Readings, ...]], None]
@@ -79,6 +80,8 @@ class Episode:
         self._collisions: tuple[int, ...] = (0,) * config.num_robots
         self._figures = np.zeros((NUM_FIGURES, config.num_robots))  # of `Standing`; ways are added up in their row
         self._found, self._distances = self._figures[FOUND], self._figures[DISTANCES]
+        self._error_integrals = self._figures[ERROR_INTEGRALS]
+        self._integrates = RUNNING_COST in config.reward  # scoring every tick costs time: only where it is asked for
         self.true_path: list[FloatArray] = []
         self.estimated_path: list[FloatArray] = []
         self.merge_ticks: list[tuple[int, tuple[int, ...], tuple[int, ...]]] = []
@@ -121,6 +124,9 @@ class Episode:
             self._collisions = tuple(map(add, self._collisions, simulator.bumped.tolist()))
         self.tick += 1
         self._perceive(read_odometry(before, simulator.poses, self.setting.bias, noise, stream, self._distances))
+        if self._integrates:
+            self._score(simulator.poses)
+            self._error_integrals += self._figures[MAP_ERRORS] * TICK
 
     def believed_poses(self) -> FloatArray:
         """Return where the robots believe to be (K, 3) [m, m, rad], laid at their true starts, world frame."""
@@ -129,7 +135,7 @@ class Episode:
     def standing(self) -> Standing:
         """Return how the team stands now: its maps and poses are scored."""
         belief, poses = self.belief, self._simulator.poses
-        self.ledger.score(belief.outlines, belief.points, self.true_starts, poses, self._figures)
+        self._score(poses)
         coverage = self._coverage.update(belief.grids, poses, self._found)
         counts = self._collisions, tuple(belief.exchange.sent)
         return Standing(self._figures.tolist(), counts, coverage, len(self.merge_ticks), self.tick * TICK)
@@ -146,7 +152,7 @@ class Episode:
             "belief": self.belief.get_state(),
             "ledger": self.ledger.get_state(),
             "coverage": self._coverage.get_state(),
-            "counts": (self._collisions, self._distances.copy()),
+            "counts": (self._collisions, self._distances.copy(), self._error_integrals.copy()),
             "last": (self.readings, self._frames),
             "paths": (tuple(self.true_path), tuple(self.estimated_path), tuple(self.merge_ticks)),
         }
@@ -168,11 +174,16 @@ class Episode:
         self.ledger.set_state(state["ledger"])
         self._coverage.set_state(state["coverage"])
         self.tick = state["tick"]
-        self._collisions, self._distances[:] = state["counts"]
+        self._collisions, self._distances[:], self._error_integrals[:] = state["counts"]
         self.readings, self._frames = state["last"]
         self.true_path, self.estimated_path, self.merge_ticks = (list(path) for path in state["paths"])
 
     # ------------------------------------------------------------------ within
+
+    def _score(self, poses: FloatArray) -> None:
+        """Write the scores of all maps and poses, with robots at true poses (K, 3), into the first figures."""
+        belief = self.belief
+        self.ledger.score(belief.outlines, belief.points, self.true_starts, poses, self._figures)
 
     def _perceive(self, odometry: FloatArray | None) -> None:
         """Read all other sensors at the true poses, and let the robots take it in."""

@@ -24,7 +24,7 @@ def infos_of(
         terms: By name, per robot: what each term of the reward has paid for the step.
         invalid: Per robot 1 if its action was masked.
     """
-    errors, rmses, recalls, precisions, _, pose_errors, heading_errors, _, _, distances = standing.figures
+    errors, rmses, recalls, precisions, _, pose_errors, heading_errors, _, _, distances, _ = standing.figures
     collisions, bytes_sent = standing.counts
     infos: dict[str, dict[str, Any]] = {}
     for robot, agent in enumerate(agents):

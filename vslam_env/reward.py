@@ -1,4 +1,8 @@
-"""Rewards as named, weighted terms of what a step changed."""
+"""Rewards as named, weighted terms of what a step changed.
+
+Discount by at least 0.999 per tick of 0.1 s, which is 0.99 per second: `gamma ** decision_ticks` for a step. With less,
+what comes after the first seconds barely counts, and looking around once pays nearly as much as exploring.
+"""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -11,10 +15,20 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from slam_backend.errors import bad_argument, check_array, check_float
-from vslam_env.standing import COLLISIONS, DISTANCES, FOUND, MAP_ERRORS, PLACED_RECALLS, POSE_SIGMAS, Standing
+from vslam_env.standing import (
+    COLLISIONS,
+    DISTANCES,
+    ERROR_INTEGRALS,
+    FOUND,
+    MAP_ERRORS,
+    PLACED_RECALLS,
+    POSE_SIGMAS,
+    Standing,
+)
 
 __all__ = [
-    "COSTS", "POTENTIALS", "TERMS", "RewardSpec", "RewardTerm", "Standing", "evaluate", "make_terms", "totals",
+    "COSTS", "POTENTIALS", "RUNNING_COST", "TERMS", "RewardSpec", "RewardTerm", "Standing", "evaluate",
+    "make_terms", "totals",
 ]  # fmt: skip
 
 
@@ -93,10 +107,12 @@ POTENTIALS: dict[str, Gain] = {
     "coverage": _coverage,
     "own_coverage": _rise_of(FOUND),
 }
+RUNNING_COST = "running_cost"
 COSTS: dict[str, Gain] = {
     "collisions": _collisions,
     "distance": _fall_of(DISTANCES),
     "time": _time,
+    RUNNING_COST: _fall_of(ERROR_INTEGRALS),
 }
 TERMS = POTENTIALS | COSTS
 

@@ -16,7 +16,7 @@ import numpy as np
 from slam_backend.errors import bad_argument
 from vslam_env.config import EnvConfig
 
-STATE_FORMAT = 26  # raised when what a state holds changes; a state goes on bit by bit only with what made it
+STATE_FORMAT = 27  # raised when what a state holds changes; a state goes on bit by bit only with what made it
 MAGIC = b"vslam_env state "
 KEYS = ("version", "config", "root", "agents", "cycle", "episode", "drivers", "standing")
 

@@ -7,8 +7,8 @@ import numpy as np
 
 from slam_backend.errors import FloatArray, IntArray
 
-NUM_FIGURES = 10
-MAP_ERRORS, PLACED_RECALLS, POSE_SIGMAS, FOUND, DISTANCES = 0, 4, 7, 8, 9  # some rows of figures
+NUM_FIGURES = 11
+MAP_ERRORS, PLACED_RECALLS, POSE_SIGMAS, FOUND, DISTANCES, ERROR_INTEGRALS = 0, 4, 7, 8, 9, 10  # rows of figures
 COLLISIONS, BYTES_SENT = 0, 1  # rows of counts
 
 
@@ -16,7 +16,7 @@ class Standing(NamedTuple):
     """How the team stands.
 
     Attributes:
-        figures: (10, K). What the first properties return, row by row in their order; first those of
+        figures: (11, K). What the first properties return, row by row in their order; first those of
             `vslam_env.scoring.score_team`.
         counts: (2, K). What `collisions` and `bytes_sent` return.
         coverage: Share of the free floor that the team has seen.
@@ -79,6 +79,14 @@ class Standing(NamedTuple):
     def distances(self) -> FloatArray:
         """(K,) float64 [m]. Way that each has gone since the reset."""
         return np.array(self.figures[DISTANCES])
+
+    @property
+    def error_integrals(self) -> FloatArray:
+        """(K,) float64 [m s]. E of each robot's map, summed over the ticks since the reset, times their length.
+
+        Zeros unless the reward has the term `running_cost`: maps are then scored at every tick.
+        """
+        return np.array(self.figures[ERROR_INTEGRALS])
 
     @property
     def collisions(self) -> IntArray:

@@ -1,9 +1,11 @@
+import hashlib
 from typing import Any
 
 import numpy as np
 import pytest
+from digests import digest
 from scored import scored, standing_at
-from small_env import MEETING, small_env, turning
+from small_env import MEETING, small_env, turning, wander
 
 from agents import make_policy
 from slam_backend.alignment import Alignment
@@ -11,9 +13,11 @@ from slam_backend.findings import Findings
 from slam_backend.landmark_map import LandmarkMap, TeamOutlines
 from slam_backend.reports import LandmarksCreated, TeamReport
 from vslam_env import ExplorationEnv, vslam_v0
+from vslam_env.config import TICK
 from vslam_env.errors_of_maps import ClaimLedger
 from vslam_env.oracle import true_alignment
-from vslam_env.reward import POTENTIALS, TERMS, Standing, evaluate, make_terms
+from vslam_env.reward import POTENTIALS, RUNNING_COST, TERMS, Standing, evaluate, make_terms
+from vslam_env.scoring import FALSE
 
 FIGURES: dict[str, list[float]] = {  # in the order of their rows
     "map_errors": [0.7, 0.6],
@@ -26,6 +30,7 @@ FIGURES: dict[str, list[float]] = {  # in the order of their rows
     "pose_sigmas": [0.02, 0.05],
     "found": [0.2, 0.05],
     "distances": [1.0, 2.0],
+    "error_integrals": [2.0, 1.5],
 }
 
 
@@ -64,6 +69,7 @@ def test_named_terms() -> None:
         found=[0.25, 0.25],
         collisions=(2, 3),
         distances=[1.25, 2.0],
+        error_integrals=[2.25, 1.75],
         time=3.5,
     )
     weights = {name: float(weight) for weight, name in enumerate(TERMS, start=2)}
@@ -79,6 +85,7 @@ def test_named_terms() -> None:
         "collisions": [-2.0, 0.0],
         "distance": [-0.25, 0.0],
         "time": [-0.5, -0.5],
+        "running_cost": [-0.25, -0.25],
     }
     assert rewards.keys() == expected.keys() == TERMS.keys()
     for name, values in expected.items():
@@ -158,6 +165,17 @@ def test_a_map_that_is_placed_wrong_has_no_recall() -> None:
         assert (scores.map_recalls[0], scores.placed_recalls[0]) == (2 / 3, placed)
 
 
+def _merge(env: ExplorationEnv, shift: list[float]) -> None:
+    """Merge the maps of two robots with the true transform, moved by a shift (3,)."""
+    episode = env.episode
+    claims = [episode.ledger.claims(r, episode.belief.filter_map(r).ids) for r in range(2)]
+    true = true_alignment(*claims, *episode.true_starts)
+    assert true is not None
+    inliers = np.empty((0, 2), np.int64) if any(shift) else true.inliers
+    used = Alignment(True, "", *(true.transform + shift).tolist(), true.covariance, inliers, 0.0)
+    episode.ledger.rename(episode.belief.merge(0, 1, used))
+
+
 def test_a_wrong_merge_costs() -> None:
     """A merge with the true transform lowers every map error; half a metre and ten degrees off it raises both."""
     changes = []
@@ -167,18 +185,116 @@ def test_a_wrong_merge_costs() -> None:
         env.reset(seed=5, options={"start_poses": MEETING})
         for _ in range(60):
             infos = env.step(turning(env.agents))[4]
-        episode = env.episode
-        claims = [episode.ledger.claims(r, episode.belief.filter_map(r).ids) for r in range(2)]
-        true = true_alignment(*claims, *episode.true_starts)
-        assert true is not None
-        pose = true.transform + shift
-        inliers = true.inliers if shift[0] == 0.0 else np.empty((0, 2), np.int64)
-        used = Alignment(True, "", *pose.tolist(), true.covariance, inliers, 0.0)
-        episode.ledger.rename(episode.belief.merge(0, 1, used))
-        after = episode.standing().map_errors
+        _merge(env, shift)
+        after = env.episode.standing().map_errors
         changes.append([error - infos[f"robot_{r}"]["map_error"] for r, error in enumerate(after)])
     assert max(changes[0]) < 0.0
     assert min(changes[1]) > 0.01
+
+
+@pytest.mark.parametrize("action_type", ["continuous", "goal"])
+def test_the_running_cost_leaves_all_else_alone(action_type: str) -> None:
+    """With a weight of zero every observation and reward has the bytes that it has without the running cost."""
+    plain = small_env(action_type=action_type, decision_ticks=6)
+    costly = small_env(action_type=action_type, decision_ticks=6, reward={"map_error": 1.0, RUNNING_COST: 0.0})
+    digests = []
+    for env in (plain, costly):
+        rng, told = np.random.default_rng(1), hashlib.sha256()
+        digest(env.reset(seed=5)[0], told)
+        while env.agents:
+            digest(env.step(wander(env, rng))[:2], told)
+        digests.append(told.hexdigest())
+    assert digests[0] == digests[1]
+
+
+def _standing_still(env: ExplorationEnv) -> dict[str, Any]:
+    """Return continuous actions that move no robot."""
+    return {agent: np.zeros(2) for agent in env.agents}
+
+
+def test_the_running_cost_charges_every_tick() -> None:
+    """A step of several ticks costs what its ticks cost one by one: the map error after each, times its 0.1 s."""
+    weights = {"map_error": 1.0, RUNNING_COST: 0.5}
+    each, many = (small_env(reward=weights, decision_ticks=ticks, max_cycles=120) for ticks in (1, 6))
+    for env in (each, many):
+        env.reset(seed=5, options={"start_poses": MEETING})
+    for _ in range(20):
+        expected = dict.fromkeys(each.agents, 0.0)
+        for _ in range(6):
+            infos = each.step(turning(each.agents))[4]
+            for agent, info in infos.items():
+                assert info["reward/running_cost"] == pytest.approx(-0.5 * TICK * info["map_error"], abs=1e-12)
+                expected[agent] += info["reward/running_cost"]
+        infos = many.step(turning(many.agents))[4]
+        for agent, cost in expected.items():
+            assert infos[agent]["reward/running_cost"] == pytest.approx(cost, abs=1e-12)
+    assert any(event.kind == "merge" for event in many.events)
+
+
+def test_snapshots_hold_the_running_cost() -> None:
+    """An environment that is set to a state charges the same bytes from there on."""
+    env = small_env(reward={RUNNING_COST: 1.0}, decision_ticks=3)
+    env.reset(seed=5)
+    for _ in range(4):
+        env.step(turning(env.agents))
+    twin = small_env(reward={RUNNING_COST: 1.0}, decision_ticks=3)
+    twin.set_state(env.get_state())
+    for _ in range(4):
+        assert env.step(turning(env.agents))[1] == twin.step(turning(twin.agents))[1]
+        assert env.episode.standing().error_integrals.tolist() == twin.episode.standing().error_integrals.tolist()
+
+
+def test_idling_costs_its_time() -> None:
+    """200 idle ticks cost the map error times 20 s where nothing is seen: c / sqrt(2) for a map of no landmarks."""
+    blind = {"detection_probability": 0.0, "false_points": 0.0}
+    config = small_env().config.replace(landmark_sensor=blind)
+    weights = {"map_error": 1.0, RUNNING_COST: 1.0}
+    env = small_env(config=config, reward=weights, decision_ticks=20, max_cycles=10)
+    env.reset(seed=0)
+    costs = dict.fromkeys(env.agents, 0.0)
+    while env.agents:
+        infos = env.step(_standing_still(env))[4]
+        for agent, info in infos.items():
+            assert info["map_error"] == pytest.approx(np.sqrt(0.5))
+            assert info["reward/map_error"] == 0.0
+            costs[agent] += info["reward/running_cost"]
+    assert list(costs.values()) == pytest.approx([-20.0 * np.sqrt(0.5)] * 2, abs=1e-12)
+
+
+@pytest.mark.parametrize("gamma", [1.0, 0.999, 0.99])
+def test_a_worse_map_costs_more(gamma: float) -> None:
+    """Landmarks that become duplicates or false points, or a wrong merge, lower the return of the running cost."""
+    quiet = small_env().config.replace(belief={"attempts": {"every": 10**6}})
+    env = small_env(config=quiet, reward={RUNNING_COST: 1.0}, max_cycles=400)
+    env.reset(seed=5, options={"start_poses": MEETING})
+    for _ in range(60):
+        env.step(turning(env.agents))
+
+    def cost(twin: ExplorationEnv) -> float:
+        rewards = [twin.step(_standing_still(twin))[1]["robot_0"] for _ in range(20)]
+        return float(sum(gamma**t * reward for t, reward in enumerate(rewards)))
+
+    held = env.belief("robot_0").map.ids
+    true_one = int(env.episode.ledger.claims(0, held[:1])[0])
+    assert true_one >= 0
+
+    def claiming(claim: int) -> ExplorationEnv:
+        """Return a twin in which more landmarks of the first robot's map claim the same."""
+        twin, state = env.clone(), env.get_state()
+        state["episode"]["ledger"]["books"][0, held[1:4]] = claim
+        twin.set_state(state)
+        return twin
+
+    def merged(shift: list[float]) -> ExplorationEnv:
+        """Return a twin that has merged its maps."""
+        twin = env.clone()
+        _merge(twin, shift)
+        return twin
+
+    as_it_is = cost(env.clone())
+    assert cost(claiming(true_one)) < as_it_is
+    assert cost(claiming(FALSE)) < as_it_is
+    assert cost(merged([0.5, -0.5, np.radians(10.0)])) < as_it_is < cost(merged([0.0, 0.0, 0.0]))
 
 
 @pytest.mark.slow
