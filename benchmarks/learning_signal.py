@@ -1,30 +1,45 @@
-"""How well a learner can tell good goals from bad: what random play says about the choices that `vslam train` makes.
+"""What a learner is paid for: how well random play tells good goals from bad, and what discounts make of the reward.
 
-    python benchmarks/learning_signal.py --episodes 60
+    python benchmarks/learning_signal.py choices --episodes 60
+    python benchmarks/learning_signal.py returns --seeds 20
 
-Robots drive to candidates drawn at random, in worlds of the training split. For several rewards and traces of the
-generalised advantage estimate (lambda; a linear value is fitted and subtracted) it prints how the advantage of a
-decision correlates with what was chosen, against what could have been: a shorter way, a longer frontier, one that no
-teammate is nearer to. Beside each correlation stands its t value over the episodes: the larger, the fewer decisions a
-policy gradient needs; twice the t value is a quarter of the decisions.
+`choices` shows what random play says about the choices that `vslam train` makes. Robots drive to candidates drawn at
+random, in worlds of the training split. For several rewards and traces of the generalised advantage estimate (lambda;
+a linear value is fitted and subtracted) it prints how the advantage of a decision correlates with what was chosen,
+against what could have been: a shorter way, a longer frontier, one that no teammate is nearer to. Beside each
+correlation stands its t value over the episodes: the larger, the fewer decisions a policy gradient needs; twice the t
+value is a quarter of the decisions.
+
+`returns` plays scripted policies in the environment as it is by default, and prints the return of each, undiscounted
+and discounted per tick: of the default reward, of the running cost, and of potential-based shaping with the potential
+-E and nothing else. Beside each mean over the robots and the seeds stands by how much it is above that of the nearest
+frontier, paired over the seeds, with its 95 % bootstrap interval.
 """
 
 import os
 
 os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Annotated, Any
 
 import numpy as np
 import typer
 from rich.console import Console
+from rich.progress import track
 from rich.table import Table
 
 from agents import make_policy
-from slam_backend.errors import FloatArray
+from agents.policy import Policy
+from slam_backend.errors import FloatArray, check_int
+from training.episode import Progress, run_episode
 from training.learn_config import SPLIT_TRAIN, TrainConfig
+from training.seed_means import mean_of, shown
+from training.text_tables import markdown_table
 from vslam_env import ExplorationEnv, vslam_v0
+from vslam_env.belief import Belief
+from vslam_env.reward import RUNNING_COST
 
 TERMS = ("map_error", "coverage", "own_coverage")
 REWARDS: tuple[dict[str, float], ...] = (
@@ -36,6 +51,42 @@ TRACES = (0.95, 0.9, 0.5, 0.0)
 CHOICES = ("shorter way", "longer frontier", "no teammate nearer")
 RIDGE = 1e-2
 WIDTH = 120
+DISCOUNTS = (1.0, 0.999, 0.99)  # per tick
+TICKS_OF_A_TURN = 42  # at 1.5 rad/s: a turn and a little
+RETURNS = {"map_error": "default", RUNNING_COST: "running cost", "shaping": "shaping alone"}
+
+
+class Spin:
+    """Turns on the spot, then stands still.
+
+    Args:
+        ticks: Number of ticks that it turns.
+    """
+
+    def __init__(self, ticks: int) -> None:
+        self._ticks = ticks
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the last episode."""
+        self._left = self._ticks
+
+    def act(self, observation: Any, belief: Belief, rng: np.random.Generator) -> FloatArray:
+        """Return the `continuous` action: a turn to the left at full speed, or zeros."""
+        self._left -= 1
+        return np.array([0.0, float(self._left >= 0)])
+
+
+FRONTIER = "nearest frontier"
+PLAYERS: dict[str, Callable[[], Policy]] = {
+    FRONTIER: partial(make_policy, "frontier", "continuous"),
+    "random walk": partial(make_policy, "random_walk", "continuous"),
+    "spin": partial(Spin, 10**9),
+    "one turn, then stay": partial(Spin, TICKS_OF_A_TURN),
+    "idle": partial(Spin, 0),
+}
+
+app = typer.Typer(help="What a learner is paid for.", no_args_is_help=True, add_completion=False)
 
 
 def play(env: ExplorationEnv, seed: int) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -110,11 +161,78 @@ def advantages(rewards: FloatArray, seen: FloatArray, gamma: float, trace: float
     return scaled, explained
 
 
-def main(
+def play_ticks(env: ExplorationEnv, make: Callable[[], Policy], seed: int) -> tuple[FloatArray, FloatArray]:
+    """Play an episode of one policy for all robots.
+
+    Returns:
+        What the default reward and the running cost paid in each step, means over the robots (T, 2), and the mean map
+        error at the reset and after each step (T + 1,) [m].
+    """
+    paid, errors = [], []
+
+    def note(progress: Progress) -> None:
+        infos = progress.infos.values()
+        paid.append([[info[f"reward/{term}"] for term in ("map_error", RUNNING_COST)] for info in infos])
+        errors.append([info["map_error"] for info in infos])
+
+    run_episode(env, {agent: make() for agent in env.possible_agents}, seed, note)
+    return np.mean(paid[1:], axis=1), np.mean(errors, axis=1)
+
+
+def returns_of(paid: FloatArray, errors: FloatArray, gamma: float) -> dict[str, float]:
+    """Return the discounted return of an episode by the names of `RETURNS`.
+
+    Args:
+        paid: (T, 2). What the default reward and the running cost paid in each step.
+        errors: (T + 1,) [m]. The map error at the reset and after each step.
+        gamma: Discount per step.
+    """
+    discounts = gamma ** np.arange(len(paid))
+    shaping = errors[:-1] - gamma * errors[1:]  # gamma phi' - phi with phi = -E
+    sums = discounts @ np.column_stack([paid, shaping])
+    return dict(zip(RETURNS, sums.tolist(), strict=True))
+
+
+def table_of(found: Mapping[tuple[str, float, str], FloatArray]) -> str:
+    """Return the Markdown table of the returns (seeds,) by reward, discount and policy."""
+    rows = []
+    for reward, title in RETURNS.items():
+        for policy in PLAYERS:
+            cells = []
+            for gamma in DISCOUNTS:
+                own = found[reward, gamma, policy]
+                more = mean_of("more", own - found[reward, gamma, FRONTIER])
+                cells += [f"{own.mean():z.3f}", "" if policy == FRONTIER else shown(more, "more")]
+            rows.append([title, policy, *cells])
+    headings = [text for gamma in DISCOUNTS for text in (f"gamma {gamma:g}", "less the frontier's")]
+    return markdown_table(["reward", "policy", *headings], rows)
+
+
+@app.command()
+def returns(
+    seeds: Annotated[int, typer.Option(help="Episodes of each policy, 100 s long.")] = 20,
+    first_seed: Annotated[int, typer.Option(help="Seed of the first episode; the others follow.")] = 0,
+) -> None:
+    """Play scripted policies, and print what discounts make of their returns."""
+    check_int("seeds", seeds, 2, "An interval needs two or more.")
+    check_int("first_seed", first_seed, 0, "Use 0 or a positive number.")
+    env = vslam_v0.parallel_env(reward={"map_error": 1.0, RUNNING_COST: 1.0})
+    every = [(policy, seed) for seed in range(first_seed, first_seed + seeds) for policy in PLAYERS]
+    found: dict[tuple[str, float, str], list[float]] = {}
+    for policy, seed in track(every, "Playing", console=Console(stderr=True), transient=True):
+        episode = play_ticks(env, PLAYERS[policy], seed)
+        for gamma in DISCOUNTS:
+            for reward, value in returns_of(*episode, gamma).items():
+                found.setdefault((reward, gamma, policy), []).append(value)
+    typer.echo(table_of({key: np.array(values) for key, values in found.items()}))
+
+
+@app.command()
+def choices(
     episodes: Annotated[int, typer.Option(help="Of three robots and 90 s; a second or two each.")] = 60,
     first_seed: Annotated[int, typer.Option(help="Of the first of them.")] = 2000,
 ) -> None:
-    """Play, and print the table."""
+    """Play random goals, and print how the advantage of a decision correlates with what was chosen."""
     chosen_config = TrainConfig(reward=dict.fromkeys(TERMS, 1.0))
     env = vslam_v0.parallel_env(config=chosen_config.make_env_config(SPLIT_TRAIN))
     played = [play(env, seed) for seed in range(first_seed, first_seed + episodes)]
@@ -136,4 +254,4 @@ def main(
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    app()

@@ -1,4 +1,4 @@
-"""What random play says about choices: advantages by hand, choices against what was valid, and the table."""
+"""What a learner is paid for: advantages by hand, choices against what was valid, discounted returns, the tables."""
 
 import importlib.util
 from pathlib import Path
@@ -6,6 +6,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+
+from vslam_env import vslam_v0
+from vslam_env.config import TICK
 
 PATH = Path(__file__).parents[2] / "benchmarks" / "learning_signal.py"
 SPEC = importlib.util.spec_from_file_location("learning_signal", PATH)
@@ -47,10 +50,74 @@ def test_advantages_are_those_of_the_definition() -> None:
     assert explained == pytest.approx(1.0 - np.mean((returns - values[:, :-1]) ** 2) / returns.var())
 
 
+@pytest.mark.parametrize("gamma", [1.0, 0.999, 0.99])
+def test_returns_are_those_of_the_definition(gamma: float) -> None:
+    """Discounts weigh the map error of early steps; shaping alone pays the first error, whatever comes after it."""
+    errors = np.random.default_rng(2).uniform(0.2, 0.7, 301)
+    paid = np.column_stack([errors[:-1] - errors[1:], -TICK * errors[1:]])
+    found = learning_signal.returns_of(paid, errors, gamma)
+    assert list(found) == list(learning_signal.RETURNS)
+    later = sum(gamma ** (t - 1) * errors[t] for t in range(1, 300))
+    last = gamma**299 * errors[300]
+    assert found["map_error"] == pytest.approx(errors[0] - (1.0 - gamma) * later - last)
+    assert found["running_cost"] == pytest.approx(-TICK * (later + last))
+    value_of_the_end = errors[300]  # what shaping alone pays from there on
+    assert found["shaping"] + gamma**300 * value_of_the_end == pytest.approx(errors[0])
+
+
+def test_players_turn_and_stand() -> None:
+    """A turn takes 4.2 s; who spins never stops, and who idles never begins."""
+
+    def turned(name: str, ticks: int) -> Any:
+        policy = learning_signal.PLAYERS[name]()
+        policy.reset()
+        actions = [policy.act(None, None, np.random.default_rng(0)) for _ in range(ticks)]
+        assert not any(action[0] for action in actions)
+        return 1.5 * TICK * sum(action[1] for action in actions) / (2.0 * np.pi)
+
+    assert turned("one turn, then stay", 200) == pytest.approx(1.0, abs=0.01)
+    assert turned("spin", 200) == pytest.approx(4.775, abs=0.01)
+    assert turned("idle", 200) == 0.0
+
+
+def test_an_episode_is_paid_as_its_errors_fall() -> None:
+    """What is noted of an episode are the rewards that the environment paid, and the errors between them."""
+    weights = {"map_error": 1.0, "running_cost": 1.0}
+    env = vslam_v0.parallel_env(world="fig5", num_robots=2, num_particles=5, max_cycles=12, reward=weights)
+    paid, errors = learning_signal.play_ticks(env, learning_signal.PLAYERS["spin"], 0)
+    assert (paid.shape, errors.shape) == ((12, 2), (13,))
+    np.testing.assert_allclose(paid, np.column_stack([errors[:-1] - errors[1:], -TICK * errors[1:]]), atol=1e-12)
+    assert errors[-1] < errors[0]
+
+
+def test_the_table_compares_with_the_frontier() -> None:
+    """Each row shows means, and beside them what others have more than the frontier on the same seeds."""
+    found = {
+        (reward, gamma, policy): np.array([0.5, 1.0]) - (policy != learning_signal.FRONTIER) * np.array([0.25, 0.5])
+        for reward in learning_signal.RETURNS
+        for gamma in learning_signal.DISCOUNTS
+        for policy in learning_signal.PLAYERS
+    }
+    lines = learning_signal.table_of(found).splitlines()
+    assert len(lines) == 2 + len(learning_signal.RETURNS) * len(learning_signal.PLAYERS)
+    assert lines[2] == "| default | nearest frontier |" + " 0.750 |  |" * 3
+    assert lines[3].startswith("| default | random walk | 0.375 | -0.375 (-0.500 .. -0.250) |")
+
+
+@pytest.mark.slow
+def test_returns_are_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    """In two episodes each the frontier earns most in each line of the default reward."""
+    learning_signal.returns(seeds=2)
+    lines = [line.split(" | ") for line in capsys.readouterr().out.splitlines() if line.startswith("| default")]
+    assert len(lines) == len(learning_signal.PLAYERS)
+    for line in lines[1:]:
+        assert all(float(lines[0][column]) > float(line[column]) for column in (2, 4, 6))
+
+
 @pytest.mark.slow
 def test_the_table_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
     """Two episodes give a line for each reward and trace."""
-    learning_signal.main(episodes=2)
+    learning_signal.choices(episodes=2)
     told = capsys.readouterr().out
     assert told.count("own_coverage") == len(learning_signal.TRACES)
     assert "shorter way" in told
