@@ -231,6 +231,7 @@ def returns(
 def choices(
     episodes: Annotated[int, typer.Option(help="Of three robots and 90 s; a second or two each.")] = 60,
     first_seed: Annotated[int, typer.Option(help="Of the first of them.")] = 2000,
+    gamma: Annotated[float, typer.Option(help="Discount per decision.")] = TrainConfig().gamma,
 ) -> None:
     """Play random goals, and print how the advantage of a decision correlates with what was chosen."""
     chosen_config = TrainConfig(reward=dict.fromkeys(TERMS, 1.0))
@@ -241,7 +242,7 @@ def choices(
     for weights in REWARDS:
         rewards = paid @ np.array([weights.get(term, 0.0) for term in TERMS])
         for trace in TRACES:
-            scaled, explained = advantages(rewards, seen, chosen_config.gamma, trace)
+            scaled, explained = advantages(rewards, seen, gamma, trace)
             shown = []
             for k in range(len(CHOICES)):
                 products = chosen[..., k] * scaled

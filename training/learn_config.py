@@ -36,7 +36,7 @@ class TrainConfig(PlainConfig):
         batch: Decisions per step of the optimiser.
         epochs: Times that each rollout is gone through.
         learning_rate: At the start; it falls linearly to zero.
-        gamma: Discount per decision.
+        gamma: Discount per decision: one per tick, to the power of `decision_ticks`. 0.999 per tick would be 0.98.
         gae_lambda: Of the generalised advantage estimate.
         clip: Of PPO's ratio.
         entropy: Weight of the entropy bonus.

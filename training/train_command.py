@@ -43,6 +43,9 @@ def train(
 ) -> None:
     """Train one network for all robots by PPO with masked goal actions; play it with vslam run --policy FOLDER.
 
+    A config.toml decides all else. Its gamma is the discount of a decision:
+    that of a tick, at least 0.999, to the power of decision_ticks.
+
     Ctrl-C ends it after the running rollout and saves; pressed again, it ends
     at once. --resume FOLDER then goes on from the last checkpoint and ends with
     the same weights as a training that never stopped, even if it was killed.

@@ -49,7 +49,7 @@ class EnvConfig:
         stop_at_recall: The episode terminates when every robot's map holds this share of the landmarks; None: never.
         observation_type: `"dict"`: named arrays. `"flat"`: one float32 vector.
         observe_images: Whether a robot observes its left image, as `"image"` (H, W, 1) uint8; with rendered eyes only.
-        reward: Weights of the named reward terms.
+        reward: Weights of the named reward terms. Learners discount by at least 0.999 per tick: see `vslam_env.reward`.
         shared_reward: Each robot gets the mean of all robots' rewards, term by term.
         oracle_pose: The robots know their poses, each in its own start frame.
         oracle_association: The robots know which landmark is which.

@@ -55,7 +55,8 @@ def parallel_env(
         num_particles: Of each filter; default 100.
         max_cycles: Steps until the episode is truncated; default 1000.
         preset: `"easy"`, `"standard"` (default) or `"hard"`; see `preset_config`.
-        reward: Weights of terms by name (default `{"map_error": 1.0}`), or a list of terms of your own.
+        reward: Weights of terms by name (default `{"map_error": 1.0}`), or a list of terms of your own. Learners
+            discount it by at least 0.999 per tick: `gamma ** decision_ticks` per step.
         observation_type: `"dict"` (default) or `"flat"`.
         observe_images: With `sensor="stereo"`: observations hold the left image, `"image"` (H, W, 1) uint8.
         oracle_pose: The robots know their poses in their own start frames.
