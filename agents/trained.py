@@ -3,7 +3,6 @@
 import hashlib
 import io
 import json
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.goal_network import NAMES, SHAPES, Weights, logits
+from slam_backend.array_files import read_arrays
 from slam_backend.errors import bad_argument
 from vslam_env.belief import Belief
 
@@ -101,11 +101,10 @@ def load_model(path: str | Path) -> tuple[Weights, dict[str, Any]]:
     if not file.is_file():
         raise bad_argument("model", expected, "no such file", f"Check {str(file)!r}.")
     try:
-        with np.load(io.BytesIO(file.read_bytes()), allow_pickle=False) as content:
-            arrays = {name: content[name] for name in content.files}
+        arrays: dict[str, NDArray[Any]] = dict(read_arrays(file))
         about = json.loads(str(arrays.pop(ABOUT)))
         version, digest = about["format"], about["weights"]
-    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         cure = f"{str(file)!r} cannot be read: copy or train it anew."
         raise bad_argument("model", expected, "a broken file", cure) from error
     if version != FORMAT:

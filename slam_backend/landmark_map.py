@@ -1,7 +1,5 @@
 """A map of landmarks: positions with covariances, descriptors, counts and ids, in one frame."""
 
-import zipfile
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,13 +8,12 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from slam_backend.array_files import read_arrays
 from slam_backend.errors import FloatArray, IntArray, bad_argument, check_array
 from slam_backend.geometry import rotate_covariances, transform_points
 
 FORMAT = "vslam landmark map"
 FORMAT_VERSION = 1
-# What numpy and zipfile raise on files that are truncated, damaged or of another kind.
-UNREADABLE = (OSError, ValueError, KeyError, EOFError, TypeError, RuntimeError, zipfile.BadZipFile, zlib.error)
 FIELDS = ("means", "covariances", "descriptors", "counts", "ids")
 
 
@@ -228,24 +225,24 @@ class LandmarkMap:
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read a map that `save` wrote.
+        """Read a map that `save` wrote; nothing of the file is run.
 
         Raises:
-            ValueError: If the file is missing, broken, of another kind or of a newer format version.
+            ValueError: If the file is missing, broken, of another kind or of another format version.
         """
         expected = "a file written by LandmarkMap.save"
         if not Path(path).is_file():
             raise bad_argument("path", expected, "no such file", f"Check the path {str(path)!r}.")
         cure = f"Save the map again; {str(path)!r} cannot be used."
         try:
-            with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as archive:
-                kind, version = str(archive["format"]), int(archive["version"])
-                arrays = {name: archive[name] for name in FIELDS} if version == FORMAT_VERSION else {}
-        except UNREADABLE as error:
+            found = read_arrays(Path(path))
+            kind, version = str(found["format"]), int(found["version"])
+            arrays = {name: found[name] for name in FIELDS} if version == FORMAT_VERSION else {}
+        except (ValueError, KeyError, TypeError) as error:
             raise bad_argument("path", expected, "a broken file", cure) from error
         if kind != FORMAT or version != FORMAT_VERSION:
             raise bad_argument("path", f"{FORMAT!r} version {FORMAT_VERSION}", f"{kind!r} version {version}", cure)
-        return cls(**arrays)
+        return cls(**arrays)  # type: ignore[arg-type]
 
 
 def _checked_covariances(value: Any, n: int) -> FloatArray:

@@ -8,19 +8,17 @@ was in the frame before, while the car went on. The tracker goes on from that pi
 world by then: what follows is a track of its own.
 """
 
-import zipfile
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from slam_backend.array_files import read_arrays
 from slam_backend.errors import FloatArray, IntArray, bad_argument, check_float
 from slam_backend.trajectory import Trajectory
 
 KEYS = ("time_stamps", "features", "linear_velocity", "rotational_velocity", "K", "b", "cam_T_imu")
-UNREADABLE = (OSError, ValueError, KeyError, EOFError, TypeError, RuntimeError, zipfile.BadZipFile, zlib.error)
 ABSENT = -1.0  # fills the four pixels of a track in frames that do not show it
 
 
@@ -153,10 +151,10 @@ def _find_truth(file: Path, truth: str | Path | None) -> Path | None:
 def _read(file: Path) -> dict[str, FloatArray]:
     """Return the arrays of the archive; all are finite numbers."""
     try:
-        with file.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
-            missing = [key for key in KEYS if key not in archive]
-            content = {} if missing else {key: np.asarray(archive[key], dtype=np.float64) for key in KEYS}
-    except UNREADABLE as error:
+        archive = read_arrays(file, KEYS)
+        missing = [key for key in KEYS if key not in archive]
+        content = {} if missing else {key: np.asarray(archive[key], dtype=np.float64) for key in KEYS}
+    except ValueError as error:
         raise bad_argument("path", "a numpy archive", "a broken file", f"Get {str(file)!r} again.") from error
     if missing:
         expected = f"{file.name} with the arrays {', '.join(KEYS)}"

@@ -1,0 +1,312 @@
+"""State trees as bytes and back, by a format that holds data alone: to read it runs no code of the file's.
+
+A tree is made of None, bools, ints, floats, texts, bytes, dicts, lists, tuples, sets, arrays of plain numbers, numpy
+scalars, and objects of the classes that the caller lists (`Kinds`). What stands in several places stands in one place
+afterwards, too. Floats keep every bit, arrays their layout and whether they can be written to.
+
+The bytes are the length of a table, the table as JSON, and the arrays' own bytes one after the other. Rows of the table
+are the parts of the tree, each of which names earlier rows only, so that reading neither recurses nor loops. Arrays are
+not compressed and do not overlap: what is read takes about as much memory as the file has bytes.
+"""
+
+import json
+import math
+import struct
+from collections.abc import Callable, Iterable
+from dataclasses import fields, is_dataclass
+from enum import Enum
+from pathlib import Path
+from stat import S_ISREG
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+from numpy.random import SeedSequence
+from numpy.typing import NDArray
+
+ALIGNMENT = 64  # bytes; where arrays begin
+MOST_BYTES = 1 << 30  # of a file: a state has some megabytes
+MOST_TABLE = 1 << 26  # bytes of a table: Python takes up to twenty times as many to hold it
+LARGEST_INT = 1 << 63  # ints from here on are written as hexadecimal digits, of which there may be any number
+DTYPES = {
+    np.dtype(kind).newbyteorder("<").str: np.dtype(kind)
+    for kind in ("?", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f2", "f4", "f8")
+}
+SEQUENCES: dict[type, tuple[str, Callable[[list[Any]], Any]]] = {
+    tuple: ("tuple", tuple),
+    list: ("list", list),
+    set: ("set", set),
+    frozenset: ("frozenset", frozenset),
+}
+BUILT = dict(SEQUENCES.values())
+
+
+class Kind(NamedTuple):
+    """How objects of one class are taken apart and built.
+
+    Attributes:
+        name: By which files call the class.
+        apart: Returns the parts of an object, which are trees.
+        build: Returns the object of these parts, or raises a ValueError.
+    """
+
+    name: str
+    apart: Callable[[Any], Iterable[Any]]
+    build: Callable[..., Any]
+
+
+class Kinds:
+    """The classes of which objects may stand in a tree: no other class is ever named or called.
+
+    Args:
+        classes: Dataclasses, named tuples and enumerations, built from their fields by their constructors.
+        special: How objects of other classes are taken apart and built.
+    """
+
+    def __init__(self, classes: Iterable[type] = (), special: dict[type, Kind] | None = None) -> None:
+        self.by_class: dict[type, Kind] = {cls: _kind_of(cls) for cls in classes} | (special or {})
+        self.by_name = {kind.name: kind for kind in self.by_class.values()}
+        assert len(self.by_name) == len(self.by_class)
+
+    def with_others(self, others: "Kinds") -> Self:
+        """Return these and others."""
+        return type(self)((), self.by_class | others.by_class)
+
+
+def _kind_of(cls: type) -> Kind:
+    """Return how objects of a class are taken apart into their fields, and built of these by its constructor."""
+    if issubclass(cls, Enum):
+        return Kind(cls.__name__, lambda member: (member.value,), cls)
+    if is_dataclass(cls):
+        names = [field.name for field in fields(cls) if field.init]
+        return Kind(
+            cls.__name__,
+            lambda each: [getattr(each, name) for name in names],
+            lambda *parts: cls(**dict(zip(names, parts, strict=True))),
+        )
+    assert issubclass(cls, tuple)
+    return Kind(cls.__name__, tuple, cls)
+
+
+def sequence_parts(sequence: SeedSequence) -> tuple[Any, ...]:
+    """Return what a seed sequence is made of, its count of children included."""
+    return sequence.entropy, sequence.spawn_key, sequence.pool_size, sequence.n_children_spawned
+
+
+def sequence_of(entropy: Any, spawn_key: Any, pool_size: int, n_children_spawned: int) -> SeedSequence:
+    """Return the seed sequence that is made of these, or raise a ValueError."""
+    if not 4 <= pool_size <= 64:  # numpy would allocate any
+        raise ValueError(f"a seed sequence has a pool of {pool_size} words")
+    return SeedSequence(entropy, spawn_key=spawn_key, pool_size=pool_size, n_children_spawned=n_children_spawned)
+
+
+SEEDS = Kinds(special={SeedSequence: Kind("SeedSequence", sequence_parts, sequence_of)})
+
+
+class ForeignObjectError(ValueError):
+    """A tree holds what no file can: an object of another class than the listed ones."""
+
+
+# ---------------------------------------------------------------------- writing
+
+
+class _Writer:
+    """Writes the table of a tree and lists its arrays.
+
+    Args:
+        kinds: Which objects may stand in it.
+    """
+
+    def __init__(self, kinds: Kinds) -> None:
+        self.rows: list[list[Any]] = []
+        self.blobs: list[bytes | NDArray[Any]] = []
+        self._kinds = kinds.by_class
+        self._row_of: dict[int, Any] = {}  # by `id`; None while an object's parts are being written
+        self._kept: list[Any] = []  # so that no `id` is used again
+
+    def entry(self, value: Any) -> Any:
+        """Return how a row names a value; values that have parts become rows of their own, once each."""
+        cls = type(value)
+        if value is None or cls is bool or cls is str:
+            return value
+        if cls is int:
+            return value if -LARGEST_INT <= value < LARGEST_INT else self._row(["int", hex(value)])
+        if cls is float:
+            return value if math.isfinite(value) else self._row(["float", struct.pack("<d", value).hex()])
+        key = id(value)
+        if key in self._row_of:
+            if self._row_of[key] is None:
+                raise ForeignObjectError("a part that holds itself")
+            return self._row_of[key]
+        self._row_of[key] = None
+        self._kept.append(value)
+        entry = self._row_of[key] = self._row(self._written(value, cls))
+        return entry
+
+    def _row(self, row: list[Any]) -> list[int]:
+        self.rows.append(row)
+        return [len(self.rows) - 1]
+
+    def _written(self, value: Any, cls: type) -> list[Any]:
+        """Return the row of a value that has parts, whose rows are written first."""
+        if cls is np.ndarray:
+            return self._array(value)
+        if cls is dict:
+            row: list[Any] = ["dict"]
+            for key, part in value.items():
+                row += (self._at(key, key), self._at(key, part))
+            return row
+        if cls in SEQUENCES:
+            return [SEQUENCES[cls][0], *(self._at(place, part) for place, part in enumerate(value))]
+        if cls is bytes:
+            self.blobs.append(value)
+            return ["bytes", len(value)]
+        if isinstance(value, np.generic) and value.dtype.str in DTYPES:
+            return ["number", value.dtype.str, value.tobytes().hex()]
+        if cls in self._kinds:
+            kind = self._kinds[cls]
+            return ["object", kind.name, *(self._at(place, part) for place, part in enumerate(kind.apart(value)))]
+        raise ForeignObjectError(f"a {cls.__module__}.{cls.__qualname__}")
+
+    def _at(self, place: Any, part: Any) -> Any:
+        """Return the entry of a part; errors say where it stands."""
+        try:
+            return self.entry(part)
+        except ForeignObjectError as error:
+            raise ForeignObjectError(f"{error} in {place!r}" if isinstance(place, str) else str(error)) from None
+
+    def _array(self, value: NDArray[Any]) -> list[Any]:
+        if value.dtype.str not in DTYPES:
+            raise ForeignObjectError(f"an array of {value.dtype}")
+        by_columns = value.flags.f_contiguous and not value.flags.c_contiguous
+        self.blobs.append(np.ascontiguousarray(value.T if by_columns else value))
+        return ["array", value.dtype.str, list(value.shape), int(by_columns), int(value.flags.writeable)]
+
+
+def encoded(tree: Any, kinds: Kinds) -> bytes:
+    """Return a tree as bytes.
+
+    Raises:
+        ForeignObjectError: If something in it is neither plain data nor of the listed classes; the text says what and
+            where.
+    """
+    writer = _Writer(kinds)
+    root = writer.entry(tree)
+    table = json.dumps([writer.rows, root], separators=(",", ":"), allow_nan=False).encode()
+    pieces: list[bytes | memoryview] = [f"{len(table)}\n".encode(), table]
+    size = len(pieces[0]) + len(table)
+    for blob in writer.blobs:
+        start = -(-size // ALIGNMENT) * ALIGNMENT
+        part = blob if isinstance(blob, bytes) else blob.reshape(-1).view(np.uint8).data if blob.size else b""
+        pieces += (bytes(start - size), part)
+        size = start + len(part)
+    return b"".join(pieces)
+
+
+# ---------------------------------------------------------------------- reading
+
+
+class _Reader:
+    """Builds the parts of a tree, row by row.
+
+    Args:
+        body: What `encoded` returned, or what somebody made of it.
+        kinds: Which objects may stand in it.
+    """
+
+    def __init__(self, body: bytes, kinds: Kinds) -> None:
+        digits, newline, _ = body[:16].partition(b"\n")
+        if not newline or not digits.isdigit() or not 0 < (length := int(digits)) <= MOST_TABLE:
+            raise ValueError("no table")
+        self._body, self._kinds = body, kinds.by_name
+        self._at = len(digits) + 1 + length
+        content = json.loads(body[len(digits) + 1 : self._at])
+        if type(content) is not list or len(content) != 2 or type(content[0]) is not list:
+            raise ValueError("no table of rows")
+        self._rows, self._root = content
+        self._parts: list[Any] = []
+
+    def tree(self) -> Any:
+        """Return the tree."""
+        for tag, *entries in self._rows:
+            self._parts.append(self._built(tag, entries))
+        if self._at != len(self._body):
+            raise ValueError("bytes that belong to nothing")
+        return self._value(self._root)
+
+    def _value(self, entry: Any) -> Any:
+        """Return what an entry of a row names."""
+        if type(entry) is not list:
+            return entry
+        (row,) = entry
+        if type(row) is not int or not 0 <= row < len(self._parts):
+            raise ValueError(f"a row {row} that is not there yet")
+        return self._parts[row]
+
+    def _built(self, tag: str, entries: list[Any]) -> Any:
+        """Return the value of a row."""
+        if tag == "array":
+            return self._array(*entries)
+        if tag == "dict":
+            values = list(map(self._value, entries))
+            return dict(zip(values[::2], values[1::2], strict=True))
+        if tag in BUILT:
+            return BUILT[tag](list(map(self._value, entries)))
+        if tag == "object":
+            name, *parts = entries
+            return self._kinds[name].build(*map(self._value, parts))
+        (first, *rest) = entries
+        if tag == "int":
+            return int(first, 16)
+        if tag == "float":
+            return struct.unpack("<d", bytes.fromhex(first))[0]
+        if tag == "number":
+            return DTYPES[first].type(np.frombuffer(bytes.fromhex(rest[0]), DTYPES[first].str.replace("b", "u"))[0])
+        if tag == "bytes":
+            return bytes(self._taken(first))
+        raise ValueError(f"a row of kind {tag!r}")
+
+    def _array(self, code: str, shape: list[int], by_columns: int, writeable: int) -> NDArray[Any]:
+        dtype = DTYPES[code]
+        if any(type(size) is not int or not 0 <= size < 1 << 40 for size in shape) or len(shape) > 8:
+            raise ValueError(f"an array of shape {shape}")
+        flat = np.frombuffer(self._taken(math.prod(shape) * dtype.itemsize), np.uint8)
+        if code == "|b1" and flat.size and flat.max() > 1:
+            raise ValueError("a truth value that is neither 0 nor 1")
+        array = flat.view(dtype).reshape(shape[::-1] if by_columns else shape)
+        array = (array.T if by_columns else array).copy("A")
+        array.setflags(write=bool(writeable))
+        return array
+
+    def _taken(self, size: int) -> memoryview:
+        """Return the next bytes that are not in the table."""
+        start = -(-self._at // ALIGNMENT) * ALIGNMENT
+        if size < 0 or start + size > len(self._body):
+            raise ValueError("more numbers than the file has bytes")
+        self._at = start + size
+        return memoryview(self._body)[start : self._at]
+
+
+def decoded(body: bytes, kinds: Kinds) -> Any:
+    """Return the tree that `encoded` wrote; nothing of the bytes is run, whatever they are.
+
+    Raises:
+        ValueError: If they are none that `encoded` wrote for these kinds; the text says what was found.
+    """
+    try:
+        return _Reader(body, kinds).tree()
+    except Exception as error:  # whatever bytes somebody made up, or constructors of the listed classes refuse
+        raise ValueError(str(error) or type(error).__name__) from error
+
+
+def read_file(path: Path) -> bytes:
+    """Return the content of a regular file of bounded size.
+
+    Raises:
+        OSError: If it cannot be read, is none, or larger than any file of this project's.
+    """
+    found = path.stat()
+    if not S_ISREG(found.st_mode):
+        raise OSError("not a regular file")
+    if found.st_size > MOST_BYTES:
+        raise OSError(f"the file has more than {MOST_BYTES >> 20} MiB")
+    return path.read_bytes()
