@@ -46,6 +46,9 @@ def finished_trials(folder: RunFolder, name: str, kind: type[TrialT]) -> dict[Tr
         folder: Where they are kept.
         name: Of the file.
         kind: A frozen dataclass, whose fields a row holds beside the figures.
+
+    Raises:
+        ValueError: If a line is no such row.
     """
     file = folder.path / name
     if not file.is_file():
@@ -56,8 +59,15 @@ def finished_trials(folder: RunFolder, name: str, kind: type[TrialT]) -> dict[Tr
             rows.append(json.loads(line))
         except json.JSONDecodeError:
             break
+        except RecursionError:
+            rows.append(None)
+    try:
+        trials = {trial_of(row, kind): row for row in rows}
+    except (KeyError, TypeError, ValueError) as error:
+        cure = f"Take {str(file)!r} away, or choose another folder: {error}."
+        raise bad_argument("out", "trials that a run kept", "others", cure) from error
     folder.write_text(name, "".join(json.dumps(row) + "\n" for row in rows))
-    return {trial_of(row, kind): row for row in rows}
+    return trials
 
 
 def trial_of(row: Mapping[str, Any], kind: type[TrialT]) -> TrialT:

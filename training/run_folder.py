@@ -23,6 +23,7 @@ PACKAGES = (
     "stable-baselines3", "sb3-contrib", "torch",
 )  # fmt: skip
 CONFIG_FILE = "config.toml"
+FORMAT = 1  # of run folders: their configuration, and the trials that are kept beside it
 METRICS_FILE = "metrics.json"
 
 
@@ -60,7 +61,7 @@ class RunFolder:
         seed = check_int("seed", seed, 0, "Use 0 or a positive number.")
         folder = _next_free(Path("runs"), f"{command.replace(' ', '-')}-{seed}") if out is None else _claim(Path(out))
         run = cls(folder, command, _drop_none(plain(config)), seed, installed_versions())
-        content = {"command": command, "seed": seed, "config": run.config, "versions": run.versions}
+        content = {"format": FORMAT, "command": command, "seed": seed, "config": run.config, "versions": run.versions}
         run.write_text(CONFIG_FILE, tomli_w.dumps(content))
         return run
 
@@ -83,7 +84,7 @@ class RunFolder:
 
 
 def read_config(path: Path, command: str, option: str = "config") -> tuple[dict[str, Any], int]:
-    """Read the config and seed of an earlier run.
+    """Read the config and seed of an earlier run; a file without a `format` is of the present one.
 
     Args:
         path: Its `config.toml`, or the run folder.
@@ -91,7 +92,7 @@ def read_config(path: Path, command: str, option: str = "config") -> tuple[dict[
         option: By which the user named it.
 
     Raises:
-        ValueError: If the file is missing or damaged, or another command wrote it.
+        ValueError: If the file is missing or damaged, of another format, or another command wrote it.
     """
     file = path / CONFIG_FILE if path.is_dir() else path
     expected = f"the {CONFIG_FILE} of an earlier run"
@@ -101,6 +102,9 @@ def read_config(path: Path, command: str, option: str = "config") -> tuple[dict[
         content = tomllib.loads(file.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise bad_argument(option, expected, "a broken file", f"Correct {str(file)!r}: {error}.") from error
+    if (found := content.get("format", FORMAT)) != FORMAT or type(found) is not int:
+        cure = f"Use the release that wrote {str(file)!r}."
+        raise bad_argument(option, f"one of format {FORMAT}", f"a run folder of format {found!r}", cure)
     if content.get("command") != command:
         raise bad_argument(option, f"a run of {command!r}", content.get("command"), "Use the command that wrote it.")
     config, seed = content.get("config"), content.get("seed")

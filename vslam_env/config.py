@@ -15,6 +15,7 @@ from vslam_env.robot_belief import BeliefConfig
 from vslam_env.sensors import LandmarkSensorConfig, ScanConfig, StereoSensorConfig
 from vslam_env.world import SPLITS, LandmarkConfig, OdometryNoise
 
+FORMAT = 1  # of TOML files; raised when what a field means changes
 ACTION_TYPES = ("continuous", "discrete", "goal")
 OBSERVATION_TYPES = ("dict", "flat")
 SENSORS = ("landmark", "stereo")
@@ -177,13 +178,14 @@ class EnvConfig:
     def from_toml(cls, path: str | Path) -> Self:
         """Read a configuration from a TOML file, as `to_toml` writes it.
 
-        What the file leaves out, in nested tables as well, has the value of the `standard` preset.
+        What the file leaves out, in nested tables as well, has the value of the `standard` preset; without a `format`
+        it is of the present one.
         """
         try:
             values = tomllib.loads(Path(path).read_text(encoding="utf-8"))
         except (OSError, TypeError, ValueError) as error:  # of the path, of the encoding and of the syntax
             raise bad_argument("config", "a readable TOML file", str(path), f"The reader says: {error}.") from error
-        return cls.from_dict(nested.with_none(values))
+        return cls._of_file(values)
 
     @classmethod
     def from_toml_text(cls, text: str) -> Self:
@@ -194,8 +196,21 @@ class EnvConfig:
             values = tomllib.loads(text)
         except tomllib.TOMLDecodeError as error:
             raise bad_argument("config", "TOML", text, f"The reader says: {error}.") from error
+        return cls._of_file(values)
+
+    @classmethod
+    def _of_file(cls, values: dict[str, Any]) -> Self:
+        """Build a configuration from what a TOML file says, or raise if it is of another format."""
+        found = values.pop("format", FORMAT)
+        if type(found) is not int or found != FORMAT:
+            cure = "Use the release that wrote it, or set the values anew."
+            raise bad_argument("config", f"one of format {FORMAT}", f"a configuration of format {found!r}", cure)
         return cls.from_dict(nested.with_none(values))
 
     def to_toml(self) -> str:
-        """Return the configuration as TOML; None is left out where it is the standard, else it is the text "none"."""
-        return tomli_w.dumps(nested.without_none(nested.plain(self), nested.plain(type(self)())))
+        """Return the configuration as TOML, with the number of its format.
+
+        None is left out where it is the standard, else it is the text "none".
+        """
+        values = nested.without_none(nested.plain(self), nested.plain(type(self)()))
+        return tomli_w.dumps({"format": FORMAT} | values)

@@ -14,6 +14,7 @@ from vslam_env.world.spec import World
 BRIGHT_SHARE = 0.85  # light grey 195 over mid grey 128, white over black, 254 over the 205 of "unknown" in ROS maps
 COLOURED = 60  # levels between the strongest and the weakest colour of a marker such as a yellow start cell
 UPSAMPLING = 3
+FORMAT = 1  # of JSON files of walls
 
 
 def load_floorplan(
@@ -84,7 +85,8 @@ def load_walls_json(path: str | Path) -> World:
         path: The file; its stem is the world's name, unless the file has a `name`.
 
     Raises:
-        ValueError: If the file is missing, no JSON, or has other keys; `start_poses` and `name` may be left out.
+        ValueError: If the file is missing, no JSON, of another `format`, or has other keys; all but `walls` may be left
+            out.
     """
     path = existing(path)
     cure = 'Write {"walls": [[x1, y1, x2, y2], ...]}, in metres; "start_poses" and "name" are optional.'
@@ -95,7 +97,10 @@ def load_walls_json(path: str | Path) -> World:
     if not isinstance(content, dict) or "walls" not in content:
         got = sorted(content) if isinstance(content, dict) else content
         raise bad_argument("world", f"an object with the key 'walls' in {path}", got, cure)
-    unknown = sorted(set(content) - {"walls", "start_poses", "name"})
+    if (found := content.get("format", FORMAT)) != FORMAT or type(found) is not int:
+        cure = "Use the release that wrote it, or write the walls anew."
+        raise bad_argument("world", f"one of format {FORMAT} in {path}", f"a world of format {found!r}", cure)
+    unknown = sorted(set(content) - {"format", "walls", "start_poses", "name"})
     if unknown:
         raise bad_argument("world", f"no other keys in {path}", unknown[0], cure)
     return World(content.get("name", path.stem), content["walls"], start_poses=content.get("start_poses"))
@@ -111,7 +116,7 @@ def save_walls_json(world: World, path: str | Path) -> None:
     Raises:
         ValueError: If the file cannot be written.
     """
-    content = {"name": world.name, "walls": np.round(world.walls, 6).tolist()}
+    content: dict[str, Any] = {"format": FORMAT, "name": world.name, "walls": np.round(world.walls, 6).tolist()}
     if world.start_poses is not None:
         content["start_poses"] = world.start_poses.tolist()
     try:
