@@ -8,23 +8,21 @@ import numpy as np
 
 from slam_backend._existence_step import ExistenceStep
 from slam_backend._filter_arrays import FilterArrays
+from slam_backend._filter_checks import KEPT, POSES, check_filter
 from slam_backend._journal import Journal
 from slam_backend._kernels import add_share
 from slam_backend._kernels.layout import CAMERA, RECOVERY
 from slam_backend._mixtures import pose_mixtures
-from slam_backend._particle_maps import MAPS_KEPT, ParticleMaps
+from slam_backend._particle_maps import ParticleMaps
 from slam_backend._rejuvenated_maps import write_maps
-from slam_backend._rejuvenation_step import SCHEDULE, RejuvenationStep
+from slam_backend._rejuvenation_step import RejuvenationStep
 from slam_backend._turns import assumed, spans_of
-from slam_backend.errors import IntArray, bad_argument, check_int, check_seed
+from slam_backend.errors import IntArray, check_int, check_seed
 from slam_backend.filter_options import MOST_ROBOTS, FilterOptions
 from slam_backend.reports import PoseEstimates
 from slam_backend.run_log import RobotLog
 from slam_backend.smoothing.rejuvenation import Particles
-
-POSES = ("_poses", "_starts", "_means", "_covariances")  # (K, 3 or 6, P), of each robot
-KEPT = (*POSES, "_frame", "_blind", "_log_weights", "_path_log_weights", "_weights")
-OTHERS_KEPT = ("steps", "estimates", "maps", "logs", "options", "rng")
+from slam_backend.state_checks import generator_of
 
 
 class FilterState(FilterArrays):
@@ -155,17 +153,11 @@ class FilterState(FilterArrays):
         Raises:
             ValueError: If `state` is not one of `get_state`.
         """
-        if not isinstance(state, Mapping):
-            raise bad_argument(
-                "state", "a dict from FastSlam.get_state", f"a {type(state).__name__}", "Pass it unchanged."
-            )
-        missing = [name for name in (*KEPT, *OTHERS_KEPT) if name not in state]
-        missing = missing or [f"maps.{name}" for name in MAPS_KEPT if name not in state["maps"]]
-        if not missing and state["options"].rejuvenate_every is not None:
-            schedule = state.get("rejuvenation", {}).get("schedule", {})
-            missing = [f"rejuvenation.schedule.{name}" for name in SCHEDULE if name not in schedule]
-        if missing:
-            raise bad_argument("state", "a dict from FastSlam.get_state", f"no {missing[0]!r}", "Pass it unchanged.")
+        check_filter("state", state)
+        self._go_on_from(state)
+
+    def _go_on_from(self, state: Mapping[str, Any]) -> None:
+        """Go on from a state that was checked."""
         shapes = [state[name].shape == getattr(self, name).shape for name in ("_poses", "_weights")]
         same = state["options"] == self.options and all(shapes)
         if not same:
@@ -181,6 +173,4 @@ class FilterState(FilterArrays):
         if self._rejuvenation is not None:
             self._rejuvenation.set_state(state["rejuvenation"])
         self._steps, self._estimates = state["steps"], state["estimates"].copy()
-        # A stream of its own: the old one may be the caller's, or of another kind.
-        self._rng = np.random.Generator(getattr(np.random, state["rng"]["bit_generator"])(0))
-        self._rng.bit_generator.state = state["rng"]
+        self._rng = generator_of(state["rng"])  # of its own: the old one may be the caller's, or of another kind

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from slam_backend._team_checks import TeamCheck
 from slam_backend.alignment import AlignmentOptions
 from slam_backend.attempts import AttemptOptions, AttemptSchedule
 from slam_backend.branches import Branch
@@ -15,12 +16,11 @@ from slam_backend.errors import bad_argument, check_int, check_seed
 from slam_backend.filter import FastSlam
 from slam_backend.filter_options import MOST_ROBOTS, FilterOptions
 from slam_backend.groups import Group
+from slam_backend.input_log import StepInput
 from slam_backend.lineup import Lineup
 from slam_backend.merge_options import MergeOptions
 from slam_backend.records import Records
 from slam_backend.reports import MergeEvent
-
-KEYS = ("step", "epoch", "rng", "events", "groups", "numbers", "alignment", "merging", "schedule", "records")
 
 
 class TeamState:
@@ -86,6 +86,11 @@ class TeamState:
 
     # ------------------------------------------------------------------ snapshots
 
+    @property
+    def kept_readings(self) -> Mapping[int, StepInput]:
+        """Readings of the last steps that some filter may take in later, by step; to be looked at."""
+        return self._records.log.kept
+
     def get_state(self) -> dict[str, Any]:
         """Return all that decides how the team goes on, random streams included.
 
@@ -110,12 +115,11 @@ class TeamState:
         Raises:
             ValueError: If `state` is not one of `get_state`, or of a team of another size.
         """
-        missing = [key for key in KEYS if not isinstance(state, Mapping) or key not in state]
-        if missing:
-            raise bad_argument("state", "a dict from TeamSlam.get_state", f"no {missing[0]!r}", "Pass it unchanged.")
-        count = sum(len(group["branches"][0]["robots"]) for group in state["groups"])
-        if count != self._num_robots:
-            raise bad_argument("state", f"one of {self._num_robots} robots", count, "Build a team of the same size.")
+        TeamCheck(self._num_robots, self.kept_readings).check("state", state)
+        self._go_on_from(state)
+
+    def _go_on_from(self, state: Mapping[str, Any]) -> None:
+        """Go on from a state that was checked."""
         self._step, self._epoch = state["step"], state["epoch"]
         self._rng.bit_generator.state = copy.deepcopy(state["rng"])
         self._events = list(state["events"])

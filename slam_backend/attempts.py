@@ -42,7 +42,7 @@ class AttemptOptions:
 
 
 @dataclass(slots=True)
-class _Record:
+class AttemptRecord:
     """What one pair of groups has tried."""
 
     wait: int
@@ -84,7 +84,7 @@ class AttemptSchedule:
     def __init__(self, options: AttemptOptions, alignment: AlignmentOptions) -> None:
         self._options = options
         self._alignment = alignment
-        self._records: dict[PairKey, _Record] = {}
+        self._records: dict[PairKey, AttemptRecord] = {}
         self._proposed: dict[PairKey, set[tuple[int, int]]] = {}
         self._bars: list[tuple[PairKey, int]] = []
         self._doubts: dict[tuple[int, int], float] = {}  # robot of either side -> the least that there has been
@@ -152,7 +152,7 @@ class AttemptSchedule:
             gone = set(pair[0]) | set(pair[1])
             self._records = {key: value for key, value in self._records.items() if not gone & set(key[0] + key[1])}
             return
-        record = self._records.setdefault(pair, _Record(self._options.every))
+        record = self._records.setdefault(pair, AttemptRecord(self._options.every))
         record.tried = set() if straightened else self._proposed.get(pair, set())
         record.last_step = step
         record.next_step = step + max(record.wait, math.ceil(GROWN * step) if straightened else 0)

@@ -115,7 +115,7 @@ class ReplayedStep(NamedTuple):
 def restored_filter(state: Mapping[str, Any], at_hand: FastSlam | None = None) -> FastSlam:
     """Return a filter that goes on from `FastSlam.get_state`; one at hand is filled, which is faster than building."""
     slam = at_hand if at_hand is not None else FastSlam.from_options(len(state["_poses"]), state["options"])
-    slam.set_state(state)
+    slam._go_on_from(state)
     return slam
 
 

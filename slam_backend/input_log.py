@@ -74,6 +74,11 @@ class InputLog:
         """Return how many steps are kept."""
         return len(self._steps)
 
+    @property
+    def kept(self) -> Mapping[int, StepInput]:
+        """The steps that are kept, by their numbers; to be looked at."""
+        return self._steps
+
     def record(self, step: int, inputs: StepInput) -> None:
         """Keep what all robots read in a step, later than all before."""
         self._steps[step] = inputs

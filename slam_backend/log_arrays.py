@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final, NamedTuple, cast
+from weakref import WeakSet
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,7 +39,10 @@ class LogStep(NamedTuple):
     descriptor_rows: IntArray | None
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+COLUMNS = ("steps", "kinds", "motions", "given", "starts", "points", "ids", "covariances", "descriptor_rows")
+
+
+@dataclass(frozen=True, slots=True, weakref_slot=True, eq=False, kw_only=True)
 class LogArrays:
     """T steps with n measurements in all. The arrays cannot be written.
 
@@ -65,7 +69,7 @@ class LogArrays:
     descriptor_rows: IntArray | None
 
     def __post_init__(self) -> None:
-        for name in self.__slots__:
+        for name in COLUMNS:
             array = getattr(self, name)
             if array is not None:
                 array.setflags(write=False)
@@ -86,7 +90,7 @@ class LogArrays:
 
     def _columns(self) -> dict[str, Any]:
         """Return all arrays by name."""
-        return {name: getattr(self, name) for name in self.__slots__}
+        return {name: getattr(self, name) for name in COLUMNS}
 
     def row(self, t: int) -> LogStep:
         """Return row t, 0 <= t < T."""
@@ -131,6 +135,19 @@ class LogArrays:
             known = old_ids[at] == self.ids
             ids[known] = new_ids[at[known]]
         return replace(self, ids=ids)
+
+
+_checked: WeakSet[LogArrays] = WeakSet()
+
+
+def has_been_checked(rows: Any) -> bool:
+    """Tell whether all of a log's arrays were looked at before: they cannot be written."""
+    return type(rows) is LogArrays and rows in _checked
+
+
+def note_checked(rows: LogArrays) -> None:
+    """Remember that all of a log's arrays were looked at."""
+    _checked.add(rows)
 
 
 def _from_columns(columns: dict[str, Any]) -> LogArrays:

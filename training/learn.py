@@ -12,6 +12,7 @@ from stable_baselines3.common.logger import configure
 
 from agents.trained import MODEL_FILE, save_model
 from slam_backend.errors import bad_argument
+from slam_backend.state_checks import check_generator
 from training.learn_checkpoint import CHECKPOINT_FILE, read_checkpoint, write_checkpoint
 from training.learn_config import SPLIT_TRAIN, SPLIT_TRY, TrainConfig
 from training.learn_network import GoalPolicy
@@ -89,13 +90,18 @@ class Training:
         content = {
             "config": self.config.to_mapping(),
             "seed": self.config.seed,
-            "policy": {name: tensor.cpu() for name, tensor in model.policy.state_dict().items()},
-            "optimizer": model.policy.optimizer.state_dict(),
+            "policy": as_arrays(model.policy.state_dict()),
+            "optimizer": as_arrays(model.policy.optimizer.state_dict()),
             "counts": (model.num_timesteps, model._n_updates, model._current_progress_remaining),
             "last": (model._last_obs, model._last_episode_starts),
             "environments": self.env.get_state(),
             "watch": self.watch.get_state(),
-            "draws": (random.getstate(), np.random.get_state(), torch.get_rng_state(), _cuda_state()),  # noqa: NPY002
+            "draws": {
+                "python": random.getstate(),
+                "numpy": np.random.get_state(legacy=False),  # noqa: NPY002   # the learner draws from the global one
+                "torch": as_arrays(torch.get_rng_state()),
+                "cuda": as_arrays(_cuda_state()),
+            },
         }
         write_checkpoint(self._folder / CHECKPOINT_FILE, content)
         self.save_model(self._folder / MODEL_FILE)
@@ -112,20 +118,32 @@ class Training:
         save_model(file, self.model.policy.actor_weights(), about)
 
     def restore(self, kept: Mapping[str, Any]) -> None:
-        """Go on from what `kept_of` read."""
-        model = self.model
-        model.policy.load_state_dict(kept["policy"])
-        model.policy.optimizer.load_state_dict(kept["optimizer"])
+        """Go on from what `kept_of` read.
+
+        Raises:
+            ValueError: If a part of it is none that `save` wrote; train anew, or read another.
+        """
+        try:
+            self._go_on_from(kept)
+        except Exception as error:  # whatever torch says of parts that are none of this model's
+            cure = f"Copy the checkpoint again, or train anew. It says: {error}."
+            raise bad_argument("resume", "the parts that a training saved", "others", cure) from error
+
+    def _go_on_from(self, kept: Mapping[str, Any]) -> None:
+        """Take over the parts of a checkpoint."""
+        model, draws = self.model, kept["draws"]
+        model.policy.load_state_dict(as_tensors(kept["policy"]))
+        model.policy.optimizer.load_state_dict(as_tensors(kept["optimizer"]))
         model.num_timesteps, model._n_updates, model._current_progress_remaining = kept["counts"]
         model._last_obs, model._last_episode_starts = kept["last"]
         self.env.set_state(kept["environments"])
         self.watch.set_state(kept["watch"])
-        python, numpy, generator, cuda = kept["draws"]
-        random.setstate(python)
-        np.random.set_state(numpy)  # noqa: NPY002   # the learner draws from the global one
-        torch.set_rng_state(generator)
-        if cuda is not None and torch.cuda.is_available():
-            torch.cuda.set_rng_state_all(cuda)
+        random.setstate(draws["python"])
+        check_generator("draws", draws["numpy"])
+        np.random.set_state(draws["numpy"])  # noqa: NPY002
+        torch.set_rng_state(as_tensors(draws["torch"]))
+        if draws["cuda"] is not None and torch.cuda.is_available():
+            torch.cuda.set_rng_state_all(as_tensors(draws["cuda"]))
 
     def close(self) -> None:
         """Close the environments and their processes."""
@@ -163,6 +181,24 @@ def check_device(device: str) -> str:
             cure = "Leave --device out to use the processor, or install a torch that finds the GPU."
             raise bad_argument("device", "a GPU that torch can use", f"a machine with {found} of them", cure)
     return device
+
+
+def as_arrays(value: Any) -> Any:
+    """Return nested dicts, lists and tuples with arrays in place of tensors, as checkpoints hold them."""
+    if isinstance(value, torch.Tensor):
+        return value.detach().cpu().numpy().copy()
+    if isinstance(value, Mapping):
+        return {key: as_arrays(entry) for key, entry in value.items()}
+    return type(value)(map(as_arrays, value)) if isinstance(value, (list, tuple)) else value
+
+
+def as_tensors(value: Any) -> Any:
+    """Return what `as_arrays` was given, on the processor."""
+    if isinstance(value, np.ndarray):
+        return torch.from_numpy(value.copy())
+    if isinstance(value, Mapping):
+        return {key: as_tensors(entry) for key, entry in value.items()}
+    return type(value)(map(as_tensors, value)) if isinstance(value, (list, tuple)) else value
 
 
 def _cuda_state() -> Any:

@@ -2,15 +2,16 @@
 
 import hashlib
 import json
-import pickle
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from slam_backend.errors import bad_argument
+from slam_backend.state_codec import MOST_BYTES, decoded, encoded, read_file
 from training.run_folder import installed_versions
+from vslam_env.state_kinds import ENV_KINDS
 
-FORMAT = 1  # raised when what a checkpoint holds changes
+FORMAT = 2  # raised when what a checkpoint holds changes
 MAGIC = b"vslam train checkpoint "
 CHECKPOINT_FILE = "checkpoint.bin"
 DECISIVE = ("vslam-env", "torch", "stable-baselines3", "sb3-contrib", "numpy")  # a training goes on exactly with these
@@ -19,12 +20,16 @@ DECISIVE = ("vslam-env", "torch", "stable-baselines3", "sb3-contrib", "numpy")  
 def write_checkpoint(file: Path, content: Mapping[str, Any]) -> None:
     """Write a checkpoint; an interrupted write leaves the one before.
 
-    The file is a marked pickle: like any pickle, load it only from where you would run code from.
+    The file holds data alone: to read it runs no code of the file's.
+
+    Args:
+        file: Where to.
+        content: Plain values, arrays, and states of environments.
 
     Raises:
         ValueError: If it cannot be written.
     """
-    packed = pickle.dumps(dict(content), protocol=5)
+    packed = encoded(dict(content), ENV_KINDS)
     mark = {
         "format": FORMAT,
         "versions": _versions(),
@@ -50,7 +55,11 @@ def read_checkpoint(file: Path) -> dict[str, Any]:
     if not file.is_file():
         cure = f"There is no {str(file)!r}: the run ended before its first checkpoint. Train anew."
         raise bad_argument("resume", expected, "no such file", cure)
-    head, _, packed = file.read_bytes().partition(b"\n")
+    try:
+        head, _, packed = read_file(file).partition(b"\n")
+    except OSError as error:
+        cure = f"{str(file)!r} cannot be read: {error}."
+        raise bad_argument("resume", f"{expected} of at most {MOST_BYTES >> 20} MiB", "another file", cure) from error
     try:
         if not head.startswith(MAGIC):
             raise ValueError("another kind of file")
@@ -58,16 +67,22 @@ def read_checkpoint(file: Path) -> dict[str, Any]:
         size, digest, version, versions = (mark[name] for name in ("bytes", "sha256", "format", "versions"))
     except (ValueError, KeyError, TypeError) as error:
         raise bad_argument("resume", expected, "a broken file", f"{str(file)!r} is none: train anew.") from error
+    if version != FORMAT:
+        raise bad_argument("resume", f"one of format {FORMAT}", f"a checkpoint of format {version}", "Train anew.")
     if len(packed) != size or hashlib.sha256(packed).hexdigest() != digest:
         cure = f"{str(file)!r} was cut off or changed: copy it again, or train anew."
         raise bad_argument("resume", f"{expected}, {size} bytes", f"a broken file of {len(packed)}", cure)
-    if version != FORMAT:
-        raise bad_argument("resume", f"one of format {FORMAT}", f"a checkpoint of format {version}", "Train anew.")
     for package, here in _versions().items():
         if versions.get(package) != here:
             cure = f"Install {package}=={versions.get(package)}, or train anew."
             raise bad_argument("resume", f"a checkpoint made with {package} {here}", versions.get(package), cure)
-    content: dict[str, Any] = pickle.loads(packed)
+    try:
+        content = decoded(packed, ENV_KINDS)
+        if not isinstance(content, dict) or not all(isinstance(name, str) for name in content):
+            raise ValueError("it holds no parts by name")
+    except ValueError as error:
+        cure = f"{str(file)!r} was made by something else: train anew. Reading says: {error}."
+        raise bad_argument("resume", expected, "a broken file", cure) from error
     return content
 
 

@@ -11,6 +11,7 @@ from slam_backend.alignment import Alignment
 from slam_backend.errors import FloatArray, bad_argument
 from slam_backend.filter_options import FilterOptions
 from slam_backend.geometry import rotate_covariances
+from slam_backend.input_log import StepInput
 from slam_backend.landmark_map import LandmarkMap, TeamOutlines
 from slam_backend.reports import MergeEvent, Renaming, TeamReport
 from slam_backend.standpoints import Standpoints
@@ -19,6 +20,7 @@ from vslam_env.navigation import TeamSlots
 from vslam_env.readings import Readings, TeamReadings
 from vslam_env.robot_belief import Belief, BeliefConfig, Body, Candidates, Teammate, View
 from vslam_env.shared_grids import SharedGrids
+from vslam_env.strokes import Strokes
 
 __all__ = ["Belief", "BeliefConfig", "Body", "Candidates", "TeamBelief", "Teammate"]
 
@@ -179,6 +181,16 @@ class TeamBelief:
         features = self._candidates.features(self.points.poses)
         return View(self._robots, self.points, self.outlines, self.grids.cells, features)
 
+    @property
+    def kept_readings(self) -> Mapping[int, StepInput]:
+        """Readings of the last ticks that some filter may take in later, by step; to be looked at."""
+        return self._team.kept_readings
+
+    @property
+    def kept_strokes(self) -> dict[int, Strokes]:
+        """What the grids may have to paint again, by `id`; to be looked at."""
+        return self._grids.kept_strokes
+
     def get_state(self) -> dict[str, Any]:
         """Return all that decides how the beliefs go on; it shares nothing with them."""
         return {
@@ -189,12 +201,8 @@ class TeamBelief:
         }
 
     def set_state(self, state: Mapping[str, Any]) -> None:
-        """Go on exactly as the beliefs that gave `state`.
-
-        Raises:
-            ValueError: If it is of another number of robots, or no state.
-        """
-        self._team.set_state(state["team"])
+        """Go on exactly as the beliefs that gave `state`, which was checked."""
+        self._team._go_on_from(state["team"])
         self._tick = state["tick"]
         self._grids.set_state(state["grids"])
         for slots, candidates in zip(self._slots, state["slots"], strict=True):

@@ -21,7 +21,7 @@ from vslam_env.rendering import draw_frame
 from vslam_env.reward import RewardSpec, evaluate, make_terms, totals
 from vslam_env.scenes import scene_of
 from vslam_env.setting import draw_setting
-from vslam_env.snapshots import EnvState, check_state, restored_sequence, sequence_state, state_version
+from vslam_env.snapshots import EnvState, check_parts, check_state, objects_of, sequence_state, state_version
 from vslam_env.standing import Standing
 from vslam_env.window import Window
 from vslam_env.world import WorldSource, check_source, is_one_building
@@ -82,6 +82,7 @@ class ExplorationEnv(EnvKnowledge):
         self._cycle = 0
         self._standing: Standing  # set at a reset
         self._window = Window(self.metadata["name"])
+        self._objects = objects_of(self._source, self._terms)
 
     # ------------------------------------------------------------------ PettingZoo
 
@@ -204,6 +205,7 @@ class ExplorationEnv(EnvKnowledge):
         return {
             "version": state_version(),
             "config": self.config,
+            "objects": dict(self._objects),
             "root": sequence_state(self._root),
             "agents": tuple(self.agents),
             "cycle": 0 if episode is None else self._cycle,
@@ -219,34 +221,21 @@ class ExplorationEnv(EnvKnowledge):
             state: Of `get_state`; it can be used again.
 
         Raises:
-            ValueError: If it is no state, one of another version of the package or of another configuration; or if a
-                part of it is damaged: then nothing but a reset or another state goes on.
+            ValueError: If it is no state, one of another version of the package or of another configuration, or a part
+                of it is damaged; the environment is then as before.
         """
-        state = check_state(state, self.config)
-        try:
-            self._restore(state)
-        except Exception as error:
-            self._episode, self.agents = None, []
-            said = f"{type(error).__name__}: {error}"
-            cure = "Pass it unchanged; until then the environment has to be reset."
-            raise bad_argument("state", "what get_state returned", f"a damaged one ({said})", cure) from error
-
-    def _restore(self, state: Mapping[str, Any]) -> None:
-        """Take over the parts of a state."""
-        self._root = restored_sequence(state["root"])
-        self.agents = []
+        state = check_state(state, self.config, self._objects)
+        root = check_parts(state, self.config, self._episode)
+        self._root, self.agents = root, []
         if state["episode"] is None:
             self._episode = None
             return
         if self._episode is None:
             self._episode = Episode(self.config, state["episode"]["setting"], self._tap)
-        agents, figures, cycle = (state[part] for part in ("agents", "standing", "cycle"))
-        if not (set(agents) <= set(self.possible_agents) and isinstance(figures, Standing) and type(cycle) is int):
-            raise TypeError("agents, standing or cycle are of another kind")
         self._episode.set_state(state["episode"])
         self._drivers = Drivers(self.config)
         self._drivers.set_state(state["drivers"])
-        self._standing, self._cycle, self.agents = figures, cycle, list(agents)
+        self._standing, self._cycle, self.agents = state["standing"], state["cycle"], list(state["agents"])
 
     def clone(self) -> "ExplorationEnv":
         """Return an independent environment in the same state, for looking ahead; without window and recorder."""

@@ -149,6 +149,11 @@ def make_terms(reward: RewardSpec) -> tuple[RewardTerm, ...]:
     return tuple(reward)
 
 
+def is_named(term: RewardTerm) -> bool:
+    """Tell whether a term is one of the package's, which its name and weight describe."""
+    return isinstance(term, _NamedTerm)
+
+
 def evaluate(
     terms: Sequence[RewardTerm], before: Standing, after: Standing, shared: bool = False
 ) -> dict[str, list[float]]:

@@ -201,6 +201,11 @@ class SharedGrids:
         since = self._parted[self._parted >= 0]
         self._oldest_parting = int(since.min()) if len(since) else None
 
+    @property
+    def kept_strokes(self) -> dict[int, Strokes]:
+        """All strokes that are kept, by `id`; to be looked at."""
+        return {id(one): one for history in (self._strokes, *(k.strokes for k in self._kept)) for one in history}
+
     def get_state(self) -> dict[str, Any]:
         """Return all that decides how the grids go on; what is never written to is shared."""
         return {

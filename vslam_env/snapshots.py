@@ -2,8 +2,7 @@
 
 import dataclasses
 import hashlib
-import pickle
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from os import PathLike, replace
@@ -14,11 +13,18 @@ from typing import Any
 import numpy as np
 
 from slam_backend.errors import bad_argument
+from slam_backend.state_checks import check_kind, check_whole, refuse
+from slam_backend.state_codec import ForeignObjectError, decoded, encoded, read_file, sequence_of
+from vslam_env._state_checks import EpisodeCheck, check_drivers, check_standing
 from vslam_env.config import EnvConfig
+from vslam_env.episode import Episode
+from vslam_env.reward import RewardTerm, is_named
+from vslam_env.state_kinds import ENV_KINDS
+from vslam_env.world import WorldSource
 
 STATE_FORMAT = 27  # raised when what a state holds changes; a state goes on bit by bit only with what made it
 MAGIC = b"vslam_env state "
-KEYS = ("version", "config", "root", "agents", "cycle", "episode", "drivers", "standing")
+KEYS = ("version", "config", "objects", "root", "agents", "cycle", "episode", "drivers", "standing")
 
 EnvState = dict[str, Any]
 
@@ -33,25 +39,74 @@ def state_version() -> str:
     return f"{STATE_FORMAT}/{package}"
 
 
-def check_state(state: Any, config: EnvConfig) -> Mapping[str, Any]:
+def objects_of(source: WorldSource, terms: Sequence[RewardTerm]) -> dict[str, str]:
+    """Return what of an environment are objects of the caller's, which no state holds: a word for each."""
+    objects = {} if isinstance(source, (str, Path)) else {"world": type(source).__qualname__}
+    return objects | {f"reward {term.name!r}": type(term).__qualname__ for term in terms if not is_named(term)}
+
+
+def check_state(state: Any, config: EnvConfig, objects: Mapping[str, str]) -> Mapping[str, Any]:
     """Return a state if an environment of `config` can go on from it.
+
+    Args:
+        state: What came.
+        config: Of the environment.
+        objects: What of it are objects of the caller's.
 
     Raises:
         ValueError: If it is no state, one of another version, or one of another configuration.
     """
     found = _checked("state", state)
+    theirs_own = found["objects"]
+    if not isinstance(theirs_own, dict) or not all(isinstance(name, str) for name in theirs_own):
+        refuse("state['objects']", "a word for each object of the caller's", theirs_own)
     if found["config"] != config:
         name, ours, theirs = _difference(config, found["config"])
         cure = "Restore into an environment of the same configuration."
+        if theirs_own and name in ("world", "reward"):
+            cure = f"No state holds objects of your own: make the environment with the same {', '.join(theirs_own)}."
         raise bad_argument("state", f"one made with {name} = {_short(ours)}", theirs, cure)
+    if theirs_own != objects:
+        named = [", ".join(f"{name} ({kind})" for name, kind in each.items()) for each in (objects, theirs_own)]
+        cure = "No state holds these: make the environment with the same ones."
+        raise bad_argument("state", f"one made with {named[0] or 'no'} objects", f"'{named[1] or 'none'}'", cure)
     return found
+
+
+def check_parts(state: Mapping[str, Any], config: EnvConfig, own: Episode | None) -> np.random.SeedSequence | None:
+    """Return the root of all seeds of a state that `check_state` passed, if each of its parts is whole.
+
+    Args:
+        state: Nothing of it is taken over yet.
+        config: Of the environment.
+        own: The environment's running episode; None: there is none.
+
+    Raises:
+        ValueError: By name of the part that is wrong.
+    """
+    try:
+        root = restored_sequence(state["root"])
+    except Exception as error:  # whatever numpy says of what are no parts of one
+        raise bad_argument("state['root']", "a seed sequence", f"'{error}'", "Pass it unchanged.") from error
+    check_kind("state['agents']", state["agents"], tuple)
+    if state["agents"] not in ((), tuple(config.agents)):
+        refuse("state['agents']", f"{tuple(config.agents)} or none", state["agents"])
+    check_whole("state['cycle']", state["cycle"])
+    if state["episode"] is None:
+        if state["agents"]:
+            refuse("state['episode']", "a running episode", "none")
+        return root
+    EpisodeCheck(config, own).check("state['episode']", state["episode"])
+    check_standing("state['standing']", state["standing"], config.num_robots)
+    check_drivers("state['drivers']", state["drivers"], config.num_robots)
+    return root
 
 
 def save_state(state: Mapping[str, Any], path: str | Path) -> None:
     """Write a state of `get_state` to a file; an interrupted write leaves no file, or the old one.
 
-    A file of that name is replaced; what is there and no file is refused. The file is a pickle, marked and with its
-    SHA-256: like any pickle, load it only from where you would run code from.
+    A file of that name is replaced; what is there and no file is refused. The file holds data alone, with its SHA-256:
+    to load it runs no code of the file's. Objects of your own (worlds, reward terms) are not stored.
 
     Raises:
         ValueError: If it is no state of this version, or the file cannot be written.
@@ -59,12 +114,16 @@ def save_state(state: Mapping[str, Any], path: str | Path) -> None:
     _checked("state", state)
     path = _checked_path(path)
     try:
+        body = encoded(dict(state), ENV_KINDS)
+    except ForeignObjectError as error:
+        cure = "Objects of your own are not stored: make the environment that loads with them."
+        raise bad_argument("state", "numbers, arrays and configurations of this package", str(error), cure) from error
+    try:
         if path.exists() and not path.is_file():
             raise bad_argument("path", "a file that can be written", str(path), "There is something else, no file.")
         part = path.with_name(f"{path.name}.{token_hex(8)}.part")
         with part.open("xb") as file:  # readable to whom the process lets read, which temporary files are not
             try:
-                body = pickle.dumps(dict(state), protocol=5)
                 file.write(MAGIC + f"{state['version']}\n{_fingerprint(body)}\n".encode() + body)
                 file.close()
                 replace(part, path)
@@ -83,20 +142,20 @@ def load_state(path: str | Path) -> EnvState:
     """
     path = _checked_path(path)
     try:
-        content = path.read_bytes()
+        content = read_file(path)
     except OSError as error:
         raise bad_argument("path", "the file of a state", str(path), f"The system says: {error}.") from error
     head, _, body = content.partition(b"\n")
     if not head.startswith(MAGIC):
         raise bad_argument("path", "the file of a state", str(path), "Write one with save_state.")
-    _check_version(str(path), head[len(MAGIC) :].decode(errors="replace"))  # before anything of it is unpickled
+    _check_version(str(path), head[len(MAGIC) :].decode(errors="replace"))  # before anything of it is read
     mark, _, body = body.partition(b"\n")
     if mark.decode(errors="replace") != _fingerprint(body):
         raise bad_argument("path", "a whole file of a state", f"a damaged file {path}", "Save it again.")
     try:
-        state = pickle.loads(body)
-    except Exception as error:
-        cure = f"Read it where it was written; reading says: {error}."
+        state = decoded(body, ENV_KINDS)
+    except ValueError as error:
+        cure = f"Save it again; reading says: {error}."
         raise bad_argument("path", "the file of a state that can be read here", str(path), cure) from error
     return dict(_checked(str(path), state))
 
@@ -115,7 +174,7 @@ def sequence_state(sequence: np.random.SeedSequence | None) -> dict[str, Any] | 
 
 def restored_sequence(state: Mapping[str, Any] | None) -> np.random.SeedSequence | None:
     """Return the seed sequence that `sequence_state` described."""
-    return None if state is None else np.random.SeedSequence(**state)
+    return None if state is None else sequence_of(**state)
 
 
 def _checked_path(path: Any) -> Path:

@@ -99,7 +99,7 @@ def test_maps_that_are_forged_run_nothing(tmp_path: Path) -> None:
     arrays = read_arrays(file)
     with file.open("wb") as out:
         np.savez(out, allow_pickle=True, **arrays | {"means": np.array([Trap(proof)], dtype=object)})
-    with pytest.raises(ValueError, match="path: expected a file written by LandmarkMap.save, got a broken file"):
+    with pytest.raises(ValueError, match=r"path: expected a file written by LandmarkMap\.save, got a broken file"):
         LandmarkMap.load(file)
     assert not proof.exists()
     with file.open("wb") as out:

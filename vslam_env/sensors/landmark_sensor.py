@@ -63,8 +63,8 @@ class Frames(NamedTuple):
 
     Attributes:
         measurements: In one piece.
-        names: (K, B) int64. In each row the landmarks behind a robot's points, -1 for a false point; what follows them
-            means nothing.
+        names: (K, B) int64. In each row the landmarks behind a robot's points, -1 for a false point. What follows them
+            means nothing, but names no other landmarks.
     """
 
     measurements: TeamMeasurements
@@ -89,6 +89,10 @@ class LandmarkSensor:
         walls: (S, 4) float64 [m], world frame.
         landmarks: On these walls.
         robot_radius: Robots hide what stands behind them [m].
+
+    Attributes:
+        config: As given.
+        robot_radius: Likewise.
     """
 
     def __init__(
@@ -99,13 +103,13 @@ class LandmarkSensor:
         self._landmarks = landmarks
         descriptors = landmarks.descriptors.astype(np.float64)
         self._points = np.hstack([landmarks.positions, descriptors])
-        self._robot_radius = check_float("robot_radius", robot_radius, "Give metres.", at_least=0.0)
+        self.robot_radius = check_float("robot_radius", robot_radius, "Give metres.", at_least=0.0)
         camera = config.camera
         lens = camera.focal_px, camera.baseline, camera.sigma_px, camera.sigma_disparity_px
         self._optics = np.array([*camera.mount, *lens])
         self._view = view_limits(camera, config.max_incidence)
         walls_by_rows = self._walls.T.copy()
-        self._sight = marks_of(landmarks), landmarks.walls.copy(), walls_by_rows, self._robot_radius, self._view
+        self._sight = marks_of(landmarks), landmarks.walls.copy(), walls_by_rows, self.robot_radius, self._view
         self._frame_shape = config.max_measurements, self._points.shape[1]
         self._no_false_points = np.empty((0, self._points.shape[1]))
         # False points look like landmarks of this world: the common part of all descriptors and a part of their own.
@@ -114,7 +118,7 @@ class LandmarkSensor:
 
     def visible(self, poses: FloatArray) -> BoolArray:
         """Tell which landmarks (K, N) the robots at `poses` (K, 3) [m, m, rad], world frame, can see."""
-        return visible_landmarks(poses, self._landmarks, self._walls, self._robot_radius, self._view)
+        return visible_landmarks(poses, self._landmarks, self._walls, self.robot_radius, self._view)
 
     def measure(self, poses: FloatArray, rng: np.random.Generator) -> Frames:
         """Take a frame with each robot's camera.
@@ -132,7 +136,7 @@ class LandmarkSensor:
         config, robots, (most, size) = self.config, len(poses), self._frame_shape
         num_false = rng.poisson(config.false_points, robots)
         keys = rng.random((robots, len(self._points)))
-        ids, ends = np.empty((robots, most), np.int64), np.empty(robots, np.int64)
+        ids, ends = np.full((robots, most), -1), np.empty(robots, np.int64)
         total, extra = detect(poses, *self._sight, keys, config.detection_probability, num_false, ids, ends)
         false_points = self._no_false_points
         if extra:

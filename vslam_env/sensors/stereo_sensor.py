@@ -113,6 +113,7 @@ class StereoSensor:
         config: As given.
         textures: Of the walls.
         corners: The true landmarks.
+        robot_radius: As given.
     """
 
     def __init__(
@@ -123,15 +124,40 @@ class StereoSensor:
         rng: np.random.Generator,
         robot_radius: float = 0.2,
     ) -> None:
-        self.config = config
-        self.textures: WallTextures = draw_textures(world.walls, rng, config.textures)
+        textures = draw_textures(world.walls, rng, config.textures)
         resolution = config.camera.focal_px / config.working_distance
         options: CornerOptions = config.front_end.corners
-        self.corners = TextureCorners(world, self.textures, free_space, resolution, options, config.tolerance)
-        self._walls, self._robot_radius = world.walls, robot_radius
+        corners = TextureCorners(world, textures, free_space, resolution, options, config.tolerance)
+        self._settle(config, world.walls, textures, corners, robot_radius)
+
+    def _settle(
+        self,
+        config: StereoSensorConfig,
+        walls: FloatArray,
+        textures: WallTextures,
+        corners: TextureCorners,
+        robot_radius: float,
+    ) -> None:
+        """Look at a world whose textures and corners are known."""
+        self.config, self.textures, self.corners = config, textures, corners
+        self._walls, self.robot_radius = walls, robot_radius
         self._view = view_limits(config.camera, config.max_incidence)
-        self._eye = StereoEye(config.camera, config.imaging, world.walls, self.textures, robot_radius)
+        self._eye = StereoEye(config.camera, config.imaging, walls, textures, robot_radius)
         self._front_end = StereoFrontEnd(config.camera, config.front_end)
+
+    @classmethod
+    def of_textures(
+        cls,
+        config: StereoSensorConfig,
+        walls: FloatArray,
+        textures: WallTextures,
+        corners: TextureCorners,
+        robot_radius: float,
+    ) -> "StereoSensor":
+        """Return the sensor of a world whose textures and corners are known; arguments as of `StereoSensor`."""
+        self = cls.__new__(cls)
+        self._settle(config, walls, textures, corners, robot_radius)
+        return self
 
     @property
     def landmarks(self) -> Landmarks:
@@ -140,7 +166,7 @@ class StereoSensor:
 
     def visible(self, poses: FloatArray) -> BoolArray:
         """Tell which true landmarks (K, N) the robots at `poses` (K, 3) [m, m, rad], world frame, can see."""
-        return visible_landmarks(poses, self.landmarks, self._walls, self._robot_radius, self._view)
+        return visible_landmarks(poses, self.landmarks, self._walls, self.robot_radius, self._view)
 
     def measure(self, poses: FloatArray, rng: np.random.Generator) -> EyeFrames:
         """Take and measure a pair of images with each robot's eyes.

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend.errors import FloatArray, IntArray, bad_argument, check_choice, check_float
+from slam_backend.errors import FloatArray, IntArray, bad_argument, check_array, check_choice, check_float
 from slam_backend.frontend.images import Image
 
 STYLES = ("distinct", "bricks", "posters_alike", "bricks_alike")
@@ -119,6 +119,25 @@ def draw_textures(walls: FloatArray, rng: np.random.Generator, config: TextureCo
     for array in (sums, starts, columns, widths):
         array.setflags(write=False)
     return WallTextures(config, sums, starts[:-1], columns, widths)
+
+
+def check_textures(textures: WallTextures, walls: FloatArray) -> None:
+    """Refuse textures that are none of these walls (S, 4) [m]: kernels go by where each face begins.
+
+    Raises:
+        ValueError: As said.
+    """
+    cure = "Use those that draw_textures returned for the same walls."
+    faces = 2 * len(walls)
+    columns = check_array("textures.columns", textures.columns, (faces,), cure, dtype=np.int64)
+    starts = check_array("textures.starts", textures.starts, (faces,), cure, dtype=np.int64)
+    check_array("textures.widths", textures.widths, (faces,), cure)
+    sums = textures.sums
+    ends = np.cumsum(columns + 1) if columns.min() > 0 and columns.max() < len(sums) else np.zeros(faces, np.int64)
+    kinds = [array.dtype.str for array in (textures.starts, textures.columns, sums)] == ["<i8", "<i8", "<i4"]
+    rows = max(1, round((textures.config.ceiling - textures.config.floor) / textures.config.texel))
+    if not kinds or sums.shape != (ends[-1], rows + 1) or starts[0] != 0 or (starts[1:] != ends[:-1]).any():
+        raise bad_argument("textures", "a picture for each face of each wall", f"shape {sums.shape}", cure)
 
 
 def load_photographs(folder: str | Path, rows: int) -> list[Image]:

@@ -46,10 +46,8 @@ class TextureCorners:
         corners: CornerOptions,
         tolerance: float = 0.08,
     ) -> None:
-        self._walls, self._tolerance = world.walls, tolerance
         starts, ends = world.walls[:, :2], world.walls[:, 2:]
-        self._lengths = np.linalg.norm(ends - starts, axis=1)
-        along = (ends - starts) / self._lengths[:, None]
+        along = (ends - starts) / np.linalg.norm(ends - starts, axis=1)[:, None]
         left = np.stack([-along[:, 1], along[:, 0]], axis=1)
         unlimited = CornerOptions(
             most=ALL,
@@ -70,17 +68,41 @@ class TextureCorners:
             faces.append(np.full(int(free.sum()), face))
             offsets.append(found[free])
             descriptors.append(described[free])
-        self.faces: IntArray = np.concatenate(faces)
-        self.offsets: FloatArray = np.concatenate(offsets)
-        walls = self.faces // 2
-        positions = starts[walls] + self.offsets[:, :1] * along[walls]
-        self.landmarks = Landmarks(
-            positions=np.column_stack([positions, self.offsets[:, 1]]),
-            normals=np.where(self.faces % 2 == 0, 1.0, -1.0)[:, None] * left[walls],
+        of_faces, places = np.concatenate(faces), np.concatenate(offsets)
+        walls = of_faces // 2
+        positions = starts[walls] + places[:, :1] * along[walls]
+        landmarks = Landmarks(
+            positions=np.column_stack([positions, places[:, 1]]),
+            normals=np.where(of_faces % 2 == 0, 1.0, -1.0)[:, None] * left[walls],
             walls=walls,
             descriptors=np.concatenate(descriptors),
         )
-        self._begins = np.searchsorted(self.faces, np.arange(2 * len(world.walls) + 1))
+        self._settle(world.walls, landmarks, of_faces, places, tolerance)
+
+    def _settle(
+        self, walls: FloatArray, landmarks: Landmarks, faces: IntArray, offsets: FloatArray, tolerance: float
+    ) -> None:
+        """Hold corners that were found."""
+        self.landmarks, self.faces, self.offsets, self._tolerance = landmarks, faces, offsets, tolerance
+        self._lengths = np.linalg.norm(walls[:, 2:] - walls[:, :2], axis=1)
+        self._begins = np.searchsorted(faces, np.arange(2 * len(walls) + 1))
+
+    @classmethod
+    def found(
+        cls, walls: FloatArray, landmarks: Landmarks, faces: IntArray, offsets: FloatArray, tolerance: float
+    ) -> "TextureCorners":
+        """Return corners that were found before.
+
+        Args:
+            walls: (S, 4) float64 [m], world frame.
+            landmarks: The corners.
+            faces: (N,) int64, ascending.
+            offsets: (N, 2) float64 [m].
+            tolerance: [m].
+        """
+        self = cls.__new__(cls)
+        self._settle(walls, landmarks, faces, offsets, tolerance)
+        return self
 
     def claims(self, traced: Traced, heights: FloatArray) -> IntArray:
         """Return which landmark (n,) int64 each point on a wall is, -1: none.
