@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from agents.goal_network import NAMES, SHAPES, Weights, logits
 from slam_backend.array_files import read_arrays
 from slam_backend.errors import bad_argument
+from slam_backend.files import write_file
 from vslam_env.belief import Belief
 
 FORMAT = 1  # raised when the network, or what observations mean, changes
@@ -74,14 +75,15 @@ def save_model(file: Path, weights: Weights, about: Mapping[str, Any]) -> None:
         file: Where to; it is replaced as a whole.
         weights: Of the network.
         about: Plain values.
+
+    Raises:
+        ValueError: If the file cannot be written; an old one of that name is then unchanged.
     """
     arrays = {name: np.asarray(weights[name], np.float32) for name in sorted(weights)}
     told = {"format": FORMAT, "weights": _digest(arrays)} | dict(about)
     packed = io.BytesIO()
     np.savez(packed, allow_pickle=False, **{ABOUT: np.array(json.dumps(told))}, **arrays)
-    part = file.with_name(f".{file.name}.part")
-    part.write_bytes(packed.getvalue())
-    part.replace(file)
+    write_file(file, packed.getvalue(), "file")
 
 
 def load_model(path: str | Path) -> tuple[Weights, dict[str, Any]]:

@@ -23,8 +23,9 @@ from rich.table import Table
 
 from agents import make_policy
 from slam_backend.errors import check_int
+from slam_backend.files import check_writable, write_file
 from training.episode import run_episode
-from training.run_folder import check_writable, plain, to_json, write_whole
+from training.run_folder import plain, to_json
 from vslam_env import EnvConfig, preset_config, vslam_v0
 
 DECISIONS = 150  # of a second each
@@ -134,7 +135,7 @@ def main(
     Console().print(table)
     if json_file is not None:
         means = {name: summary(trials) for name, trials in results.items()}
-        write_whole(json_file, to_json(plain({"trials": results, "means": means})), "json")
+        write_file(json_file, to_json(plain({"trials": results, "means": means})), "json")
     if figure is not None:
         draw(results, figure)
 

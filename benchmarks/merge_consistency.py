@@ -27,9 +27,10 @@ from rich.table import Table
 from agents.registry import make_policy
 from slam_backend.alignment import align_maps
 from slam_backend.errors import FloatArray, check_int
+from slam_backend.files import check_writable, write_file
 from slam_backend.geometry import between, inverse, transform_points, wrap_angle
 from slam_backend.team import TeamSlam
-from training.run_folder import check_writable, plain
+from training.run_folder import plain
 from vslam_env import ExplorationEnv, preset_config
 from vslam_env.errors_of_maps import ClaimLedger
 from vslam_env.readings import Readings
@@ -148,7 +149,7 @@ def main(
         table.add_row(moment, *(f"{np.mean(values[name]):.2f} ({np.median(values[name]):.2f})" for name in names))
     Console(width=150).print(table)
     if json_file is not None:
-        json_file.write_text(json.dumps(plain({"trials": trials}), indent=2))
+        write_file(json_file, json.dumps(plain({"trials": trials}), indent=2), "json")
 
 
 if __name__ == "__main__":

@@ -34,12 +34,13 @@ from agents.registry import make_policy
 from slam_backend.alignment import Alignment
 from slam_backend.attempts import AttemptOptions
 from slam_backend.errors import FloatArray, IntArray, bad_argument, check_choice, check_int
+from slam_backend.files import check_writable, write_file
 from slam_backend.geometry import between, rotation
 from slam_backend.landmark_map import LandmarkMap
 from slam_backend.merge_options import MergeOptions
 from slam_backend.team import TeamSlam
 from training.episode import is_false_merge
-from training.run_folder import check_writable, plain
+from training.run_folder import plain
 from training.stereo_runs import STEP, RunSpec, simulate_run
 from vslam_env import ExplorationEnv, preset_config
 from vslam_env.errors_of_maps import ClaimLedger
@@ -277,7 +278,7 @@ def main(
         "delays": [asdict(delay) for delay in late],
     }
     if json_file is not None:
-        json_file.write_text(json.dumps(plain(record), indent=1))
+        write_file(json_file, json.dumps(plain(record), indent=1), "json")
 
 
 if __name__ == "__main__":

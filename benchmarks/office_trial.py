@@ -24,10 +24,11 @@ import typer
 from rich.console import Console
 
 from slam_backend.errors import check_int
+from slam_backend.files import check_writable, write_file
 from training.episode import run_episode
 from training.episode_scores import score_episode
 from training.run_config import RunConfig
-from training.run_folder import check_writable, plain
+from training.run_folder import plain
 
 
 def play(config: RunConfig) -> dict[str, Any]:
@@ -118,7 +119,7 @@ def main(
     for name, value in summary.items():
         console.print(f"{name:36s} {value:.3f}" if isinstance(value, float) else f"{name:36s} {value}")
     if json_file is not None:
-        json_file.write_text(json.dumps(plain({"summary": summary, "trials": trials}), indent=2) + "\n")
+        write_file(json_file, json.dumps(plain({"summary": summary, "trials": trials}), indent=2) + "\n", "json")
 
 
 if __name__ == "__main__":

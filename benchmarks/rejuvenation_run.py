@@ -23,11 +23,11 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from rich.console import Console
 
+from slam_backend.files import check_writable, write_file
 from slam_backend.filter import FastSlam
 from slam_backend.geometry import wrap_angle
 from slam_backend.metrics import nees
 from training.accuracy_trials import LEAST_SIGMA, REJUVENATE_EVERY
-from training.run_folder import check_writable
 from training.stereo_runs import STEP, RunSpec, StereoRun, simulate_run
 
 SMOOTH = 40  # steps over which the median of the NEES is drawn
@@ -112,7 +112,7 @@ def main(
         console.print(name, {key: round(v, 4) if isinstance(v, float) else v for key, v in told.items()})
     draw(figure, found)
     if json is not None:
-        json.write_text(json_format.dumps(found), encoding="utf-8")
+        write_file(json, json_format.dumps(found), "json")
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
@@ -10,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from slam_backend.array_files import read_arrays
 from slam_backend.errors import FloatArray, IntArray, bad_argument, check_array
+from slam_backend.files import write_file
 from slam_backend.geometry import rotate_covariances, transform_points
 
 FORMAT = "vslam landmark map"
@@ -214,14 +216,12 @@ class LandmarkMap:
         """Write the map to `path`, exactly as named, as a numpy archive that `load` reads back bit for bit.
 
         Raises:
-            ValueError: If the folder of `path` is not there.
+            ValueError: If the file cannot be written; an old one of that name is then unchanged.
         """
         arrays: dict[str, Any] = {name: getattr(self, name) for name in FIELDS}
-        if not Path(path).parent.is_dir():
-            cure = f"Make the folder {str(Path(path).parent)!r} first."
-            raise bad_argument("path", "a file in an existing folder", str(path), cure)
-        with Path(path).open("wb") as file:
-            np.savez(file, format=np.array(FORMAT), version=np.array(FORMAT_VERSION), **arrays)
+        packed = BytesIO()
+        np.savez(packed, format=np.array(FORMAT), version=np.array(FORMAT_VERSION), **arrays)
+        write_file(path, packed.getvalue())
 
     @classmethod
     def load(cls, path: str | Path) -> Self:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from slam_backend.errors import FloatArray, bad_argument, check_array
+from slam_backend.files import write_file
 from slam_backend.geometry import wrap_angle
 
 PLANAR_TOLERANCE = 1e-6
@@ -84,12 +85,20 @@ class Trajectory:
         return np.asarray(poses)
 
     def save_tum(self, path: str | Path) -> None:
-        """Write lines `time tx ty tz qx qy qz qw`, every number in the shortest form that reads back bit for bit."""
+        """Write `to_tum()` to a file.
+
+        Raises:
+            ValueError: If the file cannot be written; an old one of that name is then unchanged.
+        """
+        write_file(path, self.to_tum())
+
+    def to_tum(self) -> str:
+        """Return lines `time tx ty tz qx qy qz qw`, every number in the shortest form that reads back bit for bit."""
         rows = ["# timestamp tx ty tz qx qy qz qw"]
         half = 0.5 * self.poses[:, 2]
         for time, (x, y, _), qz, qw in zip(self.times, self.poses, np.sin(half), np.cos(half), strict=True):
             rows.append(" ".join(repr(float(v)) for v in (time, x, y, 0.0, 0.0, 0.0, qz, qw)))
-        Path(path).write_text("\n".join(rows) + "\n", encoding="ascii")
+        return "\n".join(rows) + "\n"
 
     @classmethod
     def load_tum(cls, path: str | Path) -> Self:

@@ -58,8 +58,9 @@ def gather(
     log: tuple[Path, str] | None = None,
 ) -> dict[str, Any]:
     """Return the plain values of which `choose` makes a configuration; arguments and errors as there."""
+    from slam_backend.files import check_writable
     from training.replay_paths import find_log
-    from training.run_folder import check_writable, read_config
+    from training.run_folder import read_config
 
     if json is not None and json.parent != out:  # the run's own folder does not exist yet
         check_writable(json, "json")
@@ -129,10 +130,11 @@ def finish(
     Raises:
         typer.Exit: With status 1, if `check` and a goal was missed or none was looked at.
     """
-    from training.run_folder import to_json, write_whole
+    from slam_backend.files import write_file
+    from training.run_folder import to_json
 
     if json is not None:
-        write_whole(json, to_json(metrics), "json")
+        write_file(json, to_json(metrics), "json")
     console.print(f"Run folder: {folder.path}", soft_wrap=True, highlight=False)
     verdicts = list(held)
     if check and not (verdicts and all(verdicts)):

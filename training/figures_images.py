@@ -5,7 +5,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from slam_backend.errors import FloatArray, IntArray, bad_argument
+from slam_backend.errors import FloatArray, IntArray
+from slam_backend.files import write_file
 from slam_backend.frontend.images import Image
 from slam_backend.geometry import inverse, transform_points
 
@@ -87,5 +88,4 @@ def _fine(column: float, row: float) -> tuple[int, int]:
 
 
 def _write(file: Path, picture: np.ndarray) -> None:
-    if not cv2.imwrite(str(file), picture):
-        raise bad_argument("out", "a folder that can be written", str(file), "Choose another one.")
+    write_file(file, cv2.imencode(file.suffix, picture)[1].tobytes(), "out")

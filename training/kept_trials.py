@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from slam_backend.errors import bad_argument
+from slam_backend.files import append_text
 from training.run_folder import CONFIG_FILE, RunFolder, installed_versions, plain, read_config
 
 SINGLE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -95,14 +96,15 @@ def run_trials(
         processes: How many run at a time; 1: in this process.
         interrupted: Asked before each trial.
         on_trial: Called with each row.
+
+    Raises:
+        ValueError: If a row cannot be written; those before it are kept.
     """
-    with (folder.path / name).open("a", encoding="utf-8") as file:
-        going = _until(interrupted, trials)
-        for row in map(play, going) if processes == 1 else _spread(play, going, processes):
-            kept = plain(row)
-            file.write(json.dumps(kept, allow_nan=False) + "\n")
-            file.flush()
-            on_trial(kept)
+    going = _until(interrupted, trials)
+    for row in map(play, going) if processes == 1 else _spread(play, going, processes):
+        kept = plain(row)
+        append_text(folder.path / name, json.dumps(kept, allow_nan=False) + "\n", "out")
+        on_trial(kept)
 
 
 def _until(interrupted: Callable[[], bool], trials: Iterable[TrialT]) -> Iterator[TrialT]:

@@ -2,7 +2,6 @@
 
 import json
 import math
-import os
 import platform
 import tempfile
 import tomllib
@@ -16,6 +15,7 @@ import numpy as np
 import tomli_w
 
 from slam_backend.errors import bad_argument, check_int
+from slam_backend.files import write_file
 from slam_backend.trajectory import Trajectory
 
 PACKAGES = (
@@ -74,13 +74,11 @@ class RunFolder:
 
     def write_trajectory(self, name: str, trajectory: Trajectory) -> Path:
         """Write a path as `<name>.tum`."""
-        file = self.path / f"{name}.tum"
-        trajectory.save_tum(file)
-        return file
+        return self.write_text(f"{name}.tum", trajectory.to_tum())
 
     def write_text(self, name: str, text: str) -> Path:
         """Write a text file so that a reader finds it whole or not at all."""
-        return write_whole(self.path / name, text)
+        return write_file(self.path / name, text, "out")
 
 
 def read_config(path: Path, command: str, option: str = "config") -> tuple[dict[str, Any], int]:
@@ -135,43 +133,6 @@ def to_json(content: Any) -> str:
     return json.dumps(content, indent=2, allow_nan=False) + "\n"
 
 
-def write_whole(file: Path, text: str, argument: str = "out") -> Path:
-    """Write a text file by way of a temporary one beside it, so that no reader ever finds a part.
-
-    Raises:
-        ValueError: If it cannot be written; the message names `argument`.
-    """
-    try:
-        handle, temporary = tempfile.mkstemp(dir=file.parent, prefix=f".{file.name}-")
-        with os.fdopen(handle, "w", encoding="utf-8") as stream:
-            stream.write(text)
-        Path(temporary).chmod(0o666 & ~_umask())  # mkstemp makes files that only their owner can read
-        Path(temporary).replace(file)
-    except OSError as error:
-        raise _no_access(argument, file, error) from error
-    return file
-
-
-def check_writable(file: Path, argument: str) -> None:
-    """Refuse a file that cannot be written, before the work whose result it is to hold.
-
-    Raises:
-        ValueError: If it is a folder, or its folder is missing or takes no files; the message names `argument`.
-    """
-    if file.is_dir():
-        raise bad_argument(argument, "a file", "a folder", f"Name a file in {str(file)!r}.")
-    try:
-        tempfile.TemporaryFile(dir=file.parent).close()
-    except OSError as error:
-        raise _no_access(argument, file, error) from error
-
-
-def _no_access(argument: str, file: Path, error: OSError) -> ValueError:
-    """Return the error that says that `file` cannot be written."""
-    cure = f"Choose another than {str(file)!r}: {error.strerror}."
-    return bad_argument(argument, "a place that can be written", "no access", cure)
-
-
 def installed_versions() -> dict[str, str]:
     """Return the versions of Python and of `PACKAGES`, as far as these are installed."""
     versions = {"python": platform.python_version()}
@@ -181,13 +142,6 @@ def installed_versions() -> dict[str, str]:
         except PackageNotFoundError:
             continue
     return versions
-
-
-def _umask() -> int:
-    """Return the process's mask of file permissions, which can only be read by setting it."""
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
 
 
 def _drop_none(value: Any) -> Any:
@@ -204,15 +158,15 @@ def check_free(folder: Path) -> None:
         ValueError: If it is a file, holds files, or could not be made or written.
     """
     cure = f"Choose another than {str(folder)!r}, or leave --out away."
-    if folder.is_file():
-        raise bad_argument("out", "a new or empty folder", "a file", cure)
     try:
+        if folder.is_file():
+            raise bad_argument("out", "a new or empty folder", "a file", cure)
         full = folder.is_dir() and any(folder.iterdir())
         if not full:
             there = next(place for place in (folder, *folder.absolute().parents) if place.exists())
             tempfile.TemporaryFile(dir=there).close()
     except OSError as error:
-        raise bad_argument("out", "a folder that can be written", f"no access ({error.strerror})", cure) from error
+        raise _no_folder(folder, error, "leave --out away") from error
     if full:
         raise bad_argument("out", "a new or empty folder", "a folder with files", cure)
 
@@ -223,8 +177,7 @@ def _claim(folder: Path) -> Path:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        cure = f"Choose another than {str(folder)!r}, or leave --out away."
-        raise bad_argument("out", "a folder that can be written", f"no access ({error.strerror})", cure) from error
+        raise _no_folder(folder, error, "leave --out away") from error
     return folder
 
 
@@ -237,7 +190,12 @@ def _next_free(parent: Path, stem: str) -> Path:
         except FileExistsError:
             continue
         except OSError as error:
-            cure = f"Name a folder with --out; {str(parent)!r} is not for us."
-            raise bad_argument("out", "a folder that can be written", f"no access ({error.strerror})", cure) from error
+            raise _no_folder(parent, error, "name one with --out") from error
         return folder
     raise bad_argument("out", "a free number", f"a million folders {stem!r}", "Clean up runs.")
+
+
+def _no_folder(folder: Path, error: OSError, cure: str) -> ValueError:
+    """Return the error that says why a folder cannot be made or written."""
+    text = f"The system says: {error.strerror}. Choose another folder, or {cure}."
+    return bad_argument("out", "a folder that can be written", str(folder), text)

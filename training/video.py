@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend.errors import bad_argument, check_float, check_int
+from slam_backend.files import check_writable, move_file, resolved
 from slam_backend.reports import MergeEvent
 from vslam_env.rendering import MergeFlash, Scene
 from vslam_env.rendering.flash import FLASH_TICKS
@@ -69,7 +70,7 @@ class VideoWriter:
     """A video file that appears under its name only when it is complete; use it in a `with` block.
 
     It is completed also when the block is left by an exception, with the frames until then; a video without frames
-    leaves no file.
+    leaves no file, and neither does one that its encoder could not write.
 
     Args:
         path: Of the file, ending in .mp4.
@@ -77,7 +78,8 @@ class VideoWriter:
         fps: Frames per second.
 
     Raises:
-        ValueError: If the path ends otherwise, its folder is missing, or a number is out of range.
+        ValueError: If the path ends otherwise, its folder is missing, it cannot be written, or a number is out of
+            range.
     """
 
     def __init__(self, path: Path, size: tuple[int, int], fps: int = FPS) -> None:
@@ -87,8 +89,9 @@ class VideoWriter:
             if check_int(name, length, 2, "Give the picture's size in pixels.") % 2:
                 raise bad_argument(name, "an even number", length, "Add one pixel.")
         check_int("fps", fps, 1, "Show at least one frame a second.")
+        check_writable(path, "path")
         self._path, self._size = path, size
-        self._partial = path.with_name(f".{path.stem}.partial.mp4")
+        self._partial = resolved(path).with_name(f".{path.stem}.partial.mp4")
         self._frames = 0
         self._sink: Any = imageio_ffmpeg.write_frames(
             self._partial,
@@ -99,6 +102,7 @@ class VideoWriter:
             pix_fmt_out="yuv420p",
             macro_block_size=2,
             quality=None,
+            ffmpeg_log_level="quiet",  # what it cannot write is found when the video is closed
             output_params=["-crf", str(QUALITY), "-preset", "veryfast", "-movflags", "+faststart"],
         )
         self._sink.send(None)
@@ -109,7 +113,10 @@ class VideoWriter:
         if frame.shape != (height, width, 3) or frame.dtype != np.uint8:
             got = f"shape {frame.shape} of {frame.dtype}"
             raise bad_argument("frame", f"an array of shape ({height}, {width}, 3) of uint8", got, "Draw it so large.")
-        self._sink.send(np.ascontiguousarray(frame))
+        try:
+            self._sink.send(np.ascontiguousarray(frame))
+        except (OSError, StopIteration) as error:
+            raise self._unwritten() from error
         self._frames += 1
 
     def __enter__(self) -> Self:
@@ -119,7 +126,23 @@ class VideoWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._sink.close()
-        if self._frames:
-            self._partial.replace(self._path)
-        else:
+        try:
+            if self._frames:
+                self._check_whole()
+                move_file(self._partial, self._path)
+        finally:
             self._partial.unlink(missing_ok=True)
+
+    def _check_whole(self) -> None:
+        """Refuse a file that lacks frames: the encoder does not report that it could not write."""
+        try:
+            count, _ = imageio_ffmpeg.count_frames_and_secs(self._partial)
+        except (OSError, RuntimeError) as error:
+            raise self._unwritten() from error
+        if count != self._frames:
+            raise self._unwritten()
+
+    def _unwritten(self) -> ValueError:
+        """Return the error of a video that its encoder could not write."""
+        text = "The encoder stopped: make room on the disk, or go without a video."
+        return bad_argument("path", "a file that can be written", str(self._path), text)

@@ -58,8 +58,8 @@ def preview(
     import imageio.v3 as imageio
 
     from slam_backend.errors import bad_argument
+    from slam_backend.files import check_writable, write_file
     from training.compiling import compilation_shown
-    from training.run_folder import check_writable
     from training.worlds_survey import contact_sheet
 
     if out.suffix.lower() != ".png":
@@ -67,7 +67,7 @@ def preview(
     check_writable(out, "out")
     with compilation_shown(Console(stderr=True)):
         picture = contact_sheet(world, first_seed, seeds, robots)
-    imageio.imwrite(out, picture)
+    write_file(out, imageio.imwrite("<bytes>", picture, extension=".png"), "out")
     Console().print(f"Picture: {out}", soft_wrap=True, highlight=False)
 
 

@@ -291,7 +291,10 @@ def test_the_command_from_end_to_end(vslam: Any, tmp_path: Path) -> None:
         (("--length", "0"), "length: expected a finite number >= 0.25, got 0.0."),
         (("--seeds", "0"), "seeds: expected an int >= 1, got 0."),
         (("--processes", "0"), "processes: expected an int >= 1, got 0."),
-        (("--json", "/nowhere/copy.json"), "json: expected a place that can be written, got no access."),
+        (
+            ("--json", "/nowhere/copy.json"),
+            "json: expected a file that can be written, got '/nowhere/copy.json'. The system says: No such file",
+        ),
         (("--config", "/nowhere"), "config: expected the config.toml of an earlier run, got no such file."),
     ],
 )

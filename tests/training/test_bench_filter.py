@@ -73,7 +73,10 @@ def test_a_bench_leaves_a_folder_that_repeats_it(vslam: Any, tmp_path: Path) -> 
         (("--particles", "0"), "particles: expected an int >= 1, got 0."),
         (("--landmarks", "20"), "landmarks: expected an int >= 30, got 20."),
         (("--steps", "0"), "steps: expected an int >= 1, got 0."),
-        (("--json", "/nowhere/copy.json"), "json: expected a place that can be written, got no access."),
+        (
+            ("--json", "/nowhere/copy.json"),
+            "json: expected a file that can be written, got '/nowhere/copy.json'. The system says: No such file",
+        ),
         (("--config", "/nowhere"), "config: expected the config.toml of an earlier run, got no such file."),
     ],
 )

@@ -35,7 +35,10 @@ def test_every_command_explains_itself(vslam: Any, command: tuple[str, ...]) -> 
         (("--path", ".", "--duration", "-1"), "duration: expected a finite number > 0, got -1.0."),
         (("--path", ".", "--estimator", "ekf"), "estimator: expected one of 'fastslam2', 'fastslam1', got 'ekf'."),
         (("--path", ".", "--seed", "-2"), "seed: expected an int >= 0, got -2."),
-        (("--path", ".", "--json", "/nowhere/copy.json"), "json: expected a place that can be written, got no access."),
+        (
+            ("--path", ".", "--json", "/nowhere/copy.json"),
+            "json: expected a file that can be written, got '/nowhere/copy.json'. The system says: No such file",
+        ),
         (("--config", "/nowhere/config.toml"), "config: expected the config.toml of an earlier run, got no such file."),
     ],
 )

@@ -368,7 +368,10 @@ def test_check_tells_by_the_exit_status(tmp_path: Path, factor: float, status: i
         (("--length", "0"), "length: expected a finite number >= 0.25, got 0.0."),
         (("--seeds", "0"), "seeds: expected an int >= 1, got 0."),
         (("--processes", "0"), "processes: expected an int >= 1, got 0."),
-        (("--json", "/nowhere/copy.json"), "json: expected a place that can be written, got no access."),
+        (
+            ("--json", "/nowhere/copy.json"),
+            "json: expected a file that can be written, got '/nowhere/copy.json'. The system says: No such file",
+        ),
     ],
 )
 def test_bad_options_are_one_line_and_status_2(

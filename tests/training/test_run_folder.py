@@ -1,4 +1,5 @@
 import json
+import shutil
 import tomllib
 from pathlib import Path
 
@@ -8,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from slam_backend.trajectory import Trajectory
-from training.run_folder import METRICS_FILE, RunFolder, plain, read_config, write_whole
+from training.run_folder import METRICS_FILE, RunFolder, plain, read_config
 
 
 def test_a_run_can_be_read_back(tmp_path: Path) -> None:
@@ -38,7 +39,9 @@ def test_an_empty_folder_is_taken_and_a_full_one_refused(tmp_path: Path) -> None
     (tmp_path / "file").write_text("x")
     with pytest.raises(ValueError, match="out: expected a new or empty folder, got a file"):
         RunFolder.create(tmp_path / "file", "run", {}, seed=0)
-    with pytest.raises(ValueError, match="out: expected a folder that can be written, got no access"):
+    with pytest.raises(
+        ValueError, match=r"out: expected a folder that can be written, got '.*below'\. The system says: Not a"
+    ):
         RunFolder.create(tmp_path / "file" / "below", "run", {}, seed=0)
     with pytest.raises(ValueError, match="seed: expected an int >= 0, got -1"):
         RunFolder.create(tmp_path / "other", "run", {}, seed=-1)
@@ -86,9 +89,13 @@ def test_a_config_that_cannot_be_repeated_is_refused(tmp_path: Path, text: str |
 
 
 def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
-    """A file in a folder that is not there is refused as `out`."""
-    with pytest.raises(ValueError, match=r"out: expected a place that can be written, got no access\. .*none"):
-        write_whole(tmp_path / "none" / "metrics.json", "{}")
+    """A file in a folder that is gone is refused as `out`, with the reason."""
+    folder = RunFolder.create(tmp_path / "run", "run", {}, seed=0)
+    shutil.rmtree(folder.path)
+    with pytest.raises(
+        ValueError, match=r"out: expected a file that can be written, got .*\. The system says: No such"
+    ):
+        folder.write_metrics({})
 
 
 values = st.recursive(

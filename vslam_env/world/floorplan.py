@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from slam_backend.errors import FloatArray, bad_argument, check_float
+from slam_backend.files import write_file
 from vslam_env.world.spec import World
 
 BRIGHT_SHARE = 0.85  # light grey 195 over mid grey 128, white over black, 254 over the 205 of "unknown" in ROS maps
@@ -119,10 +120,7 @@ def save_walls_json(world: World, path: str | Path) -> None:
     content: dict[str, Any] = {"format": FORMAT, "name": world.name, "walls": np.round(world.walls, 6).tolist()}
     if world.start_poses is not None:
         content["start_poses"] = world.start_poses.tolist()
-    try:
-        Path(path).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-    except (OSError, TypeError, ValueError) as error:  # the latter two are of what is no path
-        raise bad_argument("path", "a file that can be written", str(path), f"The system says: {error}.") from error
+    write_file(path, json.dumps(content, indent=1) + "\n")
 
 
 def read_image(path: Path, flags: int) -> Any:
