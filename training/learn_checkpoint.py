@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from slam_backend.errors import bad_argument
+from slam_backend.files import write_file
 from slam_backend.state_codec import MOST_BYTES, decoded, encoded, read_file
 from training.run_folder import installed_versions
 from vslam_env.state_kinds import ENV_KINDS
@@ -36,13 +37,7 @@ def write_checkpoint(file: Path, content: Mapping[str, Any]) -> None:
         "bytes": len(packed),
         "sha256": hashlib.sha256(packed).hexdigest(),
     }
-    part = file.with_name(f".{file.name}.part")
-    try:
-        part.write_bytes(MAGIC + json.dumps(mark).encode() + b"\n" + packed)
-        part.replace(file)
-    except OSError as error:
-        cure = f"Choose another than {str(file)!r}: {error.strerror}."
-        raise bad_argument("out", "a place that can be written", "no access", cure) from error
+    write_file(file, MAGIC + json.dumps(mark).encode() + b"\n" + packed, "out")
 
 
 def read_checkpoint(file: Path) -> dict[str, Any]:

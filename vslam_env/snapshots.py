@@ -5,14 +5,14 @@ import hashlib
 from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
-from os import PathLike, replace
+from os import PathLike
 from pathlib import Path
-from secrets import token_hex
 from typing import Any
 
 import numpy as np
 
 from slam_backend.errors import bad_argument
+from slam_backend.files import refusing, write_file
 from slam_backend.state_checks import check_kind, check_whole, refuse
 from slam_backend.state_codec import ForeignObjectError, decoded, encoded, read_file, sequence_of
 from vslam_env._state_checks import EpisodeCheck, check_drivers, check_standing
@@ -106,7 +106,7 @@ def save_state(state: Mapping[str, Any], path: str | Path) -> None:
     """Write a state of `get_state` to a file; an interrupted write leaves no file, or the old one.
 
     A file of that name is replaced; what is there and no file is refused. The file holds data alone, with its SHA-256:
-    to load it runs no code of the file's. Objects of your own (worlds, reward terms) are not stored.
+    loading it runs no code. Objects of your own (worlds, reward terms) are not stored.
 
     Raises:
         ValueError: If it is no state of this version, or the file cannot be written.
@@ -118,20 +118,11 @@ def save_state(state: Mapping[str, Any], path: str | Path) -> None:
     except ForeignObjectError as error:
         cure = "Objects of your own are not stored: make the environment that loads with them."
         raise bad_argument("state", "numbers, arrays and configurations of this package", str(error), cure) from error
-    try:
-        if path.exists() and not path.is_file():
-            raise bad_argument("path", "a file that can be written", str(path), "There is something else, no file.")
-        part = path.with_name(f"{path.name}.{token_hex(8)}.part")
-        with part.open("xb") as file:  # readable to whom the process lets read, which temporary files are not
-            try:
-                file.write(MAGIC + f"{state['version']}\n{_fingerprint(body)}\n".encode() + body)
-                file.close()
-                replace(part, path)
-            except BaseException:
-                part.unlink(missing_ok=True)
-                raise
-    except OSError as error:
-        raise bad_argument("path", "a file that can be written", str(path), f"The system says: {error}.") from error
+    with refusing(path, "path"):
+        is_other = path.exists() and not path.is_file()
+    if is_other:
+        raise bad_argument("path", "a file that can be written", str(path), "There is something else, no file.")
+    write_file(path, MAGIC + f"{state['version']}\n{_fingerprint(body)}\n".encode() + body)
 
 
 def load_state(path: str | Path) -> EnvState:

@@ -355,6 +355,8 @@ def test_files_are_whole_or_not_there(tmp_path: Path) -> None:
     assert [file.name for file in tmp_path.iterdir()] == ["state"]
     with pytest.raises(ValueError, match="path: expected a file that can be written"):
         save_state(state, tmp_path / "nowhere" / "state")
+    with pytest.raises(ValueError, match=r"path: expected a file that can be written, .* File name too long"):
+        save_state(state, tmp_path / ("x" * 300))
     for other in (None, 3, "a\0b", Path("a\0b")):
         with pytest.raises(ValueError, match="path: expected the path of a file, got "):
             save_state(state, other)
