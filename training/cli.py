@@ -1,6 +1,7 @@
 """The command line `vslam`: it only registers commands; each lives in a module of its own."""
 
 import sys
+from signal import Signals
 
 import typer
 from rich.console import Console
@@ -15,6 +16,7 @@ from training.bench_stereo_command import bench_stereo
 from training.bench_train_command import bench_train
 from training.drive_command import drive_by_hand
 from training.evaluate_command import evaluate
+from training.interrupt import signals_answered
 from training.mrclam_pairs_command import bench_mrclam
 from training.paper_alignment_commands import fig2, fig3, fig4
 from training.paper_command import paper
@@ -25,6 +27,9 @@ from training.replay_pairs_command import replay_stereo
 from training.run import run
 from training.train_command import train
 from training.worlds_command import worlds
+
+BAD_INPUT = 2
+INTERRUPTED = 130  # typer's status after a KeyboardInterrupt
 
 app = typer.Typer(
     name="vslam",
@@ -60,15 +65,25 @@ app.add_typer(worlds, name="worlds")
 
 
 def main() -> None:
-    """Run the command line; bad input becomes one line on stderr and exit status 2."""
-    try:
-        app(prog_name="vslam")
-    except ValueError as error:
-        # Only errors in the project's own form explain themselves; others are faults and keep their traceback.
-        if ": expected " not in str(error):
-            raise
-        Console(stderr=True, soft_wrap=True, highlight=False).print(f"[red]error[/] {escape(str(error))}")
-        sys.exit(2)
+    """Run the command line; bad input becomes one line on stderr and exit status 2.
+
+    A command that SIGINT or SIGTERM has stopped, at once or after what was under way, ends with 128 and its number.
+    """
+    with signals_answered() as handler:
+        try:
+            app(prog_name="vslam")
+        except SystemExit as end:
+            if handler.number is None or end.code == BAD_INPUT:
+                raise
+            if end.code == INTERRUPTED:
+                Console(stderr=True).print(f"Stopped by {Signals(handler.number).name}.", highlight=False)
+            sys.exit(128 + handler.number)
+        except ValueError as error:
+            # Only errors in the project's own form explain themselves; others are faults and keep their traceback.
+            if ": expected " not in str(error):
+                raise
+            Console(stderr=True, soft_wrap=True, highlight=False).print(f"[red]error[/] {escape(str(error))}")
+            sys.exit(BAD_INPUT)
 
 
 if __name__ == "__main__":

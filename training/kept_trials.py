@@ -2,14 +2,16 @@
 
 import json
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from multiprocessing import get_context
+from contextlib import closing
+from multiprocessing import active_children, get_context
 from pathlib import Path
 from typing import Any, TypeVar
 
 from slam_backend.errors import bad_argument
 from slam_backend.files import append_text
+from training.interrupt import begin_worker, signals_held
 from training.run_folder import CONFIG_FILE, RunFolder, installed_versions, plain, read_config
 
 SINGLE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -101,10 +103,11 @@ def run_trials(
         ValueError: If a row cannot be written; those before it are kept.
     """
     going = _until(interrupted, trials)
-    for row in map(play, going) if processes == 1 else _spread(play, going, processes):
-        kept = plain(row)
-        append_text(folder.path / name, json.dumps(kept, allow_nan=False) + "\n", "out")
-        on_trial(kept)
+    with closing(_in_turn(play, going) if processes == 1 else _spread(play, going, processes)) as rows:
+        for row in rows:
+            kept = plain(row)
+            append_text(folder.path / name, json.dumps(kept, allow_nan=False) + "\n", "out")
+            on_trial(kept)
 
 
 def _until(interrupted: Callable[[], bool], trials: Iterable[TrialT]) -> Iterator[TrialT]:
@@ -115,33 +118,44 @@ def _until(interrupted: Callable[[], bool], trials: Iterable[TrialT]) -> Iterato
         yield trial
 
 
+def _in_turn(
+    play: Callable[[TrialT], dict[str, Any]], trials: Iterable[TrialT]
+) -> Generator[dict[str, Any], None, None]:
+    """Run trials in this process."""
+    for trial in trials:
+        yield play(trial)
+
+
 def _spread(
     play: Callable[[TrialT], dict[str, Any]], trials: Iterable[TrialT], processes: int
-) -> Iterator[dict[str, Any]]:
-    """Run trials in several processes, each with one thread, and give their rows as they end."""
+) -> Generator[dict[str, Any], None, None]:
+    """Run trials in several processes, each with one thread, and give their rows as they end.
+
+    Where the rows are not wanted to the end, the processes are killed, whatever they do.
+    """
     context = get_context("spawn")
+    others = set(active_children())
     before = {name: os.environ.get(name) for name in SINGLE_THREAD}
     os.environ |= dict.fromkeys(SINGLE_THREAD, "1")  # more threads would only get in the other processes' way
     try:
-        with ProcessPoolExecutor(processes, mp_context=context, initializer=_leave_interrupts_to_parent) as pool:
-            running: set[Future[dict[str, Any]]] = set()
-            for trial in trials:
-                running.add(pool.submit(play, trial))
-                while len(running) >= processes:
-                    done, running = wait(running, return_when=FIRST_COMPLETED)
-                    yield from (future.result() for future in done)
-            for future in running:
-                yield future.result()
+        with ProcessPoolExecutor(processes, mp_context=context, initializer=begin_worker) as pool:
+            try:
+                running: set[Future[dict[str, Any]]] = set()
+                for trial in trials:
+                    with signals_held():
+                        running.add(pool.submit(play, trial))  # starts a process, if there are too few
+                    while len(running) >= processes:
+                        done, running = wait(running, return_when=FIRST_COMPLETED)
+                        yield from (future.result() for future in done)
+                for future in running:
+                    yield future.result()
+            except BaseException:
+                for process in set(active_children()) - others:
+                    process.kill()
+                raise
     finally:
         for name, value in before.items():
             if value is None:
                 del os.environ[name]
             else:
                 os.environ[name] = value
-
-
-def _leave_interrupts_to_parent() -> None:
-    """Let Ctrl-C, which reaches all processes of a terminal, end no trial half-way."""
-    import signal
-
-    signal.signal(signal.SIGINT, signal.SIG_IGN)

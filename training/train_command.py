@@ -133,7 +133,7 @@ def _run_live(console: Console, training: "Training") -> tuple[bool, float]:
         bar = stack.enter_context(Progress(*columns, console=console, expand=True, speed_estimate_period=300.0))
         told = _told(training.rows[-1]) if done else "first rollout"
         task = bar.add_task("", total=total, completed=done, told=told)
-        on_press = partial(bar.update, task, told="Ctrl-C: saves after this rollout")
+        on_press = partial(bar.update, task, told="stopping: saves after this rollout")
         interrupted = stack.enter_context(interrupt_flag(on_press))
 
         def on_update(row: "Row") -> None:

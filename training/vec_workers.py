@@ -1,10 +1,12 @@
 """`SlotWorkers`: the environments of a `SlotBatch` divided among processes; observations come by shared memory."""
 
+import atexit
 import os
-import signal
+import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from functools import partial
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from typing import Any
@@ -15,10 +17,11 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from slam_backend.errors import bad_argument
+from training.interrupt import begin_worker, signals_held
 from training.kept_trials import SINGLE_THREAD
 from training.vec_slots import Infos, Layout, MakeEnv, SlotBatch, Stepped, buffers
 
-CLOSE_S = 5.0  # a worker that has not ended by then is killed
+CLOSE_S = 5.0  # workers that have not ended by then are killed
 
 
 class SlotWorkers:
@@ -26,8 +29,8 @@ class SlotWorkers:
 
     Each worker takes a run of consecutive environments, as equal in number as can be. It writes observations into
     memory that it shares with this process, which copies them out before the next step; all else goes through a pipe.
-    Workers use one thread each, leave Ctrl-C to this process, and end when it does. An error in a worker is raised
-    here, and ends all of them.
+    Workers use one thread each, leave SIGINT and SIGTERM to this process, and end when it does. An error in a worker is
+    raised here, and ends all of them.
 
     Args:
         makers: Each makes an environment; what cloudpickle can pickle. This process makes each once, to see its spaces.
@@ -66,7 +69,9 @@ class SlotWorkers:
         self._processes: list[Any] = []
         self._sent = False
         ends = [0, *np.cumsum(self.counts).tolist()]
-        with _single_threaded():
+        self._kill = partial(_kill, self._processes)
+        atexit.register(self._kill)  # comes before multiprocessing's own, which sends SIGTERM and waits
+        with _single_threaded(), signals_held():
             for share in np.array_split(np.arange(len(makers)), workers):
                 envs = slice(int(share[0]), int(share[-1]) + 1)
                 slots = slice(ends[envs.start], ends[envs.stop])
@@ -137,11 +142,13 @@ class SlotWorkers:
 
     def close(self) -> None:
         """End all processes."""
+        atexit.unregister(self._kill)
         for pipe in self._pipes:
             with suppress(OSError):
                 pipe.send(("close",))
+        deadline = time.monotonic() + CLOSE_S
         for process in self._processes:
-            process.join(CLOSE_S)
+            process.join(max(0.0, deadline - time.monotonic()))
             if process.is_alive():
                 process.kill()
                 process.join()
@@ -206,6 +213,12 @@ class SlotWorkers:
         return {name: view.copy() for name, view in self._seen.items()}
 
 
+def _kill(processes: Sequence[Any]) -> None:
+    """End the workers of environments that were never closed."""
+    for process in processes:
+        process.kill()
+
+
 def _views(memory: Mapping[str, Any], layout: Layout, slots: int) -> dict[str, NDArray[Any]]:
     """Return arrays (slots, ...) over shared memory."""
     return {
@@ -216,7 +229,7 @@ def _views(memory: Mapping[str, Any], layout: Layout, slots: int) -> dict[str, N
 
 def _serve(pipe: Connection, packed: bytes, memory: Mapping[str, Any], part: slice, slots: int) -> None:
     """Run a worker: answer commands until told to close, or until the other process is gone."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    begin_worker()
     batch: SlotBatch | None = None
     failure: Exception | None = None
     try:
@@ -235,13 +248,23 @@ def _serve(pipe: Connection, packed: bytes, memory: Mapping[str, Any], part: sli
             if batch is not None:
                 batch.close()
             return
-        if batch is None or failure is not None:
-            pipe.send((True, failure))
-            continue
         try:
-            pipe.send((False, _obey(batch, rows, command, rest)))
+            answer = (True, failure) if batch is None or failure else (False, _obey(batch, rows, command, rest))
         except Exception as error:
-            pipe.send((True, _noted(error)))
+            answer = (True, _noted(error))
+        if not _answered(pipe, answer):
+            return
+
+
+def _answered(pipe: Connection, answer: tuple[bool, Any]) -> bool:
+    """Send an answer, or the error of one that cannot be pickled; return whether the other process is still there."""
+    try:
+        pipe.send(answer)
+    except OSError:
+        return False
+    except Exception as error:
+        return _answered(pipe, (True, _noted(error)))
+    return True
 
 
 def _noted(error: Exception) -> Exception:

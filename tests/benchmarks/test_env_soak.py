@@ -45,7 +45,8 @@ def test_a_stopped_soak_leaves_a_whole_snapshot(tmp_path: Path, how: signal.Sign
     """A soak that is killed, or stopped by Ctrl-C, while it writes snapshots leaves one from which it goes on."""
     keep = tmp_path / "soak.state"
     code = (
-        "import sys; sys.path.insert(0, sys.argv[1]); import env_soak, pathlib\n"
+        "import signal, sys; sys.path.insert(0, sys.argv[1]); import env_soak, pathlib\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)  # the tests may run where it is ignored\n"
         "env_soak.beginning = env_soak.in_another_process = lambda *_: ''\n"
         "env_soak.Soak(3).run(10**6, pathlib.Path(sys.argv[2]), keep_every=1, log=lambda t: print(t, flush=True))\n"
     )

@@ -25,7 +25,6 @@ from sb3_contrib import MaskablePPO
 from agents.goal_network import logits
 from agents.trained import load_model
 from training.cli import app
-from training.interrupt import interrupt_flag
 from training.learn import Training, check_device, kept_of
 from training.learn_checkpoint import CHECKPOINT_FILE, read_checkpoint, write_checkpoint
 from training.learn_config import TrainConfig
@@ -236,18 +235,6 @@ def test_a_second_ctrl_c_tells_how_to_go_on(tmp_path: Path, monkeypatch: pytest.
     monkeypatch.setattr(Training, "run", interrupted)
     result = runner.invoke(app, ["train", "--resume", str(out), "--workers", "0"])
     assert f"Go on: vslam train --resume {out}" in result.output.replace("\n", "")
-
-
-def test_a_press_is_told_once() -> None:
-    """The first Ctrl-C calls what tells of it and raises the flag; the second one interrupts."""
-    told: list[str] = []
-    with interrupt_flag(lambda: told.append("pressed")) as pressed:
-        assert not pressed()
-        signal.raise_signal(signal.SIGINT)
-        assert pressed()
-        with pytest.raises(KeyboardInterrupt):
-            signal.raise_signal(signal.SIGINT)
-    assert told == ["pressed"]
 
 
 @pytest.mark.slow

@@ -1,6 +1,6 @@
 import json
 import signal
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,6 @@ from slam_backend.trajectory import Trajectory
 from training.episode import EpisodeRecord, MergeRecord, Progress, run_episode
 from training.episode_scores import score_episode
 from training.figures import draw_errors, draw_maps
-from training.interrupt import interrupt_flag
 from training.live import LiveProgress, describe
 from training.run_config import EPISODE_S, RunConfig
 from training.run_tables import print_tables
@@ -191,31 +190,6 @@ def test_live_figures_tell_of_merges(record: EpisodeRecord) -> None:
     assert "maps of 0 and 1 merged" in console.export_text()
 
 
-@pytest.fixture
-def interruptible() -> Iterator[None]:
-    """Let Ctrl-C interrupt, even where the tests run in the background, which a shell shields from it."""
-    inherited = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, inherited)
-
-
-@pytest.mark.usefixtures("interruptible")
-def test_the_first_interrupt_asks_and_the_second_insists() -> None:
-    """One Ctrl-C only raises the flag; the next interrupts; afterwards the usual handler is back."""
-    usual = signal.getsignal(signal.SIGINT)
-
-    def insist() -> None:
-        with interrupt_flag() as interrupted:
-            assert not interrupted()
-            signal.raise_signal(signal.SIGINT)
-            assert interrupted()
-            signal.raise_signal(signal.SIGINT)
-
-    with pytest.raises(KeyboardInterrupt, match=r"^$"):
-        insist()
-    assert signal.getsignal(signal.SIGINT) is usual
-
-
 SHORT = ("--robots", "2", "--particles", "11", "--max-cycles", "23", "--world", "fig5")
 
 
@@ -256,17 +230,20 @@ def test_a_policy_brings_its_kind_of_action(
 
 
 @pytest.mark.slow
-def test_an_interrupted_run_writes_what_it_has(monkeypatch: pytest.MonkeyPatch, vslam: Any, tmp_path: Path) -> None:
-    """Ctrl-C after seven steps leaves a whole folder about these seven steps."""
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_run_writes_what_it_has(
+    number: signal.Signals, monkeypatch: pytest.MonkeyPatch, vslam: Any, tmp_path: Path
+) -> None:
+    """A signal after seven steps leaves a whole folder about these seven steps, and its usual exit status."""
     usual: Callable[[LiveProgress, Progress], None] = LiveProgress.show
 
     def show(self: LiveProgress, progress: Progress) -> None:
         usual(self, progress)
         if progress.step == 7:
-            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(number)
 
     monkeypatch.setattr(LiveProgress, "show", show)
-    assert vslam("run", *SHORT, "--out", str(tmp_path / "run")).status == 0
+    assert vslam("run", *SHORT, "--out", str(tmp_path / "run")).status == 128 + number
     metrics: Mapping[str, object] = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert metrics["complete"] is False
     assert metrics["duration_s"] == pytest.approx(0.7)
