@@ -8,6 +8,7 @@ import typer
 from rich.console import Console
 
 from training.compiling import prepare
+from training.json_stdout import STDOUT, write_json
 
 if TYPE_CHECKING:  # what computes is imported when a command runs, so that --help answers at once
     from training.plain_config import PlainConfig
@@ -62,7 +63,7 @@ def gather(
     from training.replay_paths import find_log
     from training.run_folder import read_config
 
-    if json is not None and json.parent != out:  # the run's own folder does not exist yet
+    if json not in (None, STDOUT) and json.parent != out:  # the run's own folder does not exist yet
         check_writable(json, "json")
     values: dict[str, Any] = {}
     if config is not None:
@@ -130,11 +131,10 @@ def finish(
     Raises:
         typer.Exit: With status 1, if `check` and a goal was missed or none was looked at.
     """
-    from slam_backend.files import write_file
     from training.run_folder import to_json
 
     if json is not None:
-        write_file(json, to_json(metrics), "json")
+        write_json(json, to_json(metrics))
     console.print(f"Run folder: {folder.path}", soft_wrap=True, highlight=False)
     verdicts = list(held)
     if check and not (verdicts and all(verdicts)):

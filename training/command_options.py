@@ -5,6 +5,8 @@ from typing import Annotated, Any
 
 import typer
 
+from training.json_stdout import claim_stdout
+
 Particles = Annotated[int | None, typer.Option(help="Particles per filter.", show_default="100")]
 Estimator = Annotated[str | None, typer.Option(help="fastslam2 or fastslam1.", show_default="fastslam2")]
 Duration = Annotated[float | None, typer.Option(help="Seconds to replay.", show_default="all")]
@@ -30,7 +32,14 @@ OutToGoOn = Annotated[
         help="Run folder: a new one, or that of a run to go on with.", show_default="the next free one in runs"
     ),
 ]
-Json = Annotated[Path | None, typer.Option(help="Write the metrics to this file too.", show_default=False)]
+Json = Annotated[
+    Path | None,
+    typer.Option(
+        help="Write the metrics to this file too; - is stdout, and all else goes to stderr then.",
+        show_default=False,
+        callback=claim_stdout,
+    ),
+]
 Config = Annotated[
     Path | None,
     typer.Option(help="config.toml of an earlier run to repeat; other options override it.", show_default=False),
