@@ -15,7 +15,7 @@ from slam_backend.landmark_map import LandmarkMap
 from slam_backend.readers.mrclam import MrclamLog
 from training.png import save_png
 from training.replay_mrclam import Replay
-from training.replay_scores import PathScore, align_to_truth
+from training.replay_scores import AlignedMap, PathScore, align_to_truth
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#B8860B")  # told apart by colour-blind eyes too
 TRUTH = "#9a9a9a"
@@ -69,16 +69,21 @@ def _draw_robot(ax: Axes, log: MrclamLog, replay: Replay, path: PathScore | None
     """Draw one robot's path and dead reckoning, each fitted to the true path, and its map, fitted to the landmarks."""
     colour = COLOURS[robot % len(COLOURS)]
     title = f"robot {log.robots[robot].robot}"
+    fitted = align_to_truth(replay.maps[robot], replay.claims[robot], log)
+    own = _own_frame(fitted, path)
+    frames, labels = (own, own), ("odometry", "estimate")
     if path is not None:
         ax.plot(*path.truth[:, :2].T, color=TRUTH, alpha=0.7, lw=2.2, label="true path")
-        reckoned = transform_points(path.world_from_reckoned, replay.reckoned[robot][:, :2])
-        ax.plot(*reckoned.T, color=colour, alpha=0.6, lw=0.9, ls=":", label=f"odometry {path.reckoned_aligned:.2f} m")
-        estimated = transform_points(path.world_from_path, replay.paths[robot][:, :2])
-        ax.plot(*estimated.T, color=colour, lw=1.0, label=f"estimate {path.ate_aligned:.2f} m")
-    fitted = align_to_truth(replay.maps[robot], replay.claims[robot], log)
+        frames = path.world_from_reckoned, path.world_from_path
+        labels = f"odometry {path.reckoned_aligned:.2f} m", f"estimate {path.ate_aligned:.2f} m"
+    reckoned = transform_points(frames[0], replay.reckoned[robot][:, :2])
+    ax.plot(*reckoned.T, color=colour, alpha=0.6, lw=0.9, ls=":", label=labels[0])
+    ax.plot(*transform_points(frames[1], replay.paths[robot][:, :2]).T, color=colour, lw=1.0, label=labels[1])
+    _draw_landmarks(ax, replay.maps[robot].moved(own), colour)
     if fitted is not None:
-        _draw_landmarks(ax, fitted.landmarks, colour)
         title += f": map {fitted.score.rmse:.2f} m, {fitted.score.recall:.0%} of landmarks"
+    elif path is None:
+        title += ", own start frame"
     _finish(ax, log, title)
 
 
@@ -89,19 +94,27 @@ def _draw_group(
     names = ", ".join(str(log.robots[robot].robot) for robot in group)
     first = group[0]
     fitted = align_to_truth(replay.maps[first], replay.claims[first], log)
+    own = _own_frame(fitted, paths[first])
+    in_world = fitted is not None or paths[first] is not None
+    for robot in group:
+        # The map hangs in the first robot's start frame; the others' start frames follow through the group's.
+        first_from_own = compose(replay.start_from_group[first], inverse(replay.start_from_group[robot]))
+        points = transform_points(compose(own, first_from_own), replay.paths[robot][:, :2])
+        score = paths[robot]
+        if score is not None and in_world:
+            label = "true paths" if robot == first else None
+            ax.plot(*score.truth[:, :2].T, color=TRUTH, alpha=0.35, lw=1.6, label=label)
+        label = f"robot {log.robots[robot].robot}"
+        ax.plot(*points.T, color=COLOURS[robot % len(COLOURS)], lw=0.7, alpha=0.85, label=label)
+    _draw_landmarks(ax, replay.maps[first].moved(own), "black")
+    _finish(ax, log, f"joint map of {names}, " + ("one fit for all" if in_world else "start frame of the first"))
+
+
+def _own_frame(fitted: AlignedMap | None, path: PathScore | None) -> FloatArray:
+    """Return where a picture puts a robot's start frame (3,): by its map, else by its path, else at the origin."""
     if fitted is not None:
-        for robot in group:
-            # The map hangs in the first robot's start frame; the others' start frames follow through the group's.
-            first_from_own = compose(replay.start_from_group[first], inverse(replay.start_from_group[robot]))
-            points = transform_points(compose(fitted.world_from_map, first_from_own), replay.paths[robot][:, :2])
-            score = paths[robot]
-            if score is not None:
-                label = "true paths" if robot == first else None
-                ax.plot(*score.truth[:, :2].T, color=TRUTH, alpha=0.35, lw=1.6, label=label)
-            label = f"robot {log.robots[robot].robot}"
-            ax.plot(*points.T, color=COLOURS[robot % len(COLOURS)], lw=0.7, alpha=0.85, label=label)
-        _draw_landmarks(ax, fitted.landmarks, "black")
-    _finish(ax, log, f"joint map of {names}, one fit for all")
+        return fitted.world_from_map
+    return np.zeros(3) if path is None else path.world_from_path
 
 
 def _draw_landmarks(ax: Axes, landmarks: LandmarkMap, colour: str) -> None:
@@ -121,7 +134,8 @@ def _ellipse(covariance: FloatArray) -> tuple[float, float, float]:
 
 def _finish(ax: Axes, log: MrclamLog, title: str) -> None:
     """Add what all panels share: true landmarks, equal axes, a legend."""
-    ax.plot(*log.positions.T, ls="", marker="+", ms=8, mew=1.1, color="#404040", zorder=3, label="true landmarks")
+    if log.positions is not None:
+        ax.plot(*log.positions.T, ls="", marker="+", ms=8, mew=1.1, color="#404040", zorder=3, label="true landmarks")
     ax.set_aspect("equal", adjustable="datalim")
     ax.set_title(title)
     ax.set_xlabel("x [m]")

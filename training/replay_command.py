@@ -53,6 +53,7 @@ def replay_mrclam(
     from training.replay_mrclam import ReplayConfig, replay
     from training.replay_scores import score_path, summarise
     from training.run_folder import plain, to_json
+    from training.run_maps import group_name, write_maps
 
     given = {
         "path": path,
@@ -69,20 +70,24 @@ def replay_mrclam(
     chosen = choose(ReplayConfig, COMMAND, given, config=config, json=json, out=out, log=LOG)
     log = load_mrclam(chosen.path, chosen.robots, chosen.duration, chosen.truth)
     console, folder = begin(COMMAND, chosen, out)
+    for note in log.notes:
+        console.print(note, soft_wrap=True, highlight=False)
     result = _replay_live(console, log, chosen, replay)
     paths = [score_path(result, robot, own.truth) for robot, own in enumerate(log.robots)]
     scores = plain(summarise(result, log, paths))
-    _print_tables(console, scores)
+    _print_tables(console, scores, {own.robot for own in log.robots if own.truth is not None})
     if told := sentence_of(scores["rejuvenations"]):
         console.print(told, highlight=False)
     speed = float(result.times[-1] - result.times[0]) / result.seconds
     console.print(f"The filters took {result.seconds:.1f} s: {speed:.0f} times real time.", highlight=False)
     _write_paths(folder, log, result)
+    maps = {group_name([log.robots[r].robot for r in group]): result.maps[group[0]] for group in result.groups}
+    console.print(write_maps(folder, maps), soft_wrap=True, highlight=False)
     folder.write_text("timing.json", to_json({"seconds": result.seconds, "times_real_time": speed}))
     draw_replay(folder.path / "replay.png", log, result, paths)
     for group in result.groups:
         if len(group) > 1:
-            names = "-".join(str(log.robots[robot].robot) for robot in group)
+            names = group_name([log.robots[robot].robot for robot in group])
             draw_joint_map(folder.path / f"joint_map_{names}.png", log, result, paths, group)
     finish(console, folder, folder.write_metrics(scores), json)
 
@@ -116,8 +121,14 @@ def _write_paths(folder: "RunFolder", log: "MrclamLog", result: "Replay") -> Non
             folder.write_trajectory(f"robot{own.robot}_truth", own.truth)
 
 
-def _print_tables(console: Console, metrics: dict[str, Any]) -> None:
-    """Print scores of paths, maps and merges."""
+def _print_tables(console: Console, metrics: dict[str, Any], with_poses: set[int]) -> None:
+    """Print scores of paths, maps and merges, as far as they are known.
+
+    Args:
+        console: Where to.
+        metrics: Content of `metrics.json`.
+        with_poses: Numbers of the robots whose log has true poses.
+    """
     aligned, start = "after the best rigid fit", "from the true start, no fit"
     paths = {
         f"path (m),\n{aligned}": "ate_aligned_m", "odometry,\nfitted too": "dead_reckoning_ate_aligned_m",
@@ -125,23 +136,35 @@ def _print_tables(console: Console, metrics: dict[str, Any]) -> None:
     }  # fmt: skip
     maps = {
         f"RMSE (m),\n{aligned}": "map_rmse_m", "recall": "map_recall", "precision": "map_precision",
-        f"map error (m),\n{start}": "map_error",
+        f"map error E (m),\nerrors cut at 1 m,\n{start}": "map_error",
     }  # fmt: skip
     for title, columns in (("Paths", paths), ("Maps", maps)):
-        table = Table(title=title)
-        for name in ("robot", *columns):
-            table.add_column(name, justify="right")
-        for row in metrics["robots"]:
-            table.add_row(str(row["robot"]), *(_number(row[key]) for key in columns.values()))
-        console.print(table)
+        rows = [row for row in metrics["robots"] if any(row[key] is not None for key in columns.values())]
+        shown = {name: key for name, key in columns.items() if any(row[key] is not None for row in rows)}
+        if rows:
+            table = Table(title=title)
+            for name in ("robot", *shown):
+                table.add_column(name, justify="right")
+            for row in rows:
+                table.add_row(str(row["robot"]), *(_number(row[key]) for key in shown.values()))
+            console.print(table)
+        unknown = [row["robot"] for row in metrics["robots"] if row not in rows]
+        missed = [robot for robot in unknown if title == "Paths" and robot in with_poses]
+        for robots, why in (
+            ([robot for robot in unknown if robot not in missed], "no ground truth in this folder"),
+            (missed, "fewer than two true poses during this replay"),
+        ):
+            if robots:
+                console.print(f"{title} of robots {', '.join(map(str, robots))}: {why}.", highlight=False)
     merges = Table(title="Merges")
-    for name in ("time (s)", "group", "with", "shared landmarks", "off by (m)", "off by (°)"):
+    errors = {"off by (m)": "error_m", "off by (°)": "error_deg"}
+    errors = {name: key for name, key in errors.items() if any(row[key] is not None for row in metrics["merges"])}
+    for name in ("time (s)", "group", "with", "shared landmarks", *errors):
         merges.add_column(name, justify="right")
     for row in metrics["merges"]:
         sides = [", ".join(map(str, row[side])) for side in ("robots_a", "robots_b")]
-        merges.add_row(
-            f"{row['time_s']:.1f}", *sides, str(row["landmarks"]), _number(row["error_m"]), _number(row["error_deg"])
-        )
+        off = [_number(row[key]) for key in errors.values()]
+        merges.add_row(f"{row['time_s']:.1f}", *sides, str(row["landmarks"]), *off)
     console.print(merges if metrics["merges"] else "No merge.")
     console.print("Groups at the end: " + "; ".join(", ".join(map(str, group)) for group in metrics["groups"]))
 

@@ -18,17 +18,18 @@ from slam_backend.filter import FastSlam
 from slam_backend.filter_options import FilterOptions
 from slam_backend.frontend import DESCRIPTORS, KINDS, CornerOptions, FrontEndOptions, StereoFrame, StereoFrontEnd
 from slam_backend.frontend.odometry import camera_motion
-from slam_backend.geometry import compose, inverse
 from slam_backend.measurements import Measurements
 from slam_backend.motion import OdometryModel
 from slam_backend.readers.kitti_images import KittiImages
 from slam_backend.reports import StepReport
 from training.plain_config import PlainConfig
 from training.replay_config import check_common
+from training.replay_kitti import mean_drift
 from training.replay_one import (
     PLANAR_GATE,
     OneReplay,
     PositionScore,
+    end_errors,
     metrics_of,
     path_length,
     replay_one,
@@ -203,6 +204,7 @@ class ImagesScore:
         odometry: Score of the visual odometry alone.
         end_error: Distance at the last known pose, from the true start, no fit [m].
         odometry_end_error: Likewise of the visual odometry [m].
+        drifts: Mean errors of the motions over segments, of the estimate and of the visual odometry; see `mean_drift`.
     """
 
     truth: FloatArray
@@ -211,6 +213,7 @@ class ImagesScore:
     odometry: PositionScore
     end_error: float
     odometry_end_error: float
+    drifts: tuple[float, float]
 
 
 def score_images(result: OneReplay, log: KittiImages) -> ImagesScore | None:
@@ -220,12 +223,8 @@ def score_images(result: OneReplay, log: KittiImages) -> ImagesScore | None:
     truth = log.truth.poses[: len(result.times)]
     paths = (result.path, result.reckoned)
     scores = score_paths(paths, truth)
-    starts = [compose(truth[0], inverse(path[0])) for path in paths]
-    ends = [
-        float(np.hypot(*(compose(start, path[len(truth) - 1]) - truth[-1])[:2]))
-        for start, path in zip(starts, paths, strict=True)
-    ]
-    return ImagesScore(truth, path_length(truth), scores[0], scores[1], ends[0], ends[1])
+    ends, drifts = end_errors(paths, truth), (mean_drift(paths[0], truth), mean_drift(paths[1], truth))
+    return ImagesScore(truth, path_length(truth), scores[0], scores[1], ends[0], ends[1], drifts)
 
 
 def summarise_images(result: ImagesReplay, scored: ImagesScore | None) -> dict[str, Any]:
@@ -236,6 +235,8 @@ def summarise_images(result: ImagesReplay, scored: ImagesScore | None) -> dict[s
         "end_error_m": scored.end_error if scored else nan,
         "end_error_percent": 100.0 * scored.end_error / scored.length if scored else nan,
         "visual_odometry_end_error_m": scored.odometry_end_error if scored else nan,
+        "mean_drift": scored.drifts[0] if scored else nan,
+        "visual_odometry_mean_drift": scored.drifts[1] if scored else nan,
     }
     return metrics_of(
         one,

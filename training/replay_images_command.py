@@ -15,7 +15,7 @@ def replay_folder_of_images(values: Mapping[str, Any], out: Path | None, json: P
     from slam_backend.readers.kitti_images import load_kitti_images
     from training.figures_images import draw_frame, expected_pixels
     from training.replay_images import ImagesConfig, replay_images, score_images, summarise_images
-    from training.replay_one_command import finish_one
+    from training.replay_one_command import drift_told, end_told, finish_one
 
     chosen = ImagesConfig.from_mapping(values)
     log = load_kitti_images(chosen.path, chosen.truth, chosen.duration)
@@ -30,11 +30,8 @@ def replay_folder_of_images(values: Mapping[str, Any], out: Path | None, json: P
         f"the plane. Front end and odometry took {1e3 * result.front_end_seconds / len(log.times):.0f} ms a frame."
     ]
     if scored is not None:
-        ends = [100.0 * error / scored.length for error in (scored.end_error, scored.odometry_end_error)]
-        told.append(
-            f"End of {scored.length:.1f} m: off by {scored.end_error:.2f} m, {ends[0]:.2f} % of the path "
-            f"(visual odometry alone {ends[1]:.2f} %)."
-        )
+        ends = scored.end_error, scored.odometry_end_error
+        told += [drift_told(scored.drifts), end_told(ends, scored.length, "visual odometry alone")]
     landmarks = one.landmarks
     counts = dict(zip(landmarks.ids.tolist(), landmarks.counts.tolist(), strict=True))
     often = landmarks.subset(landmarks.counts >= 3)

@@ -14,7 +14,16 @@ from slam_backend.readers.kitti import KittiLog
 from slam_backend.readers.kitti_steps import make_camera, motion_noise, steps
 from training.plain_config import PlainConfig
 from training.replay_config import check_common
-from training.replay_one import PLANAR_GATE, OneReplay, PositionScore, metrics_of, path_length, replay_one, score_paths
+from training.replay_one import (
+    PLANAR_GATE,
+    OneReplay,
+    PositionScore,
+    end_errors,
+    metrics_of,
+    path_length,
+    replay_one,
+    score_paths,
+)
 
 # A track has its number for a descriptor, so that none is taken for another, and unlike a given identity leaves the
 # gate in force: tracks on other cars are refused, and a refused track never starts a second landmark.
@@ -75,6 +84,7 @@ class KittiScore:
         loop: Steps (earlier, later) at which the car was at one place again, nearest of all; None if it never was.
         loop_error: Error [m] of the estimated motion between these two steps; NaN if there are none.
         drifts: Mean errors of the motions over segments, of the estimate and of dead reckoning; see `mean_drift`.
+        ends: Errors at the last true pose, from the true start, no fit [m], of the estimate and of dead reckoning.
     """
 
     truth: FloatArray
@@ -85,6 +95,7 @@ class KittiScore:
     loop: tuple[int, int] | None
     loop_error: float
     drifts: tuple[float, float]
+    ends: tuple[float, float]
 
 
 def replay(log: KittiLog, config: KittiConfig, on_step: Callable[[float], None] = lambda done: None) -> OneReplay:
@@ -126,7 +137,8 @@ def score(result: OneReplay, log: KittiLog) -> KittiScore | None:
         motions = [between(path[loop[0]], path[loop[1]]) for path in (paths[0], truth)]
         error = float(np.hypot(*(motions[0] - motions[1])[:2]))
     drifts = (mean_drift(paths[0], truth), mean_drift(paths[1], truth))
-    return KittiScore(truth, paths[0], paths[1], scores[0], scores[1], loop, error, drifts)
+    ends = end_errors(paths, truth)
+    return KittiScore(truth, paths[0], paths[1], scores[0], scores[1], loop, error, drifts, (ends[0], ends[1]))
 
 
 def mean_drift(path: FloatArray, truth: FloatArray) -> float:
@@ -164,8 +176,12 @@ def find_loop(truth: FloatArray) -> tuple[int, int] | None:
 
 def summarise(result: OneReplay, scored: KittiScore | None) -> dict[str, Any]:
     """Return the content of `metrics.json`; what cannot be known is NaN, as are errors of the map."""
+    length = path_length(scored.truth) if scored else float("nan")
     own = {
-        "true_path_m": path_length(scored.truth) if scored else float("nan"),
+        "true_path_m": length,
+        "end_error_m": scored.ends[0] if scored else float("nan"),
+        "end_error_percent": 100.0 * scored.ends[0] / length if scored else float("nan"),
+        "dead_reckoning_end_error_m": scored.ends[1] if scored else float("nan"),
         "loop_error_m": scored.loop_error if scored else float("nan"),
         "mean_drift": scored.drifts[0] if scored else float("nan"),
         "dead_reckoning_mean_drift": scored.drifts[1] if scored else float("nan"),

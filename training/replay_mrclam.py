@@ -173,7 +173,9 @@ def replay(
     robots, num_steps = range(len(log.robots)), len(readings.times)
     team = _make_team(log, config)
     contacts = np.eye(len(robots), dtype=np.bool_) if config.alone else None
-    flat = np.column_stack([log.positions, np.zeros(len(log.positions))])
+    flat = np.zeros((len(log.subjects), 3))
+    if log.positions is not None:
+        flat[:, :2] = log.positions
     ledger = ClaimLedger(len(robots), flat, np.ones(len(flat), dtype=np.bool_), cutoff=1.0)
     paths = np.zeros((len(robots), num_steps, 3))
     merges: list[Merge] = []

@@ -139,6 +139,13 @@ def score_paths(paths: Iterable[FloatArray], truth: FloatArray) -> list[Position
     ]
 
 
+def end_errors(paths: Iterable[FloatArray], truth: FloatArray) -> list[float]:
+    """Return how far paths (T, 3) are off [m] at the last of n true poses (n, 3), from the true start, no fit."""
+    last = len(truth) - 1
+    ends = [compose(compose(truth[0], inverse(path[0])), path[last]) - truth[last] for path in paths]
+    return [float(np.hypot(end[0], end[1])) for end in ends]
+
+
 def path_length(path: FloatArray) -> float:
     """Return the length [m] of a path (T, 2) or (T, 3)."""
     return float(np.hypot(*np.diff(path[:, :2], axis=0).T).sum())

@@ -1,5 +1,6 @@
 """The commands `vslam replay victoria` and `vslam replay kitti`: one robot's log, one filter."""
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -20,6 +21,7 @@ if TYPE_CHECKING:  # what computes is imported when the command runs, so that --
     from training.replay_one import OneReplay, PositionScore
     from training.run_folder import RunFolder
 
+NO_TRUTH = "Errors: no ground truth in this folder."
 VICTORIA = Path("victoria_park")
 KITTI = Path("kitti_landmarks")
 
@@ -53,15 +55,21 @@ def replay_victoria(
         result = replay(log, chosen, on_step)
     scored = score(result, log)
     metrics = summarise(result, scored)
-    gps = metrics["gps"]
-    told = (
-        f"At {gps['fixes']} GPS fixes: median {gps['median_m']:.2f} m, 95 % within {gps['percentile_95_m']:.2f} m, "
-        f"worst {gps['worst_m']:.1f} m. Trees seen ten times or more: {metrics['landmarks_seen_ten_times']}."
-    )
+    told = [f"Trees seen ten times or more: {metrics['landmarks_seen_ten_times']}.", *log.notes]
+    if scored is not None:
+        gps = metrics["gps"]
+        told.insert(
+            0,
+            f"At {gps['fixes']} GPS fixes: median {gps['median_m']:.2f} m, 95 % within {gps['percentile_95_m']:.2f} m, "
+            f"worst {gps['worst_m']:.1f} m.",
+        )
     finish_one(
-        console, folder, json, result, metrics, [told], "Victoria Park",
-        paths=(scored.path, scored.reckoned), scores=(scored.estimate, scored.odometry), known=scored.fixes,
+        console, folder, json, result, {**metrics, "notes": log.notes}, told, "Victoria Park",
+        paths=(scored.path, scored.reckoned) if scored else (result.path, result.reckoned),
+        scores=(scored.estimate, scored.odometry) if scored else None,
+        known=scored.fixes if scored else None,
         known_as="GPS",
+        unknown=NO_TRUTH if log.gps is None else "Fewer than two GPS fixes during this replay: no errors are known.",
     )  # fmt: skip
 
 
@@ -88,6 +96,7 @@ def replay_kitti(
     from slam_backend.readers.kitti import load_kitti
     from slam_backend.readers.kitti_images import holds_images
     from training.replay_kitti import KittiConfig, replay, score, summarise
+    from training.replay_one import path_length
 
     command = "replay kitti"
     given = {"path": path, "truth": truth, "duration": duration, "particles": particles, "estimator": estimator}
@@ -104,6 +113,8 @@ def replay_kitti(
         result = replay(log, chosen, on_step)
     scored = score(result, log)
     told = []
+    if scored is not None:
+        told += [drift_told(scored.drifts), end_told(scored.ends, path_length(scored.truth), "odometry")]
     if scored is not None and scored.loop is not None:
         seconds = [float(result.times[step] - result.times[0]) for step in scored.loop]
         told.append(
@@ -133,6 +144,7 @@ def finish_one(
     known: "FloatArray | None",
     known_as: str = "true path",
     truth: "Trajectory | None" = None,
+    unknown: str = NO_TRUTH,
 ) -> None:
     """Show and keep what came of one robot's log.
 
@@ -149,14 +161,17 @@ def finish_one(
         known: Positions (n, 2 or 3) [m], world frame; None likewise.
         known_as: What the picture calls them.
         truth: The true path, to be kept beside the others.
+        unknown: Line in place of the table where there are no scores.
     """
     from training.figures_replay_one import draw_one
     from training.run_folder import plain
+    from training.run_maps import write_maps
 
     shown = plain(metrics)
-    print_table(console, shown, result)
-    for line in filter(None, [*told, sentence_of(metrics["rejuvenations"])]):
-        console.print(line, highlight=False)
+    print_table(console, shown, result, unknown)
+    told = [*told, sentence_of(metrics["rejuvenations"]), write_maps(folder, {"1": result.landmarks})]
+    for line in filter(None, told):
+        console.print(line, soft_wrap=True, highlight=False)
     flat = tuple(path[:, :2] for path in paths)
     draw_one(
         folder.path / "replay.png", title, result, (flat[0], flat[1]), scores,
@@ -166,16 +181,37 @@ def finish_one(
     finish(console, folder, folder.write_metrics(shown), json)
 
 
-def print_table(console: Console, metrics: dict[str, Any], result: "OneReplay") -> None:
-    """Print how far path and dead reckoning are off, what became of the measurements, and the speed."""
-    table = Table(title="RMS distance to the truth [m]")
-    for name in ("", "after the best rigid fit", "from the start, no fit"):
-        table.add_column(name, justify="right")
+def drift_told(drifts: tuple[float, float]) -> str:
+    """Return a line about KITTI's drift of the estimate and of odometry; "" where the true path is too short."""
+    if not all(map(math.isfinite, drifts)):
+        return ""
+    return (
+        f"Drift (KITTI's: mean error of the motion over 100, 200, ... 800 m): {100.0 * drifts[0]:.2f} % "
+        f"(odometry {100.0 * drifts[1]:.2f} %)."
+    )
+
+
+def end_told(ends: tuple[float, float], length: float, other: str) -> str:
+    """Return a line about errors at the end [m] of the estimate and of the `other`, after a true path [m]."""
+    shares = [100.0 * error / length for error in ends]
+    return (
+        f"End of {length:.1f} m, from the start, no fit: off by {ends[0]:.2f} m, {shares[0]:.2f} % of the path "
+        f"({other} {ends[1]:.2f} m, {shares[1]:.2f} %)."
+    )
+
+
+def print_table(console: Console, metrics: dict[str, Any], result: "OneReplay", unknown: str = NO_TRUTH) -> None:
+    """Print how far path and dead reckoning are off or that it is `unknown`, what became of the measurements, speed."""
     row = metrics["robots"][0]
-    for name, key in (("estimate", "ate"), ("odometry", "dead_reckoning_ate")):
-        figures = (row[f"{key}_aligned_m"], row[f"{key}_start_m"])
-        table.add_row(name, *("-" if value is None else f"{value:.2f}" for value in figures))
-    console.print(table)
+    if row["ate_aligned_m"] is None:
+        console.print(unknown, highlight=False)
+    else:
+        table = Table(title="RMS distance to the truth [m]")
+        for name in ("", "after the best rigid fit", "from the start, no fit"):
+            table.add_column(name, justify="right")
+        for name, key in (("estimate", "ate"), ("odometry", "dead_reckoning_ate")):
+            table.add_row(name, *(f"{row[f'{key}_{kind}_m']:.2f}" for kind in ("aligned", "start")))
+        console.print(table)
     made = metrics["measurements"]
     console.print(
         f"{metrics['landmarks']} landmarks; of the measurements {made['matched']} matched, {made['created']} began "

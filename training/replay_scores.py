@@ -89,8 +89,10 @@ def align_to_truth(landmarks: LandmarkMap, claims: IntArray, log: MrclamLog) -> 
     """Fit a map with claims (N,), rows of `MrclamLog.positions`, to the true landmarks.
 
     Returns:
-        The fitted map; None if it claims fewer than two different landmarks.
+        The fitted map; None if it claims fewer than two different landmarks, or the log has no true ones.
     """
+    if log.positions is None:
+        return None
     by_count = np.argsort(-landmarks.counts, kind="stable")
     barcodes, first = np.unique(claims[by_count], return_index=True)
     if len(barcodes) < 2:
@@ -126,6 +128,7 @@ def summarise(replay: Replay, log: MrclamLog, paths: Sequence[PathScore | None])
     start frame at the true start pose, without any fitting.
     """
     numbers = [robot.robot for robot in log.robots]
+    none = float("nan") if log.positions is None else 0.0  # share of the true landmarks that a map without a fit holds
     named = [[numbers[robot] for robot in group] for group in replay.groups]
     nan = float("nan")
     robots = []
@@ -143,8 +146,8 @@ def summarise(replay: Replay, log: MrclamLog, paths: Sequence[PathScore | None])
                 "map_rmse_m": aligned.score.rmse if aligned else nan,
                 "map_rmse_aligned_m": aligned.score.rmse if aligned else nan,
                 "map_rmse_start_m": start_rmse,
-                "map_recall": aligned.score.recall if aligned else 0.0,
-                "map_precision": aligned.score.precision if aligned else 0.0,
+                "map_recall": aligned.score.recall if aligned else none,
+                "map_precision": aligned.score.precision if aligned else none,
                 "map_error": start_error,
             }
         )
@@ -167,13 +170,16 @@ def summarise(replay: Replay, log: MrclamLog, paths: Sequence[PathScore | None])
     return {
         "robots": robots, "merges": merges, "groups": named, "coverage": nan,
         "attempts": replay.attempts, "rejuvenations": replay.rejuvenations, "duration_s": duration,
+        "notes": log.notes,
     }  # fmt: skip
 
 
 def _start_frame_errors(
     landmarks: LandmarkMap, claims: IntArray, path: PathScore, log: MrclamLog
 ) -> tuple[float, float]:
-    """Return map error and RMSE [m] with the start frame at the true start pose, without any fitting."""
+    """Return map error and RMSE [m] with the start frame at the true start pose, without fitting; NaN if unknown."""
+    if log.positions is None:
+        return float("nan"), float("nan")
     means, truths = _flat(landmarks.moved(path.world_from_start).means), _flat(log.positions)
     return map_error(means, claims, truths), map_rmse(means, truths, claims).rmse
 

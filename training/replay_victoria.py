@@ -7,7 +7,7 @@ from typing import Any, Literal
 import numpy as np
 
 from slam_backend.camera import ROBOT_FROM_CAMERA, StereoCamera
-from slam_backend.errors import FloatArray, bad_argument
+from slam_backend.errors import FloatArray
 from slam_backend.filter import FastSlam
 from slam_backend.filter_options import FilterOptions
 from slam_backend.geometry import compose, transform_points
@@ -132,16 +132,13 @@ def describe_by_place(frame: Measurements, pose: FloatArray) -> Measurements:
     return Measurements(frame.points, transform_points(pose, ahead)[:, :2].astype(np.float32), frame.covariances)
 
 
-def score(result: OneReplay, log: VictoriaLog) -> VictoriaScore:
-    """Score a replay at the GPS fixes, which are of the antenna, beside the laser.
-
-    Raises:
-        ValueError: If fewer than two fixes fall into the replay.
-    """
+def score(result: OneReplay, log: VictoriaLog) -> VictoriaScore | None:
+    """Score a replay at the GPS fixes, which are of the antenna, beside the laser; None if there are fewer than two."""
+    if log.gps is None:
+        return None
     during = (log.gps[:, 0] >= result.times[0]) & (log.gps[:, 0] <= result.times[-1])
     if np.count_nonzero(during) < 2:
-        cure = "Replay more of the log."
-        raise bad_argument("duration", "two GPS fixes or more", f"a stretch with {np.count_nonzero(during)}", cure)
+        return None
     stamps, fixes = log.gps[during, 0], log.gps[during, 1:]
     antenna = np.array([*SENSOR[:2], 0.0])
     paths = [compose(poses, antenna) for poses in (result.path, result.reckoned)]
@@ -154,12 +151,16 @@ def score(result: OneReplay, log: VictoriaLog) -> VictoriaScore:
     return VictoriaScore(fixes, paths[0][:, :2], paths[1][:, :2], scores[0], scores[1])
 
 
-def summarise(result: OneReplay, scored: VictoriaScore) -> dict[str, Any]:
+def summarise(result: OneReplay, scored: VictoriaScore | None) -> dict[str, Any]:
     """Return the content of `metrics.json`; where the trees really stand is not known, so errors of maps are NaN.
 
     `ate_start_m` puts the start frame where the first 30 m of the path fit the fixes. `gps` tells of the distances to
-    the fixes after the SE(2) alignment of the whole path: among the fixes are some that jumped.
+    the fixes after the SE(2) alignment of the whole path: among the fixes are some that jumped. Without fixes it is
+    None.
     """
+    often = int(np.count_nonzero(result.landmarks.counts >= 10))
+    if scored is None:
+        return metrics_of(result, None, {}, gps=None, landmarks_seen_ten_times=often)
     errors = scored.estimate.errors
     gps = {
         "fixes": len(scored.fixes),
@@ -168,5 +169,4 @@ def summarise(result: OneReplay, scored: VictoriaScore) -> dict[str, Any]:
         "percentile_95_m": float(np.quantile(errors, 0.95)),
         "worst_m": float(errors.max()),
     }
-    often = int(np.count_nonzero(result.landmarks.counts >= 10))
     return metrics_of(result, (scored.estimate, scored.odometry), {}, gps=gps, landmarks_seen_ten_times=often)

@@ -52,6 +52,7 @@ def run(
     from training.figures import draw_errors, draw_maps
     from training.run_config import RunConfig
     from training.run_folder import plain
+    from training.run_maps import group_name, write_maps
     from training.run_tables import print_tables
 
     if action_type is None and policy is not None and "continuous" not in (known := action_types(policy)):
@@ -79,6 +80,8 @@ def run(
     print_tables(console, scores)
     metrics = folder.write_metrics(scores)
     _write_paths(folder, record)
+    maps = {group_name(group): record.maps[group[0]] for group in record.groups}
+    console.print(write_maps(folder, maps), soft_wrap=True, highlight=False)
     draw_maps(record, folder.path / "map.png")
     draw_errors(record, folder.path / "error.png")
     finish(console, folder, metrics, json)

@@ -8,7 +8,7 @@ from rich.markup import escape
 from rich.table import Table
 
 ROWS = (
-    ("map error E [m]", "map_error", "{:.3f}", 1.0),
+    ("map error E [m], errors cut at 1 m", "map_error", "{:.3f}", 1.0),
     ("map RMSE of matched landmarks [m]", "map_rmse_m", "{:.3f}", 1.0),
     ("recall [%]", "map_recall", "{:.1f}", 100.0),
     ("precision [%]", "map_precision", "{:.1f}", 100.0),

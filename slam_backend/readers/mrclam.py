@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from slam_backend.errors import BoolArray, FloatArray, IntArray, bad_argument, check_float
+from slam_backend.readers.time_order import MOST_JITTER, sorted_note, steps_back, time_order
 from slam_backend.trajectory import Trajectory
 
 ROBOTS = (1, 2, 3, 4, 5)  # subjects with these numbers are the robots themselves
@@ -37,12 +38,19 @@ class MrclamLog:
     Attributes:
         robots: One entry per robot asked for, in that order.
         subjects: (N,) int64. Numbers of the landmarks that have a barcode, ascending.
-        positions: (N, 2) float64 [m]. Where they really are, world frame.
+        positions: (N, 2) float64 [m]. True positions of these, world frame; None where the log has none.
+        notes: Lines about the files: which were sorted by time, and where times hardly can be right.
     """
 
     robots: tuple[RobotLog, ...]
     subjects: IntArray
-    positions: FloatArray
+    positions: FloatArray | None
+    notes: tuple[str, ...] = ()
+
+    @property
+    def has_truth(self) -> bool:
+        """Whether true landmarks or the true poses of a robot are known."""
+        return self.positions is not None or any(robot.truth is not None for robot in self.robots)
 
 
 def load_mrclam(
@@ -53,9 +61,12 @@ def load_mrclam(
 ) -> MrclamLog:
     """Read a folder such as `MRCLAM_Dataset7`.
 
+    Rows up to `MOST_JITTER` back in time are sorted; the notes of the log say so. Of commands at one time the last one
+    in the file holds, of true poses at one time the first one counts, sightings at one time keep the order of the file.
+
     Args:
-        path: Folder with `Barcodes.dat`, `Landmark_Groundtruth.dat` and, for each robot i, `Robot<i>_Odometry.dat`,
-            `Robot<i>_Measurement.dat` and, where known, `Robot<i>_Groundtruth.dat`.
+        path: Folder with `Barcodes.dat` and, for each robot i, `Robot<i>_Odometry.dat` and `Robot<i>_Measurement.dat`.
+            Where the truth is known: `Landmark_Groundtruth.dat` and `Robot<i>_Groundtruth.dat`.
         robots: Numbers of the robots to read, 1 to 5, each once. None: all whose odometry is there.
         duration: Keep this many seconds from the earliest command on [s]. None: all.
         truth: A file of the true poses of the one robot that is read, for folders that lack it: rows of time, x, y and
@@ -65,39 +76,60 @@ def load_mrclam(
         The log. True poses are kept whole, so that any time of the kept readings can be looked up.
 
     Raises:
-        ValueError: If the folder or a file is missing, a line is malformed (the text names file and line), times go
-            back, a robot is unknown, a sighted landmark has no true position, or `truth` is given for several robots.
+        ValueError: If the folder or a file is missing, a line is malformed (the text names file and line), a time lies
+            more than `MOST_JITTER` back, all sightings come before a robot's odometry, a robot is unknown,
+            `Landmark_Groundtruth.dat` lacks a landmark, or `truth` is given for several robots.
     """
     folder = Path(path)
     if not folder.is_dir():
         raise bad_argument("path", "a folder of the MR.CLAM log", "no such folder", f"Check {str(path)!r}.")
     numbers = _check_robots(folder, robots)
-    barcodes = _read_table(folder / "Barcodes.dat", ("subject", "barcode"))
+    barcodes, _ = _read_table(folder / "Barcodes.dat", ("subject", "barcode"))
     subject_of = {int(barcode): int(subject) for subject, barcode in barcodes}
-    columns = ("subject", "x", "y", "sigma_x", "sigma_y")
-    place_of = {int(row[0]): row[1:3] for row in _read_table(folder / "Landmark_Groundtruth.dat", columns)}
     subjects = np.array(sorted(set(subject_of.values()) - set(ROBOTS)), dtype=np.int64)
-    unplaced = [int(subject) for subject in subjects if int(subject) not in place_of]
-    if unplaced:
-        raise bad_argument(
-            "path", "a position of each landmark", f"no position of subject {unplaced[0]}",
-            f"Add it to {folder / 'Landmark_Groundtruth.dat'}.",
-        )  # fmt: skip
-    positions = np.array([place_of[int(subject)] for subject in subjects]).reshape(-1, 2)
+    positions = _read_positions(folder / "Landmark_Groundtruth.dat", subjects)
     if truth is not None and len(numbers) != 1:
         cure = "Name the robot whose poses these are with robots."
         raise bad_argument("truth", "a file of one robot's poses", f"a log of robots {numbers}", cure)
     if truth is not None and not Path(truth).is_file():
         raise bad_argument("truth", "a file of true poses", "no such file", f"Check {str(truth)!r}.")
     truths = {numbers[0]: Path(truth)} if truth is not None else {}
-    logs = [_read_robot(folder, robot, subject_of, truths.get(robot)) for robot in numbers]
+    sorted_files: list[str] = []
+    logs = [_read_robot(folder, robot, subject_of, truths.get(robot), sorted_files) for robot in numbers]
+    notes = sorted_note(sorted_files) + tuple(note for log in logs for note in _overlap_notes(log))
     if duration is not None:
         seconds = check_float("duration", duration, "Give seconds, or None for the whole log.", above=0.0)
         start = min(log.commands[0, 0] for log in logs)
         logs = [_cut(log, start + seconds) for log in logs]
-    for array in (subjects, positions, *(a for log in logs for a in (log.commands, log.sightings))):
+    arrays = [subjects, *(a for log in logs for a in (log.commands, log.sightings))]
+    for array in arrays if positions is None else [*arrays, positions]:
         array.setflags(write=False)
-    return MrclamLog(tuple(logs), subjects, positions)
+    return MrclamLog(tuple(logs), subjects, positions, notes)
+
+
+def _overlap_notes(log: RobotLog) -> Iterator[str]:
+    """Yield a line for each kind of reading that does not overlap a robot's odometry: clocks differ, probably."""
+    first, last = log.commands[0, 0], log.commands[-1, 0]
+    stamps = {"sightings": log.sightings[:, 0], "true poses": np.empty(0) if log.truth is None else log.truth.times}
+    for name, times in stamps.items():
+        if len(times) and (times[0] > last or times[-1] < first):
+            yield (
+                f"Robot {log.robot}: no overlap of its {name} ({times[0]:.1f} to {times[-1]:.1f} s) with its odometry "
+                f"({first:.1f} to {last:.1f} s): check that their times are of one clock."
+            )
+
+
+def _read_positions(file: Path, subjects: IntArray) -> FloatArray | None:
+    """Return the true positions (N, 2) [m] of landmarks (N,), or None if there is no such file."""
+    if not file.exists():
+        return None
+    rows, _ = _read_table(file, ("subject", "x", "y", "sigma_x", "sigma_y"))
+    place_of = {int(row[0]): row[1:3] for row in rows}
+    unplaced = [int(subject) for subject in subjects if int(subject) not in place_of]
+    if unplaced:
+        got = f"no position of subject {unplaced[0]}"
+        raise bad_argument("path", "a position of each landmark", got, f"Add it to {file}.")
+    return np.array([place_of[int(subject)] for subject in subjects]).reshape(-1, 2)
 
 
 def _check_robots(folder: Path, robots: Sequence[int] | None) -> tuple[int, ...]:
@@ -115,16 +147,27 @@ def _check_robots(folder: Path, robots: Sequence[int] | None) -> tuple[int, ...]
     return numbers
 
 
-def _read_robot(folder: Path, robot: int, subject_of: dict[int, int], truth_file: Path | None) -> RobotLog:
-    """Read the files of one robot; what it saw of other robots is left out."""
-    commands = _read_table(folder / f"Robot{robot}_Odometry.dat", ("time", "velocity", "angular_velocity"))
-    rows = _read_table(folder / f"Robot{robot}_Measurement.dat", ("time", "barcode", "range", "bearing"), empty=True)
+def _read_robot(
+    folder: Path, robot: int, subject_of: dict[int, int], truth_file: Path | None, sorted_files: list[str]
+) -> RobotLog:
+    """Read the files of one robot, and add those that had to be sorted; what it saw of other robots is left out."""
+    commands, words = _read_table(folder / f"Robot{robot}_Odometry.dat", ("time", "velocity", "angular_velocity"))
+    sorted_files.append(words)
+    columns = ("time", "barcode", "range", "bearing")
+    rows, words = _read_table(folder / f"Robot{robot}_Measurement.dat", columns, empty=True)
+    sorted_files.append(words)
+    if len(rows) and rows[-1, 0] < commands[0, 0] - MOST_JITTER:
+        expected = f"sightings of robot {robot} since its first odometry at {commands[0, 0]:.3f} s"
+        got = f"a log of sightings from {rows[0, 0]:.3f} to {rows[-1, 0]:.3f} s"
+        cure = f"Check that the times in {folder / f'Robot{robot}_Measurement.dat'} are of the same clock."
+        raise bad_argument("path", expected, got, cure)
     seen = np.array([subject_of.get(int(barcode), 0) for barcode in rows[:, 1]], dtype=np.float64)
     sightings = np.column_stack([rows[:, 0], seen, rows[:, 2:]])[seen > max(ROBOTS)]
     own = folder / f"Robot{robot}_Groundtruth.dat"
     truth = None
     if truth_file is not None or own.is_file():
-        poses = _read_table(own if truth_file is None else truth_file, ("time", "x", "y", "theta"))
+        poses, words = _read_table(own if truth_file is None else truth_file, ("time", "x", "y", "theta"))
+        sorted_files.append(words)
         fresh = np.diff(poses[:, 0], prepend=-np.inf) > 0.0  # a repeated stamp says nothing new
         truth = Trajectory(poses[fresh, 0], poses[fresh, 1:])
     return RobotLog(robot, commands, sightings, truth)
@@ -138,14 +181,15 @@ def _cut(log: RobotLog, end: float) -> RobotLog:
     )
 
 
-def _read_table(file: Path, columns: tuple[str, ...], empty: bool = False) -> FloatArray:
-    """Return the rows (n, columns) of a file of numbers, with blanks or commas between.
+def _read_table(file: Path, columns: tuple[str, ...], empty: bool = False) -> tuple[FloatArray, str]:
+    """Return the rows (n, columns) of a file of numbers, with blanks or commas between, and what `time_order` says.
 
-    Comments after `#`, empty lines and a first line of names are skipped.
+    Comments after `#`, empty lines and a first line of names are skipped. Rows that begin with a time are in its order.
 
     Raises:
         ValueError: If the file is missing or, unless `empty` says otherwise, has no rows; if a line does not hold one
-            finite number per column; if subjects or barcodes are not whole, ranges not positive, or times go back.
+            finite number per column; if subjects or barcodes are not whole, ranges not positive, or times go back by
+            more than `MOST_JITTER`.
     """
     if not file.is_file():
         raise bad_argument("path", f"a folder with {file.name}", "no such file", f"Check {str(file)!r}.")
@@ -167,7 +211,10 @@ def _read_table(file: Path, columns: tuple[str, ...], empty: bool = False) -> Fl
         if broken.any():
             number = numbers[int(np.argmax(broken))]
             raise _bad_line(file, number, lines[number - 1], columns, f" with {rule}")
-    return table
+    if columns[0] != "time":
+        return table, ""
+    order, words = time_order(file.name, table[:, 0])
+    return table[order], words
 
 
 def _faults(table: FloatArray, columns: tuple[str, ...]) -> Iterator[tuple[str, BoolArray]]:
@@ -179,7 +226,7 @@ def _faults(table: FloatArray, columns: tuple[str, ...]) -> Iterator[tuple[str, 
         elif name == "range":
             yield "a range > 0", column <= 0.0
         elif name == "time":
-            yield "a time not before that of the line above", np.diff(column, prepend=-np.inf) < 0.0
+            yield f"a time at most {MOST_JITTER:g} s before that of a line above", steps_back(column) > MOST_JITTER
 
 
 def _names(body: str) -> bool:

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.io import loadmat
 
 from slam_backend.errors import FloatArray, bad_argument, check_float
+from slam_backend.readers.time_order import MOST_JITTER, sorted_note, steps_back, time_order
 
 CONTROLS_FILE = "aa3_dr.mat"
 TREES_FILE = "VictoriaParkSinSincronizar.mat"
@@ -30,34 +31,40 @@ class VictoriaLog:
         scan_times: (T,) float64 [s]. One for each laser scan.
         scans: T arrays (k, 3) float64 [m, rad, m]: range, bearing and diameter of each tree that was made out;
             bearings are positive to the left of straight ahead.
-        gps: (g, 3) float64 [s, m, m]. Time, east, north of each fix; there are holes between them.
+        gps: (g, 3) float64 [s, m, m]. Time, east, north of each fix; there are holes between them. None where the
+            folder has none.
+        notes: Lines about what the reader did to the files: which were sorted by time.
     """
 
     controls: FloatArray
     scan_times: FloatArray
     scans: tuple[FloatArray, ...]
-    gps: FloatArray
+    gps: FloatArray | None
+    notes: tuple[str, ...] = ()
 
 
 def load_victoria(path: str | Path, duration: float | None = None) -> VictoriaLog:
     """Read a folder such as that of the Victoria Park data set.
 
+    Entries up to `MOST_JITTER` back in time are sorted; the notes of the log say so. Of controls at one time the last
+    one in the file holds, of scans at one time the first one counts.
+
     Args:
         path: Folder with `aa3_dr.mat` (`time` [ms], `speed`, `steering`), `VictoriaParkSinSincronizar.mat` (`TLsr` [s],
-            `zt`: per scan rows of range, bearing from the right hand side, diameter) and `aa3_gpsx.mat` (`timeGps`
-            [ms], `Lo_m`, `La_m`).
+            `zt`: per scan rows of range, bearing from the right hand side, diameter) and, where there are fixes,
+            `aa3_gpsx.mat` (`timeGps` [ms], `Lo_m`, `La_m`).
         duration: Keep this many seconds from the first control on [s]. None: all.
 
     Raises:
         ValueError: If the folder, a file or a variable in it is missing, a file cannot be read, numbers are not finite
-            or impossible, lengths disagree or times go back; the text names the file.
+            or impossible, lengths disagree, or a time lies more than `MOST_JITTER` back; the text names the file.
     """
     folder = Path(path)
     if not folder.is_dir():
         raise bad_argument("path", "a folder of the Victoria Park log", "no such folder", f"Check {str(path)!r}.")
     end = np.inf
     driven = _read(folder / CONTROLS_FILE, ("time", "speed", "steering"))
-    controls = _table(folder / CONTROLS_FILE, driven, ("time", "speed", "steering"), MILLISECONDS)
+    controls, words = _sorted(CONTROLS_FILE, _table(folder / CONTROLS_FILE, driven, tuple(driven), MILLISECONDS))
     if np.abs(controls[:, 2]).max() > MAX_STEERING:
         raise _bad(folder / CONTROLS_FILE, f"steering angles within +-{MAX_STEERING:g} rad", "a larger one")
     if duration is not None:
@@ -69,15 +76,26 @@ def load_victoria(path: str | Path, duration: float | None = None) -> VictoriaLo
         expected = f"a cell array zt with one cell for each of {len(times)} times"
         raise _bad(folder / TREES_FILE, expected, "a different one")
     scans = [_trees(folder / TREES_FILE, number, cell) for number, cell in enumerate(cells)]
-    fixes = _read(folder / GPS_FILE, ("timeGps", "Lo_m", "La_m"))
-    gps = _table(folder / GPS_FILE, fixes, ("timeGps", "Lo_m", "La_m"), MILLISECONDS)
+    order, trees_words = time_order(TREES_FILE, times)
+    _, first = np.unique(times[order], return_index=True)
+    times, scans = times[order[first]], [scans[number] for number in order[first]]
+    gps, gps_words = None, ""
+    if (folder / GPS_FILE).exists():
+        fixes = _read(folder / GPS_FILE, ("timeGps", "Lo_m", "La_m"))
+        gps, gps_words = _sorted(GPS_FILE, _table(folder / GPS_FILE, fixes, tuple(fixes), MILLISECONDS))
     kept = int(np.searchsorted(times, end, side="right"))
     if not kept:
         raise bad_argument("duration", "long enough for a scan", duration, f"The first one is at {times[0]:.1f} s.")
     controls, times = controls[controls[:, 0] <= end], times[:kept]
-    for array in (controls, times, gps, *scans):
+    for array in (controls, times, *scans, *([] if gps is None else [gps])):
         array.setflags(write=False)
-    return VictoriaLog(controls, times, tuple(scans[:kept]), gps)
+    return VictoriaLog(controls, times, tuple(scans[:kept]), gps, sorted_note([words, trees_words, gps_words]))
+
+
+def _sorted(name: str, table: FloatArray) -> tuple[FloatArray, str]:
+    """Return rows (n, columns) that begin with a time in its order, and what `time_order` says of the file `name`."""
+    order, words = time_order(name, table[:, 0])
+    return table[order], words
 
 
 def _read(file: Path, names: tuple[str, ...]) -> dict[str, Any]:
@@ -111,11 +129,11 @@ def _table(file: Path, content: dict[str, Any], names: tuple[str, ...], unit: fl
     if not np.isfinite(table).all():
         raise _bad(file, "finite numbers", f"NaN or infinity in {names[int(np.argwhere(~np.isfinite(table))[0][1])]}")
     table[:, 0] /= unit
-    backwards = np.flatnonzero(np.diff(table[:, 0]) < 0.0)
+    backwards = np.flatnonzero(steps_back(table[:, 0]) > MOST_JITTER)
     if len(backwards):
-        later = int(backwards[0]) + 1
-        got = f"a time {table[later, 0]:.3f} s after {table[later - 1, 0]:.3f} s at index {later}"
-        raise _bad(file, f"times {names[0]} that never go back", got)
+        later = int(backwards[0])
+        got = f"a time {table[later, 0]:.3f} s after {table[:later, 0].max():.3f} s at index {later}"
+        raise _bad(file, f"times {names[0]} that go back by at most {MOST_JITTER:g} s", got)
     return table
 
 

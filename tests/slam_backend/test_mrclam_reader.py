@@ -68,7 +68,16 @@ def test_duration_counts_from_the_earliest_command(folder: Path) -> None:
         ("Robot2_Odometry.dat", "1 2 3\n1 2 x\n", r"got '1 2 x'\. Correct line 2"),
         ("Robot2_Odometry.dat", "1 2 3\n2 nan 0\n", r"with finite numbers, got '2 nan 0'\. Correct line 2"),
         ("Robot2_Odometry.dat", "1 2 inf\n", r"with finite numbers, got '1 2 inf'"),
-        ("Robot2_Odometry.dat", "2 0 0\n3 0 0\n1 0 0\n", r"a time not before that of the line above, got '1 0 0'"),
+        (
+            "Robot2_Odometry.dat",
+            "2 0 0\n3 0 0\n1 0 0\n",
+            r"a time at most 1 s before that of a line above, got '1 0 0'\. .*3",
+        ),
+        (
+            "Robot2_Measurement.dat",
+            "9.0 63 2.0 0.1\n9.1 63 2.0 0.1\n",
+            r"since its first odometry .* from 9\.000 to 9\.1",
+        ),
         ("Robot2_Odometry.dat", "1_0 0 0\n", r"got '1_0 0 0'"),
         ("Robot2_Measurement.dat", "1 63 0.0 0.1\n", r"with a range > 0, got '1 63 0\.0 0\.1'"),
         ("Robot2_Measurement.dat", "\x00\x01binary", r"expected 4 numbers \(time barcode range bearing\)"),
@@ -84,6 +93,56 @@ def test_a_damaged_log_is_refused_with_file_and_line(folder: Path, name: str, te
         (folder / name).write_text(text)
     with pytest.raises(ValueError, match=message):
         load_mrclam(folder)
+
+
+def test_rows_a_little_back_in_time_are_sorted(folder: Path) -> None:
+    """Rows of all files are put in order of time, those of one time as in the file, and one line says which."""
+    swapped = "100.0 0.5 0.0\n101.0 0.5 0.2\n100.9 0.4 0.1\n101.0 0.0 0.3\n"
+    (folder / "Robot2_Odometry.dat").write_text(swapped)
+    (folder / "Robot2_Measurement.dat").write_text("100.2 63 2.0 0.1\n100.1 63 2.1 0.1\n100.1 81 1.0 0.0\n")
+    (folder / "Robot2_Groundtruth.dat").write_text("100.0 0 0 0.5\n100.5 1 0 0\n100.4 2 0 0\n100.5 3 0 0\n")
+    log = load_mrclam(folder)
+    own = log.robots[0]
+    assert own.commands[:, 0].tolist() == [100.0, 100.9, 101.0, 101.0]
+    assert own.commands[-1].tolist() == [101.0, 0.0, 0.3]  # holds from then on
+    assert own.sightings[:, :3].tolist() == [[100.1, 6.0, 2.1], [100.1, 7.0, 1.0], [100.2, 6.0, 2.0]]
+    assert own.truth is not None
+    assert own.truth.poses[:, 0].tolist() == [0.0, 2.0, 1.0]  # the first of two poses of one time
+    assert log.notes == (
+        "Sorted by time: Robot2_Odometry.dat (1 row, up to 0.100 s back), Robot2_Measurement.dat (2 rows, up to 0.100 s"
+        " back), Robot2_Groundtruth.dat (1 row, up to 0.100 s back).",
+    )
+
+
+def test_a_jump_back_is_measured_from_the_latest_row_above(folder: Path) -> None:
+    """Small steps back that add up to more than a second are damage."""
+    (folder / "Robot2_Odometry.dat").write_text("100.0 0 0\n102.0 0 0\n101.4 0 0\n100.9 0 0\n")
+    with pytest.raises(
+        ValueError, match=r"a time at most 1 s before that of a line above, got '100\.9 0 0'\. .*line 4"
+    ):
+        load_mrclam(folder)
+
+
+def test_a_log_without_truth_is_read(folder: Path) -> None:
+    """Without files of the truth positions and poses are None; a log in order has no notes."""
+    assert load_mrclam(folder).notes == ()
+    for file in folder.glob("*Groundtruth.dat"):
+        file.unlink()
+    log = load_mrclam(folder)
+    assert log.positions is None
+    assert not log.has_truth
+    assert log.subjects.tolist() == [6, 7, 9]
+
+
+def test_readings_after_the_odometry_are_pointed_out(folder: Path) -> None:
+    """True poses or sightings that do not overlap the odometry in time get a line each."""
+    (folder / "Robot2_Groundtruth.dat").write_text("999.0 0 0 0.5\n")
+    (folder / "Robot2_Measurement.dat").write_text("200.0 63 2.0 0.1\n")
+    notes = load_mrclam(folder, (2,)).notes
+    assert [note.split(" (")[0] for note in notes] == [
+        "Robot 2: no overlap of its sightings",
+        "Robot 2: no overlap of its true poses",
+    ]
 
 
 @pytest.mark.parametrize(

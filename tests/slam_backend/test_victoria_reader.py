@@ -44,8 +44,31 @@ def test_files_become_arrays_in_seconds_metres_and_radians(tmp_path: Path) -> No
     assert log.scan_times.tolist() == [1.1, 1.6, 2.1]
     assert [len(scan) for scan in log.scans] == [2, 0, 1]
     np.testing.assert_allclose(log.scans[0], [[4.0, 0.0, 0.3], [7.0, 0.5 - np.pi / 2, 0.4]])
+    assert log.gps is not None
     assert log.gps[2].tolist() == [1.4, 2.0, -5.0]
     assert not log.scans[0].flags.writeable
+
+
+def test_entries_a_little_back_in_time_are_sorted(tmp_path: Path) -> None:
+    """Scans come with their trees; of scans at one time the first counts; one line says what was sorted."""
+    stamps = np.array([[900], [1200], [1150], [2000]])
+    _write(tmp_path, TLsr=np.array([[1.6, 1.1, 1.6]]), timeGps=stamps)
+    log = load_victoria(tmp_path)
+    assert log.scan_times.tolist() == [1.1, 1.6]
+    assert [len(scan) for scan in log.scans] == [0, 2]
+    assert log.gps is not None
+    assert log.gps[:, 1].tolist() == [0.0, 2.0, 1.0, 3.0]
+    told = "VictoriaParkSinSincronizar.mat (1 row, up to 0.500 s back), aa3_gpsx.mat (1 row, up to 0.050 s back)."
+    assert log.notes == (f"Sorted by time: {told}",)
+
+
+def test_a_log_without_gps_is_read(tmp_path: Path) -> None:
+    """Without its file there are no fixes."""
+    _write(tmp_path)
+    (tmp_path / "aa3_gpsx.mat").unlink()
+    log = load_victoria(tmp_path)
+    assert log.gps is None
+    assert log.notes == ()
 
 
 def test_a_duration_keeps_the_beginning(tmp_path: Path) -> None:
@@ -67,8 +90,11 @@ def test_a_duration_keeps_the_beginning(tmp_path: Path) -> None:
         ({"speed": np.full((80, 1), np.nan)}, "finite numbers, got NaN or infinity in speed"),
         ({"speed": np.zeros((8, 10))}, r"a row or column of numbers speed, got an array float64 \(8, 10\)"),
         ({"steering": np.full((80, 1), 1.4)}, r"steering angles within \+-1 rad, got a larger one"),
-        ({"TLsr": np.array([[1.1, 1.05, 2.1]])}, r"times TLsr that never go back, got a time 1\.050 s after 1\.100 s"),
-        ({"timeGps": np.array([[9], [5], [6], [7]])}, "times timeGps that never go back"),
+        (
+            {"TLsr": np.array([[2.1, 1.05, 2.2]])},
+            r"TLsr that go back by at most 1 s, got a time 1\.050 s after 2\.100 s",
+        ),
+        ({"timeGps": np.array([[9000], [5], [6], [7]])}, "times timeGps that go back by at most 1 s"),
         ({"TLsr": np.array([[1.1, 1.6]])}, "a cell array zt with one cell for each of 2 times, got a different one"),
         ({"zt": np.zeros((1, 3))}, "a cell array zt with one cell for each of 3 times, got a different one"),
     ],

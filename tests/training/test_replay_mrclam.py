@@ -78,8 +78,10 @@ def test_a_run_is_written_and_repeats_itself(tmp_path: Path, monkeypatch: pytest
     assert "odometry" in said.out
     names = {f"robot{n}_{kind}.tum" for n in (2, 5) for kind in ("estimate", "dead_reckoning", "truth")}
     assert {file.name for file in first.iterdir()} == {
-        "config.toml", "metrics.json", "replay.png", "joint_map_2-5.png", "timing.json", *names
+        "config.toml", "metrics.json", "replay.png", "joint_map_2-5.png", "timing.json", "map_2-5.npz", "map_2-5.csv",
+        *names,
     }  # fmt: skip
+    assert "Maps as data: map_2-5" in said.out
     for file in first.glob("*.png"):
         assert file.read_bytes()[:4] == b"\x89PNG"
     metrics = json.loads((first / "metrics.json").read_text())
@@ -92,6 +94,58 @@ def test_a_run_is_written_and_repeats_itself(tmp_path: Path, monkeypatch: pytest
     assert set(metrics) >= {"robots", "merges", "groups", "coverage", "config", "seed", "versions"}
     estimate = Trajectory.load_tum(first / "robot5_estimate.tum")
     assert np.array_equal(estimate.poses, Trajectory.load_tum(second / "robot5_estimate.tum").poses)
+
+
+def test_maps_are_left_as_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, vslam: Any) -> None:
+    """Each group's map is an archive that `LandmarkMap.load` reads, in its first robot's start frame, and a CSV."""
+    write_log(tmp_path, noise=0.0)
+    monkeypatch.chdir(tmp_path)
+    options = ("--duration", "20", "--particles", "7", "--alone", "--out", "run")
+    assert vslam("replay", "mrclam", "--path", ".", *options).status == 0
+    log = load_mrclam(tmp_path, duration=20.0)
+    config = ReplayConfig.from_mapping(json.loads((tmp_path / "run" / "metrics.json").read_text())["config"])
+    for robot, own in zip((2, 5), replay(log, config).maps, strict=True):
+        found = LandmarkMap.load(tmp_path / "run" / f"map_{robot}.npz")
+        for name in ("means", "covariances", "descriptors", "counts", "ids"):
+            assert np.array_equal(getattr(found, name), getattr(own, name))
+        table = np.genfromtxt(tmp_path / "run" / f"map_{robot}.csv", delimiter=",", names=True)
+        assert table["id"].astype(int).tolist() == own.ids.tolist()
+        assert table["count"].astype(int).tolist() == own.counts.tolist()
+        assert np.array_equal(np.column_stack([table[f"{axis}_m"] for axis in "xyz"]), own.means)
+        for pair, (i, j) in {"xx": (0, 0), "xy": (0, 1), "yz": (1, 2), "zz": (2, 2)}.items():
+            assert np.array_equal(table[f"cov_{pair}_m2"], own.covariances[:, i, j])
+
+
+def test_a_folder_without_truth_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, vslam: Any) -> None:
+    """Where nothing is known, the command says so in place of tables of dashes; what was sorted is one line."""
+    write_log(tmp_path, noise=1.0)
+    for file in tmp_path.glob("*Groundtruth.dat"):
+        file.unlink()
+    rows = (tmp_path / "Robot5_Odometry.dat").read_text().splitlines()
+    (tmp_path / "Robot5_Odometry.dat").write_text("\n".join([rows[1], rows[0], *rows[2:]]))
+    monkeypatch.chdir(tmp_path)
+    options = ("--particles", "7", "--seed", "5", "--out", "run")
+    said = vslam("replay", "mrclam", "--path", ".", "--duration", "20", *options)
+    assert said.status == 0
+    assert "Paths of robots 2, 5: no ground truth in this folder." in said.out
+    assert "Maps of robots 2, 5: no ground truth in this folder." in said.out
+    assert "│" not in said.out.split("Merges")[0]
+    assert "off by" not in said.out
+    assert "Sorted by time: Robot5_Odometry.dat (1 row, up to 0.100 s back)." in said.out.splitlines()
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert metrics["notes"] == ["Sorted by time: Robot5_Odometry.dat (1 row, up to 0.100 s back)."]
+    row = metrics["robots"][0]
+    assert {row[key] for key in ("ate_aligned_m", "map_rmse_m", "map_recall", "map_precision", "map_error")} == {None}
+    assert metrics["groups"] == [[2, 5]]
+
+
+def test_the_map_error_says_that_errors_are_cut(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, vslam: Any) -> None:
+    """The column of E says at which distance each error is cut."""
+    write_log(tmp_path, noise=0.0)
+    monkeypatch.chdir(tmp_path)
+    said = vslam("replay", "mrclam", "--path", ".", "--duration", "5", "--particles", "2", "--out", "run")
+    assert "map error E (m)," in said.out
+    assert "errors cut at 1 m," in said.out
 
 
 def test_a_log_without_truth_has_no_path_scores(tmp_path: Path) -> None:

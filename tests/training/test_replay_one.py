@@ -7,6 +7,7 @@ import pytest
 from small_logs import EAST, TREES, write_drive, write_park
 
 from slam_backend.geometry import compose, transform_points
+from slam_backend.landmark_map import LandmarkMap
 from slam_backend.readers.kitti import load_kitti
 from slam_backend.readers.velocities import integrate_commands
 from slam_backend.readers.victoria import load_victoria
@@ -17,6 +18,7 @@ from training.replay_kitti import replay as replay_kitti
 from training.replay_kitti import score as score_kitti
 from training.replay_kitti import summarise as summarise_kitti
 from training.replay_one import path_length, score_positions
+from training.replay_one_command import drift_told
 from training.replay_victoria import VictoriaConfig, describe_by_place
 from training.replay_victoria import replay as replay_victoria
 from training.replay_victoria import score as score_victoria
@@ -62,13 +64,46 @@ def test_trees_are_described_by_where_they_stand(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found.points, frame.points)
 
 
-def test_fewer_than_two_fixes_are_refused(tmp_path: Path) -> None:
-    """A stretch without GPS cannot be scored, and says so."""
+def test_a_stretch_with_fewer_than_two_fixes_has_no_scores(tmp_path: Path) -> None:
+    """A stretch without GPS is replayed, but cannot be scored."""
     write_park(tmp_path)
     log = load_victoria(tmp_path, duration=0.4)
     result = replay_victoria(log, VictoriaConfig(path="log", particles=2))
-    with pytest.raises(ValueError, match="duration: expected two GPS fixes or more, got a stretch with 0"):
-        score_victoria(result, log)
+    assert score_victoria(result, log) is None
+    assert np.isnan(summarise_victoria(result, None)["robots"][0]["ate_aligned_m"])
+
+
+@pytest.mark.parametrize("command", ["victoria", "kitti"])
+def test_a_folder_without_truth_says_so(
+    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, vslam: Any
+) -> None:
+    """Without GPS or true poses there is a line in place of the table, and no dash."""
+    (write_park if command == "victoria" else write_drive)(tmp_path)
+    (tmp_path / ("aa3_gpsx.mat" if command == "victoria" else "poses/00.txt")).unlink()
+    monkeypatch.chdir(tmp_path)
+    said = vslam("replay", command, "--path", ".", "--duration", "3", "--particles", "2", "--out", "run")
+    assert said.status == 0
+    assert "Errors: no ground truth in this folder." in said.out
+    assert " - " not in said.out
+    assert "RMS" not in said.out
+    assert json.loads((tmp_path / "run" / "metrics.json").read_text())["robots"][0]["ate_aligned_m"] is None
+
+
+def test_the_command_tells_drift_and_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, vslam: Any) -> None:
+    """Over 100 m KITTI's drift is printed as a share, and the error at the end, of the estimate and of odometry."""
+    write_drive(tmp_path, bias=0.05)
+    monkeypatch.chdir(tmp_path)
+    said = vslam("replay", "kitti", "--path", ".", "--particles", "2", "--out", "run")
+    row = json.loads((tmp_path / "run" / "metrics.json").read_text())["robots"][0]
+    assert row["end_error_percent"] == pytest.approx(100.0 * row["end_error_m"] / row["true_path_m"])
+    assert row["dead_reckoning_end_error_m"] > 5.0 * row["end_error_m"] > 0.0
+    assert (
+        f"End of {row['true_path_m']:.1f} m, from the start, no fit: off by {row['end_error_m']:.2f} m, "
+        f"{row['end_error_percent']:.2f} % of the path (odometry {row['dead_reckoning_end_error_m']:.2f} m, "
+    ) in said.out
+    assert drift_told((0.0234, 0.066)).endswith("2.34 % (odometry 6.60 %).")
+    assert drift_told((float("nan"), float("nan"))) == ""
+    assert ("Drift" in said.out) == (row["mean_drift"] is not None)
 
 
 def test_tracks_correct_the_turn_of_a_drive(tmp_path: Path) -> None:
@@ -160,9 +195,12 @@ def test_a_run_is_written_and_repeats_itself(
     assert "times real time" in said.out
     truth = {"truth.tum"} if command == "kitti" else set()
     assert {file.name for file in first.iterdir()} == truth | {
-        "config.toml", "metrics.json", "replay.png", "timing.json", "estimate.tum", "dead_reckoning.tum"
+        "config.toml", "metrics.json", "replay.png", "timing.json", "estimate.tum", "dead_reckoning.tum",
+        "map_1.npz", "map_1.csv",
     }  # fmt: skip
     assert (first / "replay.png").read_bytes()[:4] == b"\x89PNG"
+    assert "Maps as data: map_1," in said.out
+    assert len(LandmarkMap.load(first / "map_1.npz")) == json.loads((first / "metrics.json").read_text())["landmarks"]
     assert json.loads((first / "timing.json").read_text())["times_real_time"] > 0.0
     metrics = json.loads((first / "metrics.json").read_text())
     assert metrics == json.loads((tmp_path / "copy.json").read_text())

@@ -10,6 +10,7 @@ import pytest
 from rich.console import Console
 
 from slam_backend.geometry import between, compose
+from slam_backend.landmark_map import LandmarkMap
 from slam_backend.trajectory import Trajectory
 from training.episode import EpisodeRecord, MergeRecord, Progress, run_episode
 from training.episode_scores import score_episode
@@ -176,7 +177,7 @@ def test_tables_show_what_is_not_known_as_a_dash(record: EpisodeRecord) -> None:
     print_tables(console, metrics)
     console.file.close()
     text = console.export_text()
-    for word in ("map error E [m]", "off by [deg]", "false", " - ", "robot 1", "team"):
+    for word in ("map error E [m], errors cut at 1 m", "off by [deg]", "false", " - ", "robot 1", "team"):
         assert word in text
 
 
@@ -201,7 +202,11 @@ def test_a_run_folder_repeats_itself(vslam: Any, tmp_path: Path) -> None:
     assert vslam("run", "--config", str(one / "config.toml"), "--no-video", "--out", str(two)).status == 0
     names = {file.name for file in one.iterdir()}
     paths = {f"robot{k}_{kind}.tum" for k in range(2) for kind in ("estimate", "dead_reckoning", "truth")}
-    assert names == paths | {"config.toml", "environment.toml", "metrics.json", "map.png", "error.png", "video.mp4"}
+    usual = {"config.toml", "environment.toml", "metrics.json", "map.png", "error.png", "video.mp4"}
+    groups = json.loads((one / "metrics.json").read_text())["groups"]
+    stems = {f"map_{'-'.join(map(str, group))}" for group in groups}
+    assert names == paths | usual | {f"{stem}.{kind}" for stem in stems for kind in ("npz", "csv")}
+    assert all(len(LandmarkMap.load(one / f"{stem}.npz")) > 0 for stem in stems)
     assert {file.name for file in two.iterdir()} == names - {"video.mp4"}
     first, second = (json.loads((folder / "metrics.json").read_text()) for folder in (one, two))
     assert first == second == json.loads(copy.read_text())
