@@ -1,18 +1,14 @@
 """A MR.CLAM log becomes steps: odometry between common times, and what each robot saw around each of them."""
 
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 
-from slam_backend.errors import FloatArray, IntArray, bad_argument, check_float
-from slam_backend.geometry import between
+from slam_backend.errors import FloatArray, IntArray, check_float
 from slam_backend.measurements import Measurements
 from slam_backend.readers.mrclam import MrclamLog, RobotLog
-from slam_backend.readers.polar import points_from_polar
+from slam_backend.readers.range_bearing import even_times, frames_at, motions
 from slam_backend.readers.velocities import integrate_commands
-
-MAX_STEPS = 1_000_000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -118,14 +114,10 @@ def steps(
     Raises:
         ValueError: If `dt` is not positive, or makes more than a million steps.
     """
-    dt = check_float("dt", dt, "Give seconds between steps.", above=0.0)
     noise = SightingNoise() if noise is None else noise
     stamps = [robot.commands[:, 0] for robot in log.robots] + [robot.sightings[:, 0] for robot in log.robots]
     start = min(float(robot.commands[0, 0]) for robot in log.robots)
-    end = max(float(times[-1]) for times in stamps if len(times))
-    if (end - start) / dt > MAX_STEPS:
-        raise bad_argument("dt", f"at most {MAX_STEPS:,} steps", (end - start) / dt, "Take longer steps.")
-    times = start + dt * np.arange(int(np.ceil((end - start) / dt)) + 1, dtype=np.float64)
+    times = even_times(start, max(float(own[-1]) for own in stamps if len(own)), dt)
     drive = Drive() if drive is None else drive
     return MrclamSteps(times, tuple(_robot_steps(robot, times, log.subjects, noise, drive) for robot in log.robots))
 
@@ -135,22 +127,14 @@ def _robot_steps(
 ) -> RobotSteps:
     """Return the steps of one robot at these times (T,) [s]."""
     velocities = drive.driven(log.commands)
-    path = integrate_commands(velocities, times)
-    odometry = np.concatenate([np.zeros((1, 3)), between(path[:-1], path[1:])])
+
+    def pose_at(wanted: FloatArray) -> FloatArray:
+        return integrate_commands(velocities, wanted)
+
     reckoned = integrate_commands(log.commands, times)
-    for array in (odometry, reckoned):
-        array.setflags(write=False)
-    step = np.rint((log.sightings[:, 0] - times[0]) / (times[1] - times[0])).astype(np.int64) if len(times) > 1 else 0
-    step = np.clip(np.broadcast_to(step, len(log.sightings)), 0, len(times) - 1)
+    reckoned.setflags(write=False)
     column = np.searchsorted(subjects, log.sightings[:, 1].astype(np.int64))
-    _, first = np.unique(step * len(subjects) + column, return_index=True)  # sorted by step, then subject
-    chosen, step, column = log.sightings[first], step[first], column[first]
-    # The robot at the time of the sighting, seen from where it is at the step.
-    offset = between(path[step], integrate_commands(velocities, chosen[:, 0]))
-    points, covariances = points_from_polar(chosen[:, 2], chosen[:, 3], noise.variances(chosen[:, 2]), offset)
     descriptors = np.eye(len(subjects), dtype=np.float32)[column]
-    bounds = np.searchsorted(step, np.arange(len(times) + 1))
-    frames = [
-        Measurements(points[a:b], descriptors[a:b], covariances[a:b]) if b > a else None for a, b in pairwise(bounds)
-    ]
-    return RobotSteps(odometry, reckoned, tuple(frames))
+    seen, variances = log.sightings[:, [0, 2, 3]], noise.variances(log.sightings[:, 2])
+    frames = frames_at(times, pose_at, seen, variances, descriptors, column)
+    return RobotSteps(motions(pose_at(times)), reckoned, frames)

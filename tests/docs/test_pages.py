@@ -7,7 +7,7 @@ import pytest
 
 DOCS = Path(__file__).parents[2] / "docs"
 BLOCK = re.compile(r"^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
-PAGES = ("environment.md", "own_world.md", "own_reward.md", "own_policy.md")
+PAGES = ("environment.md", "own_world.md", "own_reward.md", "own_policy.md", "own_log.md")
 
 
 def _programs(page: str) -> list[str]:
@@ -15,8 +15,11 @@ def _programs(page: str) -> list[str]:
 
 
 @pytest.mark.parametrize("page", PAGES)
-def test_programs_run_as_written(page: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_programs_run_as_written(
+    page: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Each program of a page runs by itself; the last one prints what the page is about; none is long."""
+    monkeypatch.chdir(tmp_path)  # what a program leaves behind goes with it
     programs = _programs(page)
     assert programs
     for program in programs:
@@ -28,6 +31,7 @@ def test_programs_run_as_written(page: str, capsys: pytest.CaptureFixture[str]) 
         "environment.md": r"^$",
         "own_world.md": r"rooms 7 walls, \d+ landmarks",
         "own_reward.md": r"\S+ 0\.0\n$",
+        "own_log.md": r"^door at 2\.9, 0\.9 m\ndesk at -0\.\d, 1\.8 m\nlamp at 0\.3, -4\.0 m\n$",
         "own_policy.md": r"\d+% of the floor seen, map error 0\.\d\d m",
     }
     assert re.search(expected[page], printed)

@@ -1,0 +1,204 @@
+"""Odometry and range-bearing readings with times of their own become steps of a filter at common times."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from slam_backend.errors import FloatArray, IntArray, bad_argument, check_array, check_float
+from slam_backend.geometry import between
+from slam_backend.measurements import Measurements
+from slam_backend.readers.polar import points_from_polar
+from slam_backend.readers.time_order import MOST_JITTER, sorted_note, steps_back, time_order
+from slam_backend.readers.velocities import HOLD, integrate_commands
+
+MAX_STEPS = 1_000_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RangeBearingSteps:
+    """One robot's log as steps at common times.
+
+    Attributes:
+        times: (T,) float64 [s]. Evenly spaced.
+        odometry: (T, 3) float64 [m, m, rad]. Motion since the step before, in the previous robot frame; the first is 0.
+        measurements: T entries; None where nothing was seen. Points in the camera frame with covariances. Descriptors
+            are one-hot by `names`, or all the same where no identities were given.
+        names: (N,) Identities in ascending order, the columns of the descriptors; empty where none were given.
+        notes: Lines about what was done to the log: which rows were sorted by time.
+    """
+
+    times: FloatArray
+    odometry: FloatArray
+    measurements: tuple[Measurements | None, ...]
+    names: NDArray[Any]
+    notes: tuple[str, ...] = ()
+
+
+def range_bearing_steps(
+    velocities: ArrayLike,
+    sightings: ArrayLike,
+    identities: ArrayLike | None = None,
+    *,
+    sigma_range: float | ArrayLike,
+    sigma_bearing: float | ArrayLike,
+    sigma_height: float | ArrayLike = 0.05,
+    dt: float = 0.25,
+    hold: float = HOLD,
+) -> RangeBearingSteps:
+    """Turn the log of one robot that moves in the plane into odometry and measurements.
+
+    Rows up to `MOST_JITTER` back in time are sorted. A sighting goes to the nearest step and is moved there by the
+    odometry in between. Of several sightings of one identity in one step the first counts.
+
+    Args:
+        velocities: (n, 3) float64 [s, m/s, rad/s]. Time, forward and angular velocity; n >= 1. Of rows at one time the
+            last one holds.
+        sightings: (m, 3) float64 [s, m, rad]. Time, range, bearing (positive to the left of straight ahead); m >= 1.
+        identities: (m,) numbers or names of the landmarks seen; None: unknown, positions alone tell landmarks apart.
+        sigma_range: Standard deviation of a range [m], one number or (m,).
+        sigma_bearing: Standard deviation of a bearing [rad], one number or (m,).
+        sigma_height: Standard deviation of the height [m], one number or (m,): all landmarks are taken to stand at the
+            sensor's own.
+        dt: Time between steps [s].
+        hold: Longest time that a velocity moves the robot [s].
+
+    Raises:
+        ValueError: If an array is empty or of another shape, a number is not finite, a range is not positive, a time
+            lies more than `MOST_JITTER` back, no sighting lies between the first and the last velocity, a standard
+            deviation or `dt` is not positive, or there would be more than a million steps.
+    """
+    check_float("hold", hold, "Give seconds.", above=0.0)
+    driven, _, driven_words = _table("velocities", velocities, "Give rows (time, velocity, angular velocity).")
+    seen, order, seen_words = _table("sightings", sightings, "Give rows (time, range, bearing).")
+    if (seen[:, 1] <= 0.0).any():
+        least = float(seen[:, 1].min())
+        raise bad_argument("sightings", "ranges > 0 m", least, "Drop readings without an echo.")
+    first, last = driven[0, 0], driven[-1, 0]
+    if not ((seen[:, 0] >= first) & (seen[:, 0] <= last + hold)).any():
+        among = f"times among those of the velocities, {first:.3f} to {last:.3f} s"
+        got = f"a log of sightings from {seen[0, 0]:.3f} to {seen[-1, 0]:.3f} s"
+        raise bad_argument("sightings", among, got, "Give both in seconds of one clock.")
+    names, column = _identities(identities, len(seen))
+    column = column[order]
+    times = even_times(min(first, seen[0, 0]), max(last, seen[-1, 0]), dt)
+    sigmas = {"sigma_range": sigma_range, "sigma_bearing": sigma_bearing, "sigma_height": sigma_height}
+    variances = np.stack([_variances(name, sigma, len(seen))[order] for name, sigma in sigmas.items()], axis=-1)
+    if len(names):
+        descriptors, told_apart = np.eye(len(names), dtype=np.float32)[column], column
+    else:
+        descriptors, told_apart = np.ones((len(seen), 1), dtype=np.float32), np.arange(len(seen))
+
+    def pose_at(wanted: FloatArray) -> FloatArray:
+        return integrate_commands(driven, wanted, hold)
+
+    return RangeBearingSteps(
+        times,
+        motions(pose_at(times)),
+        frames_at(times, pose_at, seen, variances, descriptors, told_apart),
+        names,
+        sorted_note([driven_words, seen_words]),
+    )
+
+
+def even_times(start: float, end: float, dt: float) -> FloatArray:
+    """Return times (T,) [s] from `start` on, `dt` [s] apart, until `end` is reached.
+
+    Raises:
+        ValueError: If `dt` is not positive, or makes more than a million steps.
+
+    >>> even_times(1.0, 1.8, 0.5).tolist()
+    [1.0, 1.5, 2.0]
+    """
+    dt = check_float("dt", dt, "Give seconds between steps.", above=0.0)
+    if (end - start) / dt > MAX_STEPS:
+        cure = "Take longer steps, and give all times in seconds of one clock."
+        raise bad_argument("dt", f"at most {MAX_STEPS:,} steps", (end - start) / dt, cure)
+    return np.asarray(start + dt * np.arange(int(np.ceil((end - start) / dt)) + 1, dtype=np.float64))
+
+
+def motions(path: FloatArray) -> FloatArray:
+    """Return the motion (T, 3) [m, m, rad] since the pose before, in its frame, of poses (T, 3); the first is 0.
+
+    >>> motions(np.array([[1.0, 0.0, 0.0], [1.0, 2.0, 0.0]])).tolist()
+    [[0.0, 0.0, 0.0], [0.0, 2.0, 0.0]]
+    """
+    odometry = np.concatenate([np.zeros((1, 3)), between(path[:-1], path[1:])])
+    odometry.setflags(write=False)
+    return odometry
+
+
+def frames_at(
+    times: FloatArray,
+    pose_at: Callable[[FloatArray], FloatArray],
+    sightings: FloatArray,
+    variances: FloatArray,
+    descriptors: NDArray[np.float32],
+    identities: IntArray,
+) -> tuple[Measurements | None, ...]:
+    """Put sightings into the nearest of evenly spaced steps, moved there by the odometry in between.
+
+    Args:
+        times: (T,) float64 [s]. Evenly spaced.
+        pose_at: Poses (k, 3) [m, m, rad] by dead reckoning at times (k,) [s].
+        sightings: (m, 3) float64 [s, m, rad]. Time, range, bearing, ordered by time.
+        variances: (m, 3) float64 [m^2, rad^2, m^2]. Errors of range, bearing and height.
+        descriptors: (m, d) float32.
+        identities: (m,) int64 >= 0. Of several sightings of one identity in one step the first counts.
+
+    Returns:
+        T frames; None where nothing was seen.
+    """
+    step = np.rint((sightings[:, 0] - times[0]) / (times[1] - times[0])).astype(np.int64) if len(times) > 1 else 0
+    step = np.clip(np.broadcast_to(step, len(sightings)), 0, len(times) - 1)
+    _, first = np.unique(step * (identities.max(initial=0) + 1) + identities, return_index=True)  # by step, identity
+    chosen, step = sightings[first], step[first]
+    # The robot at the time of the sighting, seen from where it is at the step.
+    offset = between(pose_at(times)[step], pose_at(chosen[:, 0]))
+    points, covariances = points_from_polar(chosen[:, 1], chosen[:, 2], variances[first], offset)
+    looks = descriptors[first]
+    bounds = np.searchsorted(step, np.arange(len(times) + 1))
+    return tuple(
+        Measurements(points[a:b], looks[a:b], covariances[a:b]) if b > a else None for a, b in pairwise(bounds)
+    )
+
+
+def _table(name: str, value: ArrayLike, cure: str) -> tuple[FloatArray, IntArray, str]:
+    """Return rows (n, 3) in order of time, that order, and what `time_order` says."""
+    table: FloatArray = check_array(name, value, (None, 3), cure)
+    if not len(table):
+        raise bad_argument(name, "at least one row", "no row", cure)
+    late = np.flatnonzero(steps_back(table[:, 0]) > MOST_JITTER)
+    if len(late):
+        row = int(late[0])
+        got = f"a time {table[row, 0]:.3f} s after {table[:row, 0].max():.3f} s in row {row}"
+        raise bad_argument(name, f"times that go back by at most {MOST_JITTER:g} s", got, "Look at the log there.")
+    order, words = time_order(name, table[:, 0])
+    return table[order], order, words
+
+
+def _variances(name: str, sigma: float | ArrayLike, count: int) -> FloatArray:
+    """Return the variances (count,) of a standard deviation, or of one per sighting."""
+    cure = "Give a standard deviation, or one per sighting."
+    given: FloatArray = check_array(name, np.full(count, sigma) if np.ndim(sigma) == 0 else sigma, (count,), cure)
+    if (given <= 0.0).any():
+        raise bad_argument(name, "standard deviations > 0", float(given.min()), cure)
+    return given**2
+
+
+def _identities(identities: ArrayLike | None, count: int) -> tuple[NDArray[Any], IntArray]:
+    """Return the names (N,) and the place among them (count,) of each sighting; no names where none are given."""
+    if identities is None:
+        return np.empty(0, dtype=np.int64), np.zeros(count, dtype=np.int64)
+    given = np.asarray(identities)
+    cure = "Give one number or name per sighting, or None."
+    if given.shape != (count,) or given.dtype.kind not in "iufUS":
+        got = f"an array of {given.dtype}, shape {given.shape}"
+        raise bad_argument("identities", f"numbers or names of shape ({count},)", got, cure)
+    if given.dtype.kind == "f" and not np.array_equal(given, np.round(given)):
+        raise bad_argument("identities", "whole numbers or names", "NaN or fractions", cure)
+    names, column = np.unique(given, return_inverse=True)
+    return names, column.astype(np.int64)

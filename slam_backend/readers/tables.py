@@ -1,0 +1,103 @@
+"""Columns of a CSV file by their names: strict reading, errors name file, line and column."""
+
+import csv
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_backend.errors import FloatArray, bad_argument, check_choice
+
+DELIMITERS = (",", ";", "\t")
+
+
+class CsvTable(NamedTuple):
+    """The columns of a file that were asked for. n rows.
+
+    Attributes:
+        numbers: (n, k) float64. All finite.
+        labels: (n, l) str. Words without the blanks around them, none empty.
+    """
+
+    numbers: FloatArray
+    labels: NDArray[np.str_]
+
+
+def read_csv(
+    path: str | Path, numbers: Sequence[str], labels: Sequence[str] = (), delimiter: str | None = None
+) -> CsvTable:
+    """Read columns of a CSV file whose first line names them.
+
+    Other columns and empty lines are skipped, as are lines that begin with `#` below the first one.
+
+    Args:
+        path: The file, UTF-8; `#` before the first name is dropped.
+        numbers: Names of k columns of numbers.
+        labels: Names of l columns that are kept as words, such as a landmark's identity.
+        delimiter: ",", ";" or a tab; None: the one that the first line holds.
+
+    Raises:
+        ValueError: If the file is missing, no text or has no rows, a column is missing or there twice, or an entry is
+            missing, no finite number or an empty label; the text names file, line and column.
+    """
+    file = Path(path)
+    if not file.is_file():
+        raise bad_argument("path", "a CSV file", "no such file", f"Check {str(file)!r}.")
+    try:
+        lines = file.read_text(encoding="utf-8-sig").splitlines()
+    except UnicodeDecodeError as error:
+        raise bad_argument("path", f"{file.name} in UTF-8", "a file in another encoding", f"Save {file} so.") from error
+    first = next((number for number, line in enumerate(lines) if line.strip()), None)
+    if first is None:
+        raise bad_argument("path", f"{file.name} with a line of names", "no lines", f"{file} is empty.")
+    if delimiter is None:
+        delimiter = next((sign for sign in DELIMITERS if sign in lines[first]), ",")
+    check_choice("delimiter", delimiter, DELIMITERS)
+    names = [name.strip() for name in next(csv.reader([lines[first].lstrip("# ")], delimiter=delimiter))]
+    places = [_place(file, names, name) for name in (*numbers, *labels)]
+    values: list[list[float]] = []
+    words: list[list[str]] = []
+    for number, line in enumerate(lines[first + 1 :], start=first + 2):
+        if not line.strip() or line.startswith("#"):
+            continue
+        cells = next(csv.reader([line], delimiter=delimiter))
+        found = [cells[place].strip() if place < len(cells) else "" for place in places]
+        for name, word in zip((*numbers, *labels), found, strict=True):
+            if not word:
+                raise _bad_entry(file, number, name, "an entry", "no entry")
+        values.append([_number(file, number, name, word) for name, word in zip(numbers, found, strict=False)])
+        words.append(found[len(numbers) :])
+    if not values:
+        raise bad_argument("path", f"{file.name} with rows", "no rows", f"{file} ends after its line of names.")
+    return CsvTable(
+        np.array(values, dtype=np.float64).reshape(len(values), len(numbers)),
+        np.array(words, dtype=np.str_).reshape(len(words), len(labels)),
+    )
+
+
+def _place(file: Path, names: list[str], wanted: str) -> int:
+    """Return where a column stands."""
+    if names.count(wanted) != 1:
+        got = f"a line of names {', '.join(names)!r}"
+        cure = f"Correct the first line of {file}, or ask for the name that the column has."
+        raise bad_argument("path", f"{file.name} with one column {wanted!r}", got, cure)
+    return names.index(wanted)
+
+
+def _number(file: Path, number: int, name: str, word: str) -> float:
+    """Return the finite number that a word spells."""
+    try:
+        value = math.nan if "_" in word else float(word)  # Python reads 1_000 as a number, a log that holds it is odd
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise _bad_entry(file, number, name, "a finite number", repr(word))
+    return value
+
+
+def _bad_entry(file: Path, number: int, name: str, expected: str, got: str) -> ValueError:
+    """Say what is wrong with an entry of a file."""
+    return bad_argument("path", f"{expected} in column {name!r}", got, f"Correct line {number} of {file}.")

@@ -1,0 +1,62 @@
+import importlib.util
+from pathlib import Path
+
+import cv2
+import pytest
+
+PATH = Path(__file__).parents[2] / "examples" / "own_log.py"
+SPEC = importlib.util.spec_from_file_location("own_log", PATH)
+assert SPEC is not None
+assert SPEC.loader is not None
+example = importlib.util.module_from_spec(SPEC)
+SPEC.loader.exec_module(example)
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The log that the example makes up."""
+    folder = tmp_path_factory.mktemp("log")
+    example.make_log(folder)
+    return folder
+
+
+def test_a_log_becomes_a_map(log: Path, tmp_path: Path) -> None:
+    """Path and map are right to a decimetre, where dead reckoning is off by most of a metre; a picture is drawn."""
+    errors = example.run(log, tmp_path / "own.png")
+    assert errors["path"].aligned < 0.1
+    assert errors["map"].aligned < 0.05
+    assert errors["odometry"].aligned > 0.5
+    picture = cv2.imread(str(tmp_path / "own.png"))
+    assert picture is not None
+    assert picture.std() > 10.0
+
+
+def test_without_truth_nothing_is_scored(log: Path, tmp_path: Path) -> None:
+    """Odometry and sightings are enough for a map and a picture."""
+    for name in ("odometry.csv", "sightings.csv"):
+        (tmp_path / name).write_text((log / name).read_text())
+    assert example.run(tmp_path, tmp_path / "own.png") == {}
+    assert (tmp_path / "own.png").stat().st_size > 1000
+
+
+def test_the_program_says_what_is_wrong_in_one_line(log: Path, tmp_path: Path) -> None:
+    """Bad input ends the program with one line that names file, line and column."""
+    (tmp_path / "odometry.csv").write_text("time,v,omega\n0.0,0.1,fast\n")
+    message = (
+        r"^error path: expected a finite number in column 'omega', got 'fast'\. Correct line 2 of .*odometry\.csv\.$"
+    )
+    with pytest.raises(SystemExit, match=message):
+        example.main(tmp_path, tmp_path / "own.png")
+    for name in ("odometry.csv", "sightings.csv"):
+        (tmp_path / name).write_text((log / name).read_text())
+    (tmp_path / "truth.csv").write_text("time,x,y,theta\n900,0,0,0\n901,0,0,0\n")
+    with pytest.raises(SystemExit, match=r"^truth\.csv and the log do not overlap: 900\.0 to 901\.0 s"):
+        example.main(tmp_path, tmp_path / "own.png")
+
+
+def test_the_program_makes_up_a_log(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Without a folder it makes up a log, and prints three errors."""
+    example.main(None, tmp_path / "own.png")
+    printed = capsys.readouterr().out
+    assert "Made up a log in " in printed
+    assert "RMS errors after the best rigid fit: path 0.0" in printed
