@@ -20,7 +20,8 @@ from slam_backend.frontend import DESCRIPTORS, KINDS, CornerOptions, FrontEndOpt
 from slam_backend.frontend.odometry import camera_motion
 from slam_backend.measurements import Measurements
 from slam_backend.motion import OdometryModel
-from slam_backend.readers.kitti_images import KittiImages
+from slam_backend.readers.kitti_images import KittiImages, load_kitti_images
+from slam_backend.readers.stereo_files import StereoFiles, load_stereo_images
 from slam_backend.reports import StepReport
 from training.plain_config import PlainConfig
 from training.replay_config import check_common
@@ -52,6 +53,10 @@ class ImagesConfig(PlainConfig):
 
     Attributes:
         path: Folder of the drive.
+        left: Images of the left eye, as `StereoFiles` has it; None: the folder is laid out as KITTI's.
+        right: Images of the right eye, likewise.
+        calibration: Of the rig, likewise.
+        times: File of the seconds of the frames, or None for that of the folder.
         truth: File of the true poses, or None for that of the folder.
         duration: Seconds to replay [s], or None for all.
         particles: Of the filter.
@@ -67,6 +72,10 @@ class ImagesConfig(PlainConfig):
     """
 
     path: str
+    left: str | None = None
+    right: str | None = None
+    calibration: str | None = None
+    times: str | None = None
     truth: str | None = None
     duration: float | None = None
     particles: int = 100
@@ -84,6 +93,17 @@ class ImagesConfig(PlainConfig):
         check_float("max_range", self.max_range, "Give metres.", above=NEAREST)
         for name in ("sigma_px", "sigma_disparity_px"):
             check_float(name, getattr(self, name), "Give pixels.", above=0.0)
+
+    def load(self) -> KittiImages:
+        """Read the drive.
+
+        Raises:
+            ValueError: If a file is missing or cannot be read.
+        """
+        if self.left is None or self.right is None or self.calibration is None:
+            return load_kitti_images(self.path, self.truth, self.duration)
+        names = {"left": self.left, "right": self.right, "calibration": self.calibration}
+        return load_stereo_images(self.path, StereoFiles(**names, times=self.times, truth=self.truth), self.duration)
 
     def camera(self, log: KittiImages, sigma_px: float, sigma_disparity_px: float) -> StereoCamera:
         """Return the drive's camera with these standard deviations [px]."""

@@ -10,16 +10,17 @@ from training.command_progress import share_shown
 COMMAND = "replay kitti"
 
 
-def replay_folder_of_images(values: Mapping[str, Any], out: Path | None, json: Path | None) -> None:
+def replay_folder_of_images(
+    values: Mapping[str, Any], out: Path | None, json: Path | None, command: str = COMMAND
+) -> None:
     """Replay a folder of stereo images, print how far off it ended, and write the run folder."""
-    from slam_backend.readers.kitti_images import load_kitti_images
     from training.figures_images import draw_frame, expected_pixels
     from training.replay_images import ImagesConfig, replay_images, score_images, summarise_images
     from training.replay_one_command import drift_told, end_told, finish_one
 
     chosen = ImagesConfig.from_mapping(values)
-    log = load_kitti_images(chosen.path, chosen.truth, chosen.duration)
-    console, folder = begin(COMMAND, chosen, out)
+    log = chosen.load()
+    console, folder = begin(command, chosen, out)
     with share_shown(console, "replay") as on_step:
         result = replay_images(log, chosen, on_step)
     one, scored = result.replay, score_images(result.replay, log)
@@ -41,7 +42,7 @@ def replay_folder_of_images(values: Mapping[str, Any], out: Path | None, json: P
     image = log.images(len(log.times) - 1)[0]
     draw_frame(folder.path / "frame.png", image, result.last.pixels[::2], result.last_ids, counts, expected)
     finish_one(
-        console, folder, json, one, metrics, told, "KITTI stereo images in the plane",
+        console, folder, json, one, metrics, told, "stereo images in the plane",
         paths=(one.path, one.reckoned),
         scores=(scored.estimate, scored.odometry) if scored else None,
         known=scored.truth if scored else None,

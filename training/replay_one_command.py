@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from training.command_folder import begin, choose, finish, gather
@@ -206,7 +207,7 @@ def print_table(console: Console, metrics: dict[str, Any], result: "OneReplay", 
     if row["ate_aligned_m"] is None:
         console.print(unknown, highlight=False)
     else:
-        table = Table(title="RMS distance to the truth [m]")
+        table = Table(title=escape("RMS distance to the truth [m]"))
         for name in ("", "after the best rigid fit", "from the start, no fit"):
             table.add_column(name, justify="right")
         for name, key in (("estimate", "ate"), ("odometry", "dead_reckoning_ate")):

@@ -33,7 +33,7 @@ def write_maps(folder: "RunFolder", maps: "Mapping[str, LandmarkMap]") -> str:
         landmarks.save(folder.path / f"map_{name}.npz")
         folder.write_text(f"map_{name}.csv", to_csv(landmarks))
     names = ", ".join(f"map_{name}" for name in maps)
-    return f"Maps as data: {names}, each as .npz (LandmarkMap.load) and .csv."
+    return f"Maps as data: {names} (.npz for LandmarkMap.load, .csv)."
 
 
 def to_csv(landmarks: "LandmarkMap") -> str:

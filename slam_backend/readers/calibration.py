@@ -135,6 +135,41 @@ class Rectifier:
         return maps[0], maps[1]
 
 
+class Rectified:
+    """A rig whose images are rectified already: they stay as they are.
+
+    Args:
+        pair: Its calibration.
+        width: Of the images [px].
+        height: Of the images [px].
+
+    Attributes:
+        pair: The calibration.
+        body_from_camera: (4, 4) float64. The body is the left camera itself.
+    """
+
+    def __init__(self, pair: RectifiedPair, width: int, height: int) -> None:
+        self.pair, self.body_from_camera = pair, np.eye(4)
+        self._size = width, height
+
+    @property
+    def camera(self) -> StereoCamera:
+        """The rectified camera."""
+        return self.pair.camera(*self._size)
+
+    def rectify(self, left: Any, right: Any) -> tuple[Image, Image]:
+        """Return a pair (H, W) uint8 as it is.
+
+        Raises:
+            ValueError: If an image is not grey and of eight bits, or of another size than the rig's.
+        """
+        for name, image in (("left", left), ("right", right)):
+            if check_image(name, image).shape != (self._size[1], self._size[0]):
+                expected = f"an image of {self._size[0]} x {self._size[1]} px"
+                raise bad_argument(name, expected, f"shape {np.shape(image)}", "Give images of one size.")
+        return left, right
+
+
 def load_kitti_calibration(path: str | Path) -> RectifiedPair:
     """Read a file `calib.txt` of KITTI's odometry benchmark: projection matrices of the left and the right eye.
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from slam_backend.errors import FloatArray, bad_argument, check_float
 from slam_backend.frontend.images import Image
-from slam_backend.readers.calibration import RectifiedPair, load_kitti_calibration
+from slam_backend.readers.calibration import Rectified, RectifiedPair, Rectifier, load_kitti_calibration
 from slam_backend.readers.kitti import read_truth
 from slam_backend.trajectory import Trajectory
 
@@ -28,6 +28,7 @@ class KittiImages:
         width: Of the images [px].
         height: Likewise.
         truth: Poses of the left camera in the plane of its first one, x ahead, y left; None where not known.
+        rig: Rectifies the images; None: they are rectified.
     """
 
     times: FloatArray
@@ -37,14 +38,16 @@ class KittiImages:
     width: int
     height: int
     truth: Trajectory | None
+    rig: Rectifier | Rectified | None = None
 
     def images(self, frame: int) -> tuple[Image, Image]:
-        """Read the left and the right image of a frame.
+        """Read the left and the right image of a frame, rectified.
 
         Raises:
-            ValueError: If a file is no image.
+            ValueError: If a file is no image, or of another size than the others.
         """
-        return read_grey(self.left[frame]), read_grey(self.right[frame])
+        pair = read_grey(self.left[frame]), read_grey(self.right[frame])
+        return pair if self.rig is None else self.rig.rectify(*pair)
 
 
 def holds_images(path: str | Path) -> bool:
@@ -72,7 +75,7 @@ def load_kitti_images(path: str | Path, truth: str | Path | None = None, duratio
     if [file.name for file in left] != [file.name for file in right] or len(left) < 2:
         got = f"a pair of folders with {len(left)} and {len(right)}"
         raise bad_argument("path", "two or more images of the same names in both eyes", got, f"Check {str(folder)!r}.")
-    times = _times(folder / "times.txt", len(left))
+    times = read_times(folder / "times.txt" if (folder / "times.txt").is_file() else None, len(left))
     keep = len(times)
     if duration is not None:
         end = times[0] + check_float("duration", duration, "Give seconds.", above=0.0)
@@ -113,14 +116,19 @@ def _eyes(folder: Path) -> tuple[Path, Path] | None:
     return None
 
 
-def _times(file: Path, count: int) -> FloatArray:
-    """Return the times (count,) [s] of the images; without a file of them the usual ones."""
-    if not file.is_file():
+def read_times(file: Path | None, count: int) -> FloatArray:
+    """Return the times (count,) [s] of the images; without a file of them the usual ones.
+
+    Raises:
+        ValueError: If the file holds fewer numbers, or they do not rise.
+    """
+    if file is None:
         return np.arange(count, dtype=np.float64) * PERIOD
     try:
         times = np.array([float(word) for word in file.read_text("utf-8").split()])
-    except ValueError:
+    except (OSError, ValueError):
         times = np.empty(0)
-    if len(times) < count or not (np.diff(times) > 0.0).all():
-        raise bad_argument("path", f"times.txt with {count} rising times", "another file", f"Correct {str(file)!r}.")
+    if len(times) < count or not np.isfinite(times).all() or not (np.diff(times) > 0.0).all():
+        expected = f"{file.name} with {count} rising times"
+        raise bad_argument("path", expected, "another file", f"Correct {str(file)!r}: seconds, one for each image.")
     return times[:count]

@@ -1,3 +1,4 @@
+import json
 from pathlib import Path
 from typing import Any
 
@@ -6,7 +7,10 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from slam_backend.landmark_map import LandmarkMap
 from slam_backend.readers.kitti_images import holds_images, load_kitti_images
+from slam_backend.readers.stereo_files import StereoFiles, load_stereo_images
+from slam_backend.trajectory import Trajectory
 from training.cli import app
 from training.figures_images import expected_pixels
 from training.replay_images import ImagesConfig, replay_images, score_images
@@ -82,6 +86,52 @@ def test_the_command_takes_a_folder_of_images(drive: Path, tmp_path: Path) -> No
     for name in ("frame.png", "replay.png", "metrics.json", "config.toml"):
         assert (tmp_path / "run" / name).stat().st_size > 0
     assert (cv2.imread(str(tmp_path / "run" / "frame.png")) != 0).any()
+
+
+def test_drives_of_any_layout_are_followed(drive: Path, tmp_path: Path) -> None:
+    """`vslam replay stereo` with file names follows three pairs and more as `vslam replay kitti` does."""
+    (tmp_path / "stamps.txt").write_text("\n".join(str(5.0 + 0.1 * i) for i in range(6)))
+    few = ["--path", str(drive), "--particles", "10"]
+    names = [
+        "--left",
+        "image_0/*.png",
+        "--right",
+        "image_1/*.png",
+        "--calibration",
+        "calib.txt",
+        "--truth",
+        "poses.txt",
+    ]
+    stamps = ["--times", str(tmp_path / "stamps.txt")]
+    for out, arguments in (
+        ("kitti", ["kitti", *few]),
+        ("stereo", ["stereo", *few, "--max-range", "40", *names, *stamps]),
+        ("again", ["stereo", "--config", str(tmp_path / "stereo")]),
+    ):
+        done = CliRunner().invoke(app, ["replay", *arguments, "--out", str(tmp_path / out)])
+        assert done.exit_code == 0, done.output
+    found = [json.loads((tmp_path / out / "metrics.json").read_text()) for out in ("kitti", "stereo", "again")]
+    assert found[0]["robots"] == found[1]["robots"] == found[2]["robots"]
+    assert Trajectory.load_tum(tmp_path / "stereo" / "estimate.tum").times[0] == 5.0
+    assert len(LandmarkMap.load(tmp_path / "stereo" / "map_1.npz")) == found[0]["landmarks"]
+
+
+def test_raw_images_of_a_drive_are_rectified(drive: Path) -> None:
+    """Two calibrations of raw cameras do for a drive, too."""
+    eye = "T_BS:\n  data: [1.0, 0.0, 0.0, {x}, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0]\n"
+    eye += (
+        f"resolution: [{WIDTH}, {HEIGHT}]\nintrinsics: [{FOCAL}, {FOCAL}, {0.5 * (WIDTH - 1)}, {0.5 * (HEIGHT - 1)}]\n"
+    )
+    eye += "distortion_coefficients: [0.0, 0.0, 0.0, 0.0]\n"
+    for name, x in (("l.yaml", 0.0), ("r.yaml", BASELINE)):
+        (drive / name).write_text(eye.replace("{x}", str(x)))
+    files = StereoFiles(left="image_0/*.png", right="image_1/*.png", calibration="l.yaml,r.yaml", truth="poses.txt")
+    log = load_stereo_images(drive, files, duration=0.35)
+    assert len(log.left) == 4
+    assert log.pair.baseline == pytest.approx(BASELINE)
+    raw = load_kitti_images(drive).images(2)
+    for found, expected in zip(log.images(2), raw, strict=True):
+        assert np.abs(found.astype(float) - expected).mean() < 1.0
 
 
 def test_times_and_duration(drive: Path) -> None:

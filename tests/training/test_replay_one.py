@@ -193,13 +193,14 @@ def test_a_run_is_written_and_repeats_itself(
         assert said.status == 0
         monkeypatch.chdir(first)  # the config works from any folder
     assert "times real time" in said.out
+    assert "RMS distance to the truth [m]" in said.out
     truth = {"truth.tum"} if command == "kitti" else set()
     assert {file.name for file in first.iterdir()} == truth | {
         "config.toml", "metrics.json", "replay.png", "timing.json", "estimate.tum", "dead_reckoning.tum",
         "map_1.npz", "map_1.csv",
     }  # fmt: skip
     assert (first / "replay.png").read_bytes()[:4] == b"\x89PNG"
-    assert "Maps as data: map_1," in said.out
+    assert "Maps as data: map_1 (" in said.out
     assert len(LandmarkMap.load(first / "map_1.npz")) == json.loads((first / "metrics.json").read_text())["landmarks"]
     assert json.loads((first / "timing.json").read_text())["times_real_time"] > 0.0
     metrics = json.loads((first / "metrics.json").read_text())

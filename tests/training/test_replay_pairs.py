@@ -1,5 +1,6 @@
 import json
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -8,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from slam_backend.camera import ROBOT_FROM_CAMERA, StereoCamera
+from slam_backend.landmark_map import LandmarkMap
 from training.cli import app
 from training.replay_pairs import PairsConfig, align_pairs, load_pairs
 from training.stereo_scenes import WALL, Scene, wall_pose
@@ -89,3 +91,73 @@ def test_missing_files_are_named(room: Path, tmp_path: Path) -> None:
         load_pairs(tmp_path)
     with pytest.raises(ValueError, match="descriptor: expected one of"):
         PairsConfig.from_mapping({"path": str(room), "descriptor": "surf"})
+
+
+def test_other_file_names_are_options(room: Path, tmp_path: Path) -> None:
+    """The same images under other names, in other folders, give the same alignment; the run repeats from its config."""
+    names = {"left_img_0.png": "cam0/2.png", "left_img_1.png": "cam0/10.png", "right_img_0.png": "cam1/a.png"}
+    names |= {"right_img_1.png": "cam1/b.png", "sensorLeft.yaml": "l.yaml", "sensorRight.yaml": "r.yaml"}
+    other = tmp_path / "other"
+    for eye in ("cam0", "cam1"):
+        (other / eye).mkdir(parents=True)
+    for name, new in (names | {"poses_dev.txt": "truth.txt"}).items():
+        (other / new).write_bytes((room / name).read_bytes())
+    options = ["--left", "cam0/*.png", "--right", "cam1/a.png, cam1/b.png", "--calibration", "l.yaml,r.yaml"]
+    for out, arguments in (
+        ("usual", ["--path", str(room)]),
+        ("other", ["--path", str(other), *options, "--truth", str(other / "truth.txt")]),
+        ("again", ["--config", str(tmp_path / "run-other")]),
+    ):
+        done = CliRunner().invoke(app, ["replay", "stereo", *arguments, "--out", str(tmp_path / f"run-{out}")])
+        assert done.exit_code == 0, done.output
+    found = [json.loads((tmp_path / f"run-{out}" / "metrics.json").read_text()) for out in ("usual", "other", "again")]
+    assert found[0]["alignments"] == found[1]["alignments"] == found[2]["alignments"]
+    assert found[0]["alignments"]["usurf"]["error_m"] < 0.03
+    for place in (0, 1):
+        landmarks = LandmarkMap.load(tmp_path / "run-other" / f"map_{place}.npz")
+        assert len(landmarks) == found[0]["alignments"]["usurf"]["points"][place]
+        assert landmarks.means[:, 0].min() > 1.0  # ahead of the camera
+
+
+def test_rectified_pairs_need_one_file(room: Path, tmp_path: Path) -> None:
+    """KITTI's calibration and poses serve two pairs, too: the left camera is the body then."""
+    focal, middle = CAMERA.focal_px, f"{0.5 * (CAMERA.width - 1)} {{}} 0 {CAMERA.focal_px} {0.5 * (CAMERA.height - 1)}"
+    rows = [f"{focal} 0 {middle.format(shift)} 0 0 0 1 0\n" for shift in (0.0, -focal * CAMERA.baseline)]
+    (tmp_path / "calib.txt").write_text("".join(rows))
+    log = load_pairs(room)
+    assert log.poses is not None
+    poses = [" ".join(map(str, pose[:3].ravel())) for pose in log.poses]
+    (tmp_path / "poses.txt").write_text("\n".join(poses) + "\n")
+    calibration, truth = str(tmp_path / "calib.txt"), str(tmp_path / "poses.txt")
+    config = PairsConfig(path=str(room), calibration=calibration, truth=truth)
+    result = align_pairs(load_pairs(room, config.files), config)
+    assert result.true_deg == pytest.approx(np.degrees(0.3), abs=1e-6)
+    assert result.error_m < 0.03
+    assert result.error_deg < 0.5
+
+
+def test_the_command_says_that_no_truth_is_known(room: Path, tmp_path: Path) -> None:
+    """Without poses there are no columns of errors."""
+    for file in room.iterdir():
+        if file.name != "poses_dev.txt":
+            (tmp_path / file.name).write_bytes(file.read_bytes())
+    done = CliRunner().invoke(app, ["replay", "stereo", "--path", str(tmp_path), "--out", str(tmp_path / "run")])
+    assert done.exit_code == 0, done.output
+    assert "Errors: no ground truth in this folder." in done.output
+    assert "error (m)" not in done.output
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--left", "left_img_0.png"), "path: expected two or more images, as many of both eyes, got a folder with 1 "),
+        (("--right", "none*.png"), "path: expected an image file, got no such file. Check "),
+        (("--calibration", "none.yaml,none.yaml"), "calibration: expected a readable file of a calibration"),
+        (("--calibration", "a,b,c"), "calibration: expected one file or two, got 'a,b,c'"),
+        (("--truth", "none.txt"), "truth: expected a file of true poses, got no such file"),
+        (("--times", "times.txt"), "times: expected a drive of three pairs or more, got a folder with two pairs"),
+    ],
+)
+def test_bad_names_are_refused(options: tuple[str, ...], message: str, room: Path, refusal: Any) -> None:
+    """What is missing is named, and the option with which to name another."""
+    assert message in refusal("replay", "stereo", "--path", str(room), *options)

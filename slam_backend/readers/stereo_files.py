@@ -1,0 +1,149 @@
+"""Stereo images in a folder of any layout: which files are of which eye, and the rig that took them."""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from slam_backend.errors import bad_argument, check_float
+from slam_backend.readers.calibration import (
+    Rectified,
+    Rectifier,
+    load_euroc_calibration,
+    load_kitti_calibration,
+)
+from slam_backend.readers.kitti import read_truth
+from slam_backend.readers.kitti_images import KittiImages, read_grey, read_times
+
+LEAST_PAIRS = 2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StereoFiles:
+    """Names of the files of a stereo log, within its folder unless they are absolute paths.
+
+    Attributes:
+        left: Images of the left eye: a pattern such as `cam0/*.png`, taken in order of the numbers in the names, or
+            names with commas between.
+        right: Images of the right eye, in the same way and order.
+        calibration: One file of the projection matrices of rectified images (KITTI's `calib.txt`), or two files
+            `sensor.yaml` of EuRoC's raw cameras with a comma between, the left one first.
+        times: File of the seconds of the frames; None: 0.1 s apart.
+        truth: File of the true poses; None: not known.
+    """
+
+    left: str = "left_img_*.png"
+    right: str = "right_img_*.png"
+    calibration: str = "sensorLeft.yaml,sensorRight.yaml"
+    times: str | None = None
+    truth: str | None = None
+
+
+def find_pairs(folder: str | Path, files: StereoFiles) -> tuple[tuple[Path, ...], tuple[Path, ...]]:
+    """Return the images of the left and of the right eye, as many of each.
+
+    Raises:
+        ValueError: If the folder or an image is missing, or there are not as many of both eyes, two at least.
+    """
+    root = Path(folder)
+    if not root.is_dir():
+        raise bad_argument("path", "a folder with two stereo pairs", "no such folder", f"Check {str(root)!r}.")
+    left, right = (_images(root, option, getattr(files, option)) for option in ("left", "right"))
+    if len(left) != len(right) or len(left) < LEAST_PAIRS:
+        got = f"a folder with {len(left)} {files.left!r} and {len(right)} {files.right!r}"
+        raise bad_argument(
+            "path", "two or more images, as many of both eyes", got, "Name them with --left and --right."
+        )
+    return left, right
+
+
+def load_rig(folder: str | Path, calibration: str, size: tuple[int, int]) -> Rectifier | Rectified:
+    """Read the calibration of a rig.
+
+    Args:
+        folder: In which the names are looked up.
+        calibration: As `StereoFiles` has it.
+        size: Width and height of the images [px].
+
+    Raises:
+        ValueError: If it names neither one file nor two, or they cannot be used.
+    """
+    names = _words(calibration)
+    if len(names) not in (1, 2):
+        cure = "Name calib.txt, or sensor.yaml of the left and of the right camera with a comma between."
+        raise bad_argument("calibration", "one file or two", repr(calibration), cure)
+    places = [Path(folder) / name for name in names]
+    if len(places) == 2:
+        return load_euroc_calibration(*places)
+    return Rectified(load_kitti_calibration(places[0]), *size)
+
+
+def load_stereo_images(folder: str | Path, files: StereoFiles, duration: float | None = None) -> KittiImages:
+    """Read a drive of stereo images, raw or rectified.
+
+    Args:
+        folder: Of the drive.
+        files: Names within it. `truth` has rows of a 3 x 4 matrix, as KITTI's poses.
+        duration: Keep this many seconds [s]. None: all.
+
+    Raises:
+        ValueError: If a file is missing or cannot be read.
+    """
+    left, right = find_pairs(folder, files)
+    count = len(left)
+    times = read_times(None if files.times is None else _existing("times", Path(folder), files.times), count)
+    keep = count
+    if duration is not None:
+        end = times[0] + check_float("duration", duration, "Give seconds.", above=0.0)
+        keep = max(LEAST_PAIRS, int(np.searchsorted(times, end, side="right")))
+    height, width = read_grey(left[0]).shape
+    rig = load_rig(folder, files.calibration, (width, height))
+    truth = None if files.truth is None else read_truth(_existing("truth", Path(folder), files.truth), times)
+    return KittiImages(times[:keep], left[:keep], right[:keep], rig.pair, width, height, truth, rig)
+
+
+def truth_file(folder: str | Path, files: StereoFiles) -> Path | None:
+    """Return the file of true poses, None where none is named.
+
+    Raises:
+        ValueError: If it is named and not there.
+    """
+    return None if files.truth is None else _existing("truth", Path(folder), files.truth)
+
+
+def _images(folder: Path, option: str, names: str) -> tuple[Path, ...]:
+    """Return the images that a pattern or a list names; those of a pattern in order of the numbers in their names."""
+    if any(sign in names for sign in "*?["):
+        whole = Path(names)
+        root, pattern = (
+            (Path(whole.anchor), str(whole.relative_to(whole.anchor))) if whole.is_absolute() else (folder, names)
+        )
+        found = sorted((file for file in root.glob(pattern) if file.is_file()), key=_by_numbers)
+    else:
+        found = [folder / name for name in _words(names)]
+    if not found or not all(file.is_file() for file in found):
+        missing = next((str(file) for file in found if not file.is_file()), str(folder / names))
+        raise bad_argument(
+            "path", "an image file", "no such file", f"Check {missing!r}, or name yours with --{option}."
+        )
+    return tuple(found)
+
+
+def _by_numbers(file: Path) -> list[tuple[int, str]]:
+    """Return a key by which `img_2` comes before `img_10`."""
+    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"([0-9]+)", str(file))]
+
+
+def _words(names: str) -> list[str]:
+    """Return the names between the commas."""
+    return [name.strip() for name in names.split(",") if name.strip()]
+
+
+def _existing(option: str, folder: Path, name: str) -> Path:
+    """Return where a file is, and refuse one that is not there."""
+    place = folder / name
+    if not place.is_file():
+        what = {"times": "a file of the seconds of the frames", "truth": "a file of true poses"}[option]
+        raise bad_argument(option, what, "no such file", f"Check {str(place)!r}.")
+    return place
