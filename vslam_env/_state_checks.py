@@ -92,12 +92,13 @@ class EpisodeCheck:
         check_keys(f"{name}['coverage']", state["coverage"], ("ever", "found"))
         check_kept(f"{name}['coverage']['ever']", state["coverage"]["ever"], BOOL, (cells,))
         check_indices(f"{name}['coverage']['found']", state["coverage"]["found"], (count,), 0, cells)
-        check_length(f"{name}['counts']", state["counts"], 2)
-        collisions, distances = state["counts"]
+        check_length(f"{name}['counts']", state["counts"], 3)
+        collisions, distances, error_integrals = state["counts"]
         check_kind(f"{name}['counts'][0]", collisions, tuple)
         check_length(f"{name}['counts'][0]", collisions, count)
         check_wholes(f"{name}['counts'][0]", collisions)
         check_floats(f"{name}['counts'][1]", distances, (count,), 0.0)
+        check_floats(f"{name}['counts'][2]", error_integrals, (count,), 0.0)
         check_length(f"{name}['last']", state["last"], 2)
         self._check_readings(f"{name}['last'][0]", state["last"][0])
         self._check_frames(f"{name}['last'][1]", state["last"][1], setting)
