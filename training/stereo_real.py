@@ -1,5 +1,13 @@
-"""The front end on real images: a pair with known disparities, a chessboard rig, and planar pairs with homographies."""
+"""The front end on real images, whatever a folder holds of them.
 
+A pair with known disparities and a chessboard rig (OpenCV's samples), planar pairs with homographies, and stereo pairs
+with the calibration of their rig.
+"""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -8,19 +16,181 @@ import numpy as np
 
 from slam_backend.camera import StereoCamera
 from slam_backend.errors import Float32Array, FloatArray, bad_argument
-from slam_backend.frontend import KINDS, CornerOptions, FrontEndOptions, StereoFrontEnd, harris_corners
+from slam_backend.frontend import GUARDS, KINDS, CornerOptions, FrontEndOptions, StereoFrontEnd, harris_corners
 from slam_backend.frontend.descriptors import describe_points, nearest
 from slam_backend.frontend.images import Image
 from slam_backend.readers.calibration import Eye, Rectifier
 from slam_backend.readers.kitti_images import read_grey
+from slam_backend.readers.stereo_files import load_rig
 from training.stereo_quality import guard_rows
 
 ALOE_SPAN = 3740.0 * 0.16  # focal length [px] times baseline [m] of the Middlebury rig of 2006
 ALOE_DISPARITIES = (15.0, 260.0)
 BOARD = (9, 6)  # inner corners of the chessboard
-PLANAR_PAIRS = ("BruggeTower", "LePoint1", "WhiteBoard", "adam", "boat")
+MODEL = "_model.txt"  # ends the name of a planar pair's homography
+SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".ppm", ".tif", ".tiff")
+LAYOUTS = (
+    ("left*", "right*"), ("image_0/*", "image_1/*"), ("image_l/*", "image_r/*"), ("cam0/*", "cam1/*"),
+    ("cam0/data/*", "cam1/data/*"), ("*_l.*", "*_r.*"), ("*L.*", "*R.*"),
+)  # fmt: skip
+CALIBRATIONS = ("calib.txt", "sensorLeft.yaml,sensorRight.yaml", "cam0/sensor.yaml,cam1/sensor.yaml")
+MOST_PAIRS = 10  # of a rig are measured
+LEAST_DISPARITY, LARGEST_DISPARITY = 1.0, 0.25  # px; share of the width
+EXPECTED = (
+    "pairs with a model file: NAMEA, NAMEB and NAME_model.txt (a homography), or left and right images with calib.txt "
+    "or two sensor.yaml"
+)
 PLANAR_CORNERS, PLANAR_TOLERANCE = 1000, 4.0  # px in the first image
 FARTHEST_SQUARES = 60.0  # points farther than this are dropped [squares]
+
+
+@dataclass(frozen=True, slots=True)
+class RealPart:
+    """Something that a folder of real images lets be measured.
+
+    Attributes:
+        key: Under which the bench keeps it.
+        name: Of the part, for people.
+        measure: Returns rows, or one row.
+    """
+
+    key: str
+    name: str
+    measure: Callable[[], Any]
+
+
+def find_parts(folder: Path, descriptors: Sequence[str]) -> list[RealPart]:
+    """Return what there is to be measured in a folder and in those within it.
+
+    Args:
+        folder: With any of OpenCV's samples; planar pairs `NAMEA`, `NAMEB` with their homography `NAME_model.txt`;
+            stereo pairs in one of `LAYOUTS` with one of `CALIBRATIONS`.
+        descriptors: Keys of `KINDS`.
+    """
+    parts: list[RealPart] = []
+    for place in (folder, *_folders_in(folder)):
+        if (place / "aloeGT.png").is_file():
+            parts += [RealPart("aloe", f"aloe, {way}", partial(_aloe, place, way)) for way in descriptors]
+        if (place / "left01.jpg").is_file() and not _calibration(place):
+            parts.append(RealPart("chessboard", "chessboard", partial(chessboard, place)))
+        for model in sorted(place.glob(f"*{MODEL}")):
+            parts.append(
+                RealPart("planar", f"planar pair {model.name.removesuffix(MODEL)}", partial(planar_rows, model))
+            )
+        for rig in (place, *(_folders_in(place) if place != folder else ())):
+            if _calibration(rig):
+                parts.append(RealPart("rigs", f"stereo pairs in {rig.name}", partial(rig_rows, rig, descriptors)))
+    return parts
+
+
+def measure_parts(
+    parts: Sequence[RealPart],
+    result: dict[str, Any],
+    on_part: Callable[[str], None] = lambda name: None,
+    interrupted: Callable[[], bool] = lambda: False,
+) -> None:
+    """Measure parts one after the other, and add each to a result; one that fails is noted, and the others go on.
+
+    Args:
+        parts: Of `find_parts`.
+        result: Of the bench; changed. `failed` holds what was wrong, by the names of the parts.
+        on_part: Called with the name of each part.
+        interrupted: Asked before each part.
+    """
+    for part in parts:
+        if interrupted():
+            return
+        on_part(part.name)
+        try:
+            found = part.measure()
+        except Exception as error:  # of any kind: OpenCV's, numpy's or ours, on images of anyone
+            result.setdefault("failed", {})[part.name] = str(error) or type(error).__name__
+            continue
+        if isinstance(found, list):
+            result.setdefault(part.key, []).extend(found)
+        else:
+            result.setdefault(part.key, {}).update(found)
+
+
+def _folders_in(folder: Path) -> list[Path]:
+    """Return the folders within one, in order."""
+    return sorted(below for below in folder.iterdir() if below.is_dir())
+
+
+def _aloe(folder: Path, descriptor: str) -> dict[str, Any]:
+    """Return `aloe_rows` under the name of the descriptor."""
+    return {descriptor: aloe_rows(folder, descriptor)}
+
+
+def rig_rows(folder: Path, descriptors: Sequence[str]) -> list[dict[str, Any]]:
+    """Measure stereo pairs of a calibrated rig: how many matches each guard leaves, how far points are, and the time.
+
+    Args:
+        folder: In one of `LAYOUTS`, with one of `CALIBRATIONS`; at most `MOST_PAIRS` of its pairs are measured, evenly
+            chosen.
+        descriptors: Keys of `KINDS`.
+
+    Returns:
+        Per descriptor: `rig`, `descriptor`, `pairs`; means over the pairs of `matches`, of those left after each guard
+        (`left`), of `points`, of the median depth `depth_m` (None without points), and the time of a pair `ms`.
+
+    Raises:
+        ValueError: If there are no such images, or the calibration cannot be used.
+    """
+    left, right = _eyes(folder)
+    chosen = np.unique(np.linspace(0, len(left) - 1, min(len(left), MOST_PAIRS)).round().astype(int))
+    pairs = [(read_grey(left[n]), read_grey(right[n])) for n in chosen]
+    height, width = pairs[0][0].shape
+    rig = load_rig(folder, _calibration(folder), (width, height))
+    span = rig.pair.focal_px * rig.pair.baseline
+    camera = rig.pair.camera(width, height, max_range=span / LEAST_DISPARITY)
+    rectified = [rig.rectify(*pair) for pair in pairs]
+    rows = []
+    for descriptor in descriptors:
+        nearest_m = span / (LARGEST_DISPARITY * width)
+        kind: Any = descriptor
+        options = FrontEndOptions(descriptor=kind, nearest=nearest_m, corners=CornerOptions(most=1500))
+        eye = StereoFrontEnd(camera, options, rig.pair.centre_px)
+        eye.measure(*rectified[0])  # nothing is loaded or compiled any more when it is timed
+        began = time.perf_counter()
+        frames = [eye.measure(*pair) for pair in rectified]
+        spent = 1e3 * (time.perf_counter() - began) / len(frames)
+        kept = [np.cumprod(frame.matches.passed, axis=0).sum(axis=1) for frame in frames]
+        depths = np.concatenate([frame.measurements.points[:, 2] for frame in frames])
+        rows.append(
+            {
+                "rig": folder.name,
+                "descriptor": descriptor,
+                "pairs": len(frames),
+                "matches": float(np.mean([frame.matches.passed.shape[1] for frame in frames])),
+                "left": dict(zip(GUARDS, np.mean(kept, axis=0).tolist(), strict=True)),
+                "points": float(np.mean([len(frame.measurements) for frame in frames])),
+                "depth_m": float(np.median(depths)) if len(depths) else None,
+                "ms": spent,
+            }
+        )
+    return rows
+
+
+def _calibration(folder: Path) -> str:
+    """Return the calibration of a rig that a folder holds, "" if there is none."""
+    for names in CALIBRATIONS:
+        if all((folder / name).is_file() for name in names.split(",")):
+            return names
+    return ""
+
+
+def _eyes(folder: Path) -> tuple[list[Path], list[Path]]:
+    """Return the images of the left and of the right eye."""
+    for layout in LAYOUTS:
+        left, right = (
+            sorted(file for file in folder.glob(names) if file.suffix.lower() in SUFFIXES) for names in layout
+        )
+        if left and len(left) == len(right):
+            return left, right
+    got = f"a folder with {_calibration(folder)} alone"
+    expected = "as many left as right images, " + ", ".join(f"{one} and {other}" for one, other in LAYOUTS[:4])
+    raise bad_argument("real", expected, got, f"Check {str(folder)!r}.")
 
 
 def aloe_rows(folder: Path, descriptor: Any) -> list[dict[str, Any]]:
@@ -114,25 +284,61 @@ def chessboard(folder: Path) -> dict[str, Any]:
 def planar_scores(folder: Path) -> list[dict[str, Any]]:
     """Return matching scores on planar pairs with known homographies.
 
+    Args:
+        folder: Of pairs `NAMEA`, `NAMEB` with `NAME_model.txt`.
+    """
+    return [row for model in sorted(folder.glob(f"*{MODEL}")) for row in planar_rows(model)]
+
+
+def planar_rows(file: Path) -> list[dict[str, Any]]:
+    """Return matching scores on one planar pair.
+
     Descriptors of Harris corners, upright, by u-SURF, SIFT and ORB; and OpenCV's SIFT and ORB with their own keypoints
     and rotations beside them. A match is a mutual nearest descriptor; it is right if the homography takes it within
     4 px. Score: right ones among the matches.
+
+    Args:
+        file: `NAME_model.txt`, the homography from image `NAMEB` to `NAMEA` beside it.
+
+    Raises:
+        ValueError: If it holds no 3 x 3 homography, or an image is missing.
     """
+    name = file.name.removesuffix(MODEL)
+    model = _homography(file)
+    a, b = (read_grey(_image(file.parent, f"{name}{side}")) for side in "AB")
     rows = []
-    for name in PLANAR_PAIRS:
-        suffix = ".jpg" if name == "WhiteBoard" else ".png"
-        a, b = (read_grey(folder / f"{name}{side}{suffix}") for side in "AB")
-        model = np.loadtxt(folder / f"{name}_model.txt").reshape(3, 3)
-        for way in (*KINDS, "sift_own", "orb_own"):
-            (at_a, described_a), (at_b, described_b) = (_described(image, way) for image in (a, b))
-            there, _ = nearest(described_b, described_a)
-            back, _ = nearest(described_a, described_b)
-            matched = np.flatnonzero(back[there] == np.arange(len(there)))
-            lifted = np.column_stack([at_b[matched], np.ones(len(matched))]) @ model.T
-            errors = np.hypot(*(lifted[:, :2] / lifted[:, 2:] - at_a[there[matched]]).T)
-            right = int((errors <= PLANAR_TOLERANCE).sum())
-            rows.append({"pair": name, "way": way, "matches": len(matched), "right": right})
+    for way in (*KINDS, "sift_own", "orb_own"):
+        (at_a, described_a), (at_b, described_b) = (_described(image, way) for image in (a, b))
+        row = {"pair": name, "way": way, "matches": 0, "right": 0}
+        rows.append(row)
+        if not len(at_a) or not len(at_b):
+            continue
+        there, _ = nearest(described_b, described_a)
+        back, _ = nearest(described_a, described_b)
+        matched = np.flatnonzero(back[there] == np.arange(len(there)))
+        lifted = np.column_stack([at_b[matched], np.ones(len(matched))]) @ model.T
+        errors = np.hypot(*(lifted[:, :2] / lifted[:, 2:] - at_a[there[matched]]).T)
+        row |= {"matches": len(matched), "right": int((errors <= PLANAR_TOLERANCE).sum())}
     return rows
+
+
+def _homography(file: Path) -> FloatArray:
+    """Return the homography (3, 3) that a file of nine numbers holds."""
+    try:
+        numbers = np.array(file.read_text(encoding="utf-8").replace(",", " ").split(), dtype=np.float64)
+    except (OSError, ValueError):
+        numbers = np.empty(0)
+    if numbers.shape != (9,) or not np.isfinite(numbers).all() or abs(np.linalg.det(numbers.reshape(3, 3))) == 0.0:
+        raise bad_argument("real", f"{file.name} with a 3 x 3 homography", "a different one", f"Correct {str(file)!r}.")
+    return numbers.reshape(3, 3)
+
+
+def _image(folder: Path, stem: str) -> Path:
+    """Return the image of a name, whatever its suffix."""
+    found = [folder / f"{stem}{suffix}" for suffix in SUFFIXES if (folder / f"{stem}{suffix}").is_file()]
+    if not found:
+        raise bad_argument("real", f"an image {stem}.png, .jpg, ...", "no such file", f"Add it to {str(folder)!r}.")
+    return found[0]
 
 
 def _described(image: Image, way: str) -> tuple[FloatArray, Float32Array]:

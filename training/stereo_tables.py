@@ -40,6 +40,10 @@ def markdown(result: dict[str, Any]) -> str:
         )
     if "planar" in result:
         parts.append(_planar(result["planar"]))
+    parts.append(_rigs(result.get("rigs", [])))
+    if result.get("failed"):
+        failed = [f"- {name}: {why}" for name, why in result["failed"].items()]
+        parts.append("\n".join(["**Failed**", "", *failed]))
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
@@ -103,6 +107,18 @@ def _planar(rows: Sequence[dict[str, Any]]) -> str:
         cells = [f"{own[pair]['right']} / {own[pair]['matches']}" for pair in pairs]
         lines.append([NAMES[way], *cells, f"{100 * right / max(matches, 1):.0f} %"])
     return table("Planar pairs: right matches / mutual matches", ["descriptor", *pairs, "score"], lines)
+
+
+def _rigs(rows: Sequence[dict[str, Any]]) -> str:
+    guards = list(rows[0]["left"]) if rows else []
+    columns = ["images", "descriptor", "pairs", "matches", *(f"+ {name}" for name in guards), "points"]
+    columns += ["median depth, m", "front end, ms"]
+    lines = []
+    for row in rows:
+        counts = [f"{count:.0f}" for count in (row["matches"], *row["left"].values(), row["points"])]
+        depth = "-" if row["depth_m"] is None else f"{row['depth_m']:.2f}"
+        lines.append([row["rig"], NAMES[row["descriptor"]], str(row["pairs"]), *counts, depth, f"{row['ms']:.1f}"])
+    return table("Stereo pairs with a calibration: matches left after each guard, means", columns, lines)
 
 
 def _share(value: float | None) -> str:

@@ -1,6 +1,8 @@
+import json
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from typer.testing import CliRunner
@@ -9,7 +11,7 @@ from slam_backend.frontend import GUARDS, StereoFrontEnd
 from training.bench_stereo import StereoBenchConfig, camera_of, speed_row
 from training.cli import app
 from training.stereo_quality import guard_rows, quality_row, retrieval, second_looks
-from training.stereo_real import aloe_rows, chessboard, planar_scores
+from training.stereo_real import aloe_rows, chessboard, find_parts, measure_parts, planar_scores, rig_rows
 from training.stereo_scenes import WALL, Scene, panel_hall, wall_pose
 from training.stereo_tables import markdown
 
@@ -120,6 +122,109 @@ def test_impossible_benches_are_refused(change: dict[str, Any], message: str) ->
     """The error names the option."""
     with pytest.raises(ValueError, match=message):
         StereoBenchConfig.from_mapping(change)
+
+
+HOMOGRAPHY = np.array([[1.0, 0.02, 5.0], [-0.01, 1.0, 3.0], [0.0, 0.0, 1.0]])
+
+
+def _photograph(shape: tuple[int, int] = (240, 320)) -> np.ndarray:
+    """Return an image full of corners."""
+    rng, image = np.random.default_rng(4), np.full(shape, 128, np.uint8)
+    for _ in range(250):
+        x, y = rng.integers(0, shape[1] - 10), rng.integers(0, shape[0] - 10)
+        image[y : y + rng.integers(6, 30), x : x + rng.integers(6, 30)] = rng.integers(10, 245)
+    return image
+
+
+def _write_pairs(folder: Path) -> None:
+    """Write a planar pair of any name, and below it a rectified stereo pair of a wall 3 m ahead."""
+    photograph = _photograph()
+    warp = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    cv2.imwrite(str(folder / "houseA.jpg"), photograph)
+    cv2.imwrite(str(folder / "houseB.bmp"), cv2.warpPerspective(photograph, HOMOGRAPHY, (320, 240), flags=warp))
+    np.savetxt(folder / "house_model.txt", HOMOGRAPHY)
+    (folder / "rig").mkdir()
+    cv2.imwrite(str(folder / "rig" / "left0.png"), photograph[:, :300])
+    cv2.imwrite(str(folder / "rig" / "right0.png"), photograph[:, 10:310])  # 10 px of disparity
+    rows = [f"300 0 150 {shift} 0 300 120 0 0 0 1 0" for shift in (0.0, -30.0)]
+    (folder / "rig" / "calib.txt").write_text("\n".join(rows))
+
+
+def test_any_pairs_with_a_model_file_are_measured(tmp_path: Path) -> None:
+    """Planar pairs are found by their homography, stereo pairs by their calibration, whatever their names."""
+    _write_pairs(tmp_path)
+    parts = find_parts(tmp_path, ("usurf", "orb"))
+    assert [part.name for part in parts] == ["planar pair house", "stereo pairs in rig"]
+    result: dict[str, Any] = {"speed": [], "quality": [], "retrieval": []}
+    measure_parts(parts, result)
+    assert "failed" not in result
+    rows = {row["way"]: row for row in result["planar"]}
+    assert rows["usurf"]["right"] > 0.8 * rows["usurf"]["matches"] > 40
+    assert [row["descriptor"] for row in result["rigs"]] == ["usurf", "orb"]
+    for row in result["rigs"]:
+        assert row["pairs"] == 1
+        assert row["depth_m"] == pytest.approx(3.0, abs=0.02)
+        assert row["points"] > 50
+        left = [row["matches"], *row["left"].values()]
+        assert left == sorted(left, reverse=True)
+    text = markdown(result)
+    assert "| u-SURF | " in text
+    assert "| rig | ORB | 1 | " in text
+
+
+def test_what_fails_is_noted_and_the_rest_goes_on(tmp_path: Path) -> None:
+    """A broken model file, a missing image and a rig without images each fail by themselves."""
+    _write_pairs(tmp_path)
+    (tmp_path / "a_model.txt").write_text("1 2 three")
+    (tmp_path / "b_model.txt").write_text("1 0 0 0 1 0 0 0 1")
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "empty" / "calib.txt").write_text("")
+    result: dict[str, Any] = {"speed": [], "quality": [], "retrieval": []}
+    told: list[str] = []
+    measure_parts(find_parts(tmp_path, ("usurf",)), result, told.append)
+    assert told == [
+        "planar pair a",
+        "planar pair b",
+        "planar pair house",
+        "stereo pairs in empty",
+        "stereo pairs in rig",
+    ]
+    assert set(result["failed"]) == {"planar pair a", "planar pair b", "stereo pairs in empty"}
+    assert result["failed"]["planar pair a"].startswith(
+        "real: expected a_model.txt with a 3 x 3 homography, got a diff"
+    )
+    assert result["failed"]["planar pair b"].startswith("real: expected an image bA.png, .jpg, ..., got no such file")
+    assert result["failed"]["stereo pairs in empty"].startswith("real: expected as many left as right images")
+    assert len(result["rigs"]) == 1
+    assert "**Failed**" in markdown(result)
+    with pytest.raises(ValueError, match="real: expected as many left as right images"):
+        rig_rows(tmp_path / "empty", ("usurf",))
+
+
+def test_the_command_keeps_what_it_has(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, vslam: Any) -> None:
+    """A real part that fails costs the exit status 2 and one line, not the results of the others."""
+    rendered: dict[str, Any] = {"speed": [], "quality": [], "retrieval": []}
+    monkeypatch.setattr("training.bench_stereo.run_stereo_bench", lambda *arguments: dict(rendered))
+    _write_pairs(tmp_path)
+    (tmp_path / "broken_model.txt").write_text("no numbers")
+    run = tmp_path / "out"
+    said = vslam("bench", "stereo", "--real", str(tmp_path), "--descriptors", "usurf", "--out", str(run))
+    assert said.status == 2
+    assert said.err.startswith("error planar pair broken: real: expected broken_model.txt with a 3 x 3 homography")
+    assert said.err.count("\n") == 1
+    metrics = json.loads((run / "metrics.json").read_text())
+    assert len(metrics["planar"]) == 5
+    assert len(metrics["rigs"]) == 1
+    assert list(metrics["failed"]) == ["planar pair broken"]
+    assert "Planar pairs" in (run / "tables.md").read_text()
+
+
+def test_a_folder_without_real_images_is_refused_at_once(tmp_path: Path, refusal: Any) -> None:
+    """A folder that was named and is missing or holds no pairs is refused before anything is measured."""
+    (tmp_path / "empty").mkdir()
+    assert "real: expected a folder of real images, got no such folder." in refusal("bench", "stereo", "--real", "none")
+    told = refusal("bench", "stereo", "--real", str(tmp_path / "empty"))
+    assert "real: expected a folder with pairs with a model file: NAMEA, NAMEB and NAME_model.txt" in told
 
 
 @pytest.mark.slow
