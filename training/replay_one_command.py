@@ -70,8 +70,16 @@ def replay_victoria(
         scores=(scored.estimate, scored.odometry) if scored else None,
         known=scored.fixes if scored else None,
         known_as="GPS",
-        unknown=NO_TRUTH if log.gps is None else "Fewer than two GPS fixes during this replay: no errors are known.",
+        unknown=NO_TRUTH if log.gps is None else _outside(log.gps[:, 0], result.times),
     )  # fmt: skip
+
+
+def _outside(fixes: "FloatArray", times: "FloatArray") -> str:
+    """Return the line that says that fewer than two fixes at times (g,) [s] fall into a replay at times (T,) [s]."""
+    return (
+        f"Errors: fewer than two GPS fixes ({fixes[0]:.1f} to {fixes[-1]:.1f} s) during this replay ({times[0]:.1f} to "
+        f"{times[-1]:.1f} s)."
+    )
 
 
 def replay_kitti(
@@ -205,7 +213,7 @@ def print_table(console: Console, metrics: dict[str, Any], result: "OneReplay", 
     """Print how far path and dead reckoning are off or that it is `unknown`, what became of the measurements, speed."""
     row = metrics["robots"][0]
     if row["ate_aligned_m"] is None:
-        console.print(unknown, highlight=False)
+        console.print(unknown, soft_wrap=True, highlight=False)
     else:
         table = Table(title=escape("RMS distance to the truth [m]"))
         for name in ("", "after the best rigid fit", "from the start, no fit"):
