@@ -3,7 +3,6 @@
 `FastSlam` is the filter, `TeamSlam` a team of them that merges maps; `align_maps` and `fuse_maps` work on any two maps.
 """
 
-from slam_backend.adaptation import AdaptiveParticles
 from slam_backend.alignment import Alignment, AlignmentOptions, align_maps
 from slam_backend.attempts import AttemptOptions
 from slam_backend.camera import StereoCamera
@@ -25,7 +24,6 @@ from slam_backend.trajectory import Trajectory
 from slam_backend.warming import warm_up
 
 __all__ = [
-    "AdaptiveParticles",
     "Alignment",
     "AlignmentOptions",
     "AttemptOptions",

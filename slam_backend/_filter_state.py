@@ -87,16 +87,6 @@ class FilterState(FilterArrays):
 
     # ------------------------------------------------------------------ other particles, other robots
 
-    def _become(self, ancestors: IntArray) -> None:
-        """Go on with as many particles as there are ancestors (M',), equally weighted."""
-        self._maps = self._maps.taken(ancestors)
-        of_robots, path_log_weights, blind, frame = self._of_robots, self._path_log_weights, self._blind, self._frame
-        self._make_arrays(self.num_robots, len(ancestors), self._maps.padded)
-        self._of_robots[..., : len(ancestors)] = of_robots[..., ancestors]
-        self._path_log_weights[:] = path_log_weights[ancestors]
-        self._blind, self._frame = blind, frame
-        self._look_at_weights()
-
     def _renew(self, new: Particles) -> None:
         """Go on with M particles from smoothed paths; the old ones' most probable says which landmarks there are."""
         m = self.num_particles

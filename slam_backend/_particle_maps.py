@@ -163,18 +163,6 @@ class ParticleMaps(MapStore):
             self.odds[:n, :m] = self.log_odds_prior if odds is None else odds
         self._set_heads(n)
 
-    def taken(self, ancestors: IntArray) -> "ParticleMaps":
-        """Return maps of as many particles as there are ancestors (M',), each a copy of its ancestor's."""
-        slots = self.used_slots()
-        values, counts = self.dense(slots)
-        odds = self.dense_odds(slots)
-        result = ParticleMaps(len(ancestors), self.log_odds_prior)
-        result.load(
-            values[:, :, ancestors], counts[:, ancestors], self.descriptors[slots], self.ids[slots],
-            self.identities[slots], self.next_id, None if odds is None else odds[:, ancestors], self.last_seen[slots],
-        )  # fmt: skip
-        return result
-
     # ------------------------------------------------------------------ snapshots
 
     def get_state(self) -> dict[str, Any]:

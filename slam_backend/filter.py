@@ -16,7 +16,6 @@ from slam_backend._journal import tell_refused
 from slam_backend._rejuvenation_step import RejuvenationStep
 from slam_backend._step_input import FARTHEST_POSE, check_step
 from slam_backend._turns import take_turns
-from slam_backend.adaptation import AdaptiveParticles, next_num_particles
 from slam_backend.camera import StereoCamera
 from slam_backend.errors import check_array
 from slam_backend.existence import ExistenceModel
@@ -41,7 +40,7 @@ class FastSlam(FilterKnowledge):
         initial_poses: (K, 3) [m, m, rad], map frame. None: all at the origin.
         num_particles, camera, motion, proposal, resampling, resample_threshold, position_gate, descriptor_gate,
         dead_zone, dead_radius, recovery_position, recovery_heading, descriptor_sigma, ambiguity,
-        new_landmark_density, one_to_one, landmark_noise, adaptive, existence, rejuvenate_every, smoothing: See
+        new_landmark_density, one_to_one, landmark_noise, existence, rejuvenate_every, smoothing: See
         `FilterOptions`.
 
     Raises:
@@ -76,7 +75,6 @@ class FastSlam(FilterKnowledge):
         new_landmark_density: float = 0.01,
         one_to_one: bool = True,
         landmark_noise: float | None = None,
-        adaptive: AdaptiveParticles | None = None,
         existence: ExistenceModel | None = None,
         rejuvenate_every: int | None = None,
         smoothing: SmoothingOptions | None = None,
@@ -101,7 +99,6 @@ class FastSlam(FilterKnowledge):
             new_landmark_density=new_landmark_density,
             one_to_one=one_to_one,
             landmark_noise=landmark_noise,
-            adaptive=adaptive,
             existence=existence,
             rejuvenate_every=rejuvenate_every,
             smoothing=SmoothingOptions() if smoothing is None else smoothing,
@@ -237,12 +234,5 @@ class FastSlam(FilterKnowledge):
 
     def _resample(self) -> None:
         """Draw the particles anew in proportion to their weights; all that a particle holds goes with it."""
-        count = self.num_particles
-        if self.options.adaptive is not None:
-            poses = np.ascontiguousarray(self._poses[:, :, :count].transpose(0, 2, 1))
-            count = next_num_particles(self.options.adaptive, poses, self._weights)
-        ancestors = RESAMPLING[self.options.resampling](self._weights, self._rng, count)
-        if count == self.num_particles:
-            self._best = self._maps.resample(ancestors, self._of_robots, self._of_particles)
-        else:
-            self._become(ancestors)
+        ancestors = RESAMPLING[self.options.resampling](self._weights, self._rng, self.num_particles)
+        self._best = self._maps.resample(ancestors, self._of_robots, self._of_particles)

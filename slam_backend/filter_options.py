@@ -3,7 +3,6 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
-from slam_backend.adaptation import MOST_PARTICLES, AdaptiveParticles
 from slam_backend.camera import StereoCamera
 from slam_backend.errors import bad_argument, check_choice, check_float, check_int
 from slam_backend.existence import ExistenceModel
@@ -12,7 +11,7 @@ from slam_backend.resampling import RESAMPLING
 from slam_backend.smoothing.options import SmoothingOptions
 
 PROPOSALS = ("fastslam2", "fastslam1")
-MOST_ROBOTS = 1_000  # memory ends before
+MOST_ROBOTS, MOST_PARTICLES = 1_000, 1_000_000  # memory ends before
 CALIBRATED_NOISE = 0.005  # [m]; chosen on simulated stereo runs, see docs/smoothing.md
 
 
@@ -48,7 +47,6 @@ class FilterOptions:
             then does not fall below the fixed point of Riccati's recursion. 0: landmarks stand still. None:
             `CALIBRATED_NOISE` where particles are rejuvenated, for it makes honest what they claim in between, else 0:
             a filter without smoother would only forget.
-        adaptive: How the number of particles follows the spread of the poses at each resampling; None: it stays.
         existence: How the probability that a landmark exists follows from being seen and missed; particles delete
             landmarks that are too improbable. None: what is once in a map stays there.
         rejuvenate_every: Steps after which particles are drawn anew from the posterior of whole paths, as a smoother
@@ -73,7 +71,6 @@ class FilterOptions:
     new_landmark_density: float = 0.01
     one_to_one: bool = True
     landmark_noise: float | None = None
-    adaptive: AdaptiveParticles | None = None
     existence: ExistenceModel | None = None
     rejuvenate_every: int | None = None
     smoothing: SmoothingOptions = field(default_factory=SmoothingOptions)
@@ -95,10 +92,10 @@ class FilterOptions:
         if self.landmark_noise is not None:
             check_float("landmark_noise", self.landmark_noise, "Use 0 for landmarks that stand still.", at_least=0.0)
         check_float("ambiguity", self.ambiguity, "Use 0 to hold nothing back.", at_least=0.0)
-        for name, model in (("adaptive", AdaptiveParticles), ("existence", ExistenceModel)):
-            value = getattr(self, name)
-            if value is not None and not isinstance(value, model):
-                raise bad_argument(name, f"{model.__name__} or None", value, f"Build one: {model.__name__}().")
+        existence: object = self.existence
+        if not isinstance(existence, ExistenceModel | None):
+            cure = "Build one: ExistenceModel()."
+            raise bad_argument("existence", "ExistenceModel or None", self.existence, cure)
         if self.existence is not None:
             self.existence.view(self.camera)  # raises if nothing is left of the view
         if self.rejuvenate_every is not None:

@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from slam_backend.adaptation import MOST_PARTICLES
 from slam_backend.errors import bad_argument, check_choice, check_float, check_int
+from slam_backend.filter_options import MOST_PARTICLES
 
 METHODS = ("particles", "mixture")
 

@@ -2,7 +2,6 @@
 
 from typing import Any
 
-from slam_backend.adaptation import AdaptiveParticles
 from slam_backend.alignment_types import Alignment, AlignmentOptions
 from slam_backend.attempts import AttemptOptions, AttemptRecord, Straightening
 from slam_backend.branches import ReplayedStep
@@ -33,7 +32,7 @@ from slam_backend.state_codec import SEEDS, Kind, Kinds
 from slam_backend.watching import Side, Watch
 
 CONFIGURATIONS = (
-    AdaptiveParticles, AlignmentOptions, AttemptOptions, ExistenceModel, FilterOptions, MergeOptions, OdometryModel,
+    AlignmentOptions, AttemptOptions, ExistenceModel, FilterOptions, MergeOptions, OdometryModel,
     SmoothingOptions, StereoCamera,
 )  # fmt: skip
 RECORDS = (

@@ -9,7 +9,6 @@ from same_bits import assert_same
 from scipy import stats
 from stereo_world import EXACT_MOTION, StereoWorld
 
-from slam_backend.adaptation import AdaptiveParticles
 from slam_backend.alignment import Alignment
 from slam_backend.errors import FloatArray
 from slam_backend.existence import ExistenceModel
@@ -220,34 +219,6 @@ def test_a_restored_filter_weighs_existence_on_bit_for_bit(proposal: Any) -> Non
         restored.set_state(state)
         assert_same([restored.step(odometry, frames) for odometry, frames in steps[12:]], reports)
         assert_same(restored.get_state(), expected)
-
-
-def test_log_odds_follow_particles_whose_number_changes() -> None:
-    """Every new particle has the log-odds of the one that it is a copy of, and a filter that adapts keeps them all."""
-    slam = in_circle(ExistenceModel(delete_below=0.2), resample_threshold=0.0, proposal="fastslam1")
-    for odometry, frames in circle(12):
-        slam.step(odometry, frames)
-    ancestors = np.array([0, 3, 3, 20, 36])
-    slots = slam._maps.used_slots()
-    before, counts = slam._maps.dense_odds(slots), slam._dense()[3]
-    assert before is not None
-    assert len(np.unique(before[:, ancestors], axis=1).T) > 1, "particles differ"
-    slam._become(ancestors)
-    after = slam._maps.dense_odds(slam._maps.used_slots())
-    assert after is not None
-    kept = (counts[:, ancestors] > 0).any(axis=1)
-    np.testing.assert_array_equal(after, before[kept][:, ancestors])
-    adapting = in_circle(
-        ExistenceModel(), adaptive=AdaptiveParticles(min_particles=5, max_particles=90), resample_threshold=1.0
-    )
-    sizes = set()
-    for odometry, frames in circle(12):
-        adapting.step(odometry, frames)
-        sizes.add(adapting.num_particles)
-        ids, probabilities = adapting.existence()
-        np.testing.assert_array_equal(ids, adapting.map().ids)
-        assert ((probabilities >= 0.01) & (probabilities <= 0.9990001)).all()
-    assert len(sizes) > 1
 
 
 @pytest.mark.parametrize("particles", [(4, 4), (3, 40)])

@@ -10,7 +10,6 @@ from hypothesis.extra.numpy import arrays
 from scipy import stats
 from stereo_world import StereoWorld
 
-from slam_backend.adaptation import AdaptiveParticles
 from slam_backend.camera import StereoCamera
 from slam_backend.errors import FloatArray
 from slam_backend.filter_options import FilterOptions
@@ -293,5 +292,3 @@ def test_bad_input_is_refused_as_by_the_compiled_filter() -> None:
         PlainFastSlam(2, FilterOptions()).step([None], [None, None])
     with pytest.raises(ValueError, match="estimate: expected one of 'best', 'mixture'"):
         PlainFastSlam(1, FilterOptions()).map("worst")  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match=r"options.adaptive: expected None, .* use FastSlam"):
-        PlainFastSlam(1, FilterOptions(adaptive=AdaptiveParticles()))
