@@ -6,11 +6,13 @@ from typing import Any
 
 import numpy as np
 
+from slam_backend._existence_step import ExistenceStep
 from slam_backend._jit import in_place, jit
 from slam_backend._kernels import LANES
 from slam_backend._particle_maps import MAPS_KEPT
 from slam_backend._rejuvenation_step import SCHEDULE
-from slam_backend.errors import FloatArray, IntArray
+from slam_backend._turns import assumed
+from slam_backend.errors import FloatArray, IntArray, bad_argument
 from slam_backend.filter_options import MOST_ROBOTS, FilterOptions
 from slam_backend.landmark_map import LandmarkMap
 from slam_backend.log_arrays import EXACT, REJECTED, STOOD, LogArrays, has_been_checked, note_checked
@@ -21,6 +23,7 @@ from slam_backend.smoothing.graph import NONE, PathGraph
 from slam_backend.smoothing.reassociation import Refused
 from slam_backend.state_checks import (
     BOOL,
+    CURE,
     FARTHEST,
     FLOAT32,
     FLOAT64,
@@ -40,6 +43,7 @@ from slam_backend.state_checks import (
     check_kind,
     check_length,
     check_number,
+    check_options,
     check_whole,
     refuse,
 )
@@ -56,15 +60,22 @@ GRAPH_COLUMNS = frozenset(field.name for field in fields(PathGraph))
 # ---------------------------------------------------------------------- the filter
 
 
-def check_filter(name: str, state: Any) -> None:
+def check_filter(name: str, state: Any, known: Sequence[FilterOptions] = ()) -> None:
     """Refuse what is no state from which `FastSlam` can go on.
+
+    Args:
+        name: Of the part.
+        state: What came.
+        known: Options that were checked before.
 
     Raises:
         ValueError: By name of the part that is wrong.
     """
     check_keys(name, state, (*KEPT, *OTHERS_KEPT))
     options = state["options"]
-    check_kind(f"{name}['options']", options, FilterOptions)
+    check_options(f"{name}['options']", options, FilterOptions, known)
+    if not any(options is other or options == other for other in known):
+        _check_fit(f"{name}['options']", options)
     weights = state["_weights"]
     check_floats(f"{name}['_weights']", weights, (None,), 0.0, 1.0)
     m = len(weights)
@@ -90,6 +101,16 @@ def check_filter(name: str, state: Any) -> None:
         size = state["maps"]["descriptors"].shape[1]
         check_rejuvenation(f"{name}['rejuvenation']", state["rejuvenation"], state["logs"], size)
     check_generator(f"{name}['rng']", state["rng"])
+
+
+def _check_fit(name: str, options: FilterOptions) -> None:
+    """Refuse options that are fine one by one, but with which no filter can be built."""
+    try:
+        assumed(options)
+        if options.existence is not None:
+            ExistenceStep(options.existence, options.camera)
+    except Exception as error:  # of whatever kind: of numbers that are too large for floats, or not fit for the camera
+        raise bad_argument(name, "options that fit together", f"'{error}'", CURE) from error
 
 
 def check_estimates(name: str, estimates: Any, k: int) -> None:
@@ -196,6 +217,14 @@ def check_log(name: str, log: Any) -> None:
     check_steps(f"{name}['unfinished']", unfinished)
     if len(unfinished) > ROWS or (len(unfinished) and unfinished.steps[0] <= last):
         refuse(f"{name}['unfinished']", f"at most {ROWS} steps after the others", len(unfinished))
+
+
+def last_step(log: Mapping[str, Any]) -> int:
+    """Return the last step of the state of a log, -1 if there is none."""
+    for part in (log["unfinished"], *reversed(log["chunks"])):
+        if len(part):
+            return int(part.steps[-1])
+    return -1
 
 
 def check_steps(name: str, rows: Any) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 
 from slam_backend._existence_step import ExistenceStep
 from slam_backend._filter_arrays import FilterArrays
-from slam_backend._filter_checks import KEPT, POSES, check_filter
+from slam_backend._filter_checks import KEPT, POSES, check_filter, last_step
 from slam_backend._journal import Journal
 from slam_backend._kernels import add_share
 from slam_backend._kernels.layout import CAMERA, RECOVERY
@@ -17,12 +17,12 @@ from slam_backend._particle_maps import ParticleMaps
 from slam_backend._rejuvenated_maps import write_maps
 from slam_backend._rejuvenation_step import RejuvenationStep
 from slam_backend._turns import assumed, spans_of
-from slam_backend.errors import IntArray, check_int, check_seed
+from slam_backend.errors import IntArray, bad_argument, check_int, check_seed
 from slam_backend.filter_options import MOST_ROBOTS, FilterOptions
 from slam_backend.reports import PoseEstimates
 from slam_backend.run_log import RobotLog
 from slam_backend.smoothing.rejuvenation import Particles
-from slam_backend.state_checks import generator_of
+from slam_backend.state_checks import CURE, generator_of
 
 
 class FilterState(FilterArrays):
@@ -143,7 +143,9 @@ class FilterState(FilterArrays):
         Raises:
             ValueError: If `state` is not one of `get_state`.
         """
-        check_filter("state", state)
+        check_filter("state", state, (self.options,))
+        if (last := max(map(last_step, state["logs"]))) >= state["steps"]:
+            raise bad_argument("state['steps']", f"an int > {last}, the last step logged", state["steps"], CURE)
         self._go_on_from(state)
 
     def _go_on_from(self, state: Mapping[str, Any]) -> None:

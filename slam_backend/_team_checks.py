@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend._filter_checks import MOST_LANDMARKS, check_filter, check_landmarks
+from slam_backend._filter_checks import MOST_LANDMARKS, check_filter, check_landmarks, last_step
 from slam_backend._kernels import PLACED
 from slam_backend._kernels.layout import ACT, BEGIN, COUNT, END, GIVEN, NAMED
 from slam_backend.alignment_types import Alignment, AlignmentOptions
@@ -43,6 +43,7 @@ from slam_backend.state_checks import (
     check_kind,
     check_length,
     check_number,
+    check_options,
     check_robots,
     check_whole,
     check_wholes,
@@ -61,14 +62,15 @@ class TeamCheck:
     Args:
         num_robots: K.
         kept: Readings by step that the team holds already: the same ones are not looked at again.
+        known: Options of its filters, likewise.
 
     Attributes:
         descriptor_sizes: Lengths of the descriptors in it.
         options: Of all its filters.
     """
 
-    def __init__(self, num_robots: int, kept: Mapping[int, StepInput]) -> None:
-        self._count, self._kept = num_robots, kept
+    def __init__(self, num_robots: int, kept: Mapping[int, StepInput], known: Sequence[FilterOptions] = ()) -> None:
+        self._count, self._kept, self._known = num_robots, kept, known
         self._step = self._next_number = 0
         self._inputs: Mapping[int, StepInput] = {}
         self.descriptor_sizes: set[int] = set()
@@ -94,8 +96,8 @@ class TeamCheck:
         check_whole(f"{name}['step']", state["step"])
         check_whole(f"{name}['epoch']", state["epoch"])
         check_generator(f"{name}['rng']", state["rng"])
-        check_kind(f"{name}['alignment']", state["alignment"], AlignmentOptions)
-        check_kind(f"{name}['merging']", state["merging"], MergeOptions)
+        check_options(f"{name}['alignment']", state["alignment"], AlignmentOptions)
+        check_options(f"{name}['merging']", state["merging"], MergeOptions)
         self._step = state["step"]
         self._check_records(f"{name}['records']", state["records"])
         check_length(f"{name}['events']", state["events"])
@@ -172,9 +174,12 @@ class TeamCheck:
         check_wholes(f"{name}['known']", tuple(known.values()), -1, self._step - 1)
         check_whole(f"{name}['number']", branch["number"], 0, self._next_number - 1)
         check_whole(f"{name}['epoch']", branch["epoch"])
-        check_filter(f"{name}['filter']", branch["filter"])
+        check_filter(f"{name}['filter']", branch["filter"], self._known)
         if len(branch["filter"]["_poses"]) != len(robots):
             refuse(f"{name}['filter']", f"one of {len(robots)} robots", len(branch["filter"]["_poses"]))
+        for robot, log in zip(robots, branch["filter"]["logs"], strict=True):
+            if last_step(log) > known[robot]:
+                refuse(f"{name}['known']", f"at least {last_step(log)}, the last step logged", known[robot])
         self.options.append(branch["filter"]["options"])
         looks = branch["filter"]["maps"]["descriptors"]
         if len(looks):
@@ -357,8 +362,8 @@ class TeamCheck:
 
     def _check_schedule(self, name: str, schedule: Any) -> None:
         check_keys(name, schedule, ("options", "alignment", "straightening", "records", "bars", "doubts"))
-        check_kind(f"{name}['options']", schedule["options"], AttemptOptions)
-        check_kind(f"{name}['alignment']", schedule["alignment"], AlignmentOptions)
+        check_options(f"{name}['options']", schedule["options"], AttemptOptions)
+        check_options(f"{name}['alignment']", schedule["alignment"], AlignmentOptions)
         pending = schedule["straightening"]
         if pending is not None:
             check_kind(f"{name}['straightening']", pending, Straightening)

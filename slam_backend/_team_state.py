@@ -91,6 +91,11 @@ class TeamState:
         """Readings of the last steps that some filter may take in later, by step; to be looked at."""
         return self._records.log.kept
 
+    @property
+    def filter_options(self) -> FilterOptions:
+        """What all filters assume, but for their number of particles."""
+        return self._groups[0].trunk.filter.options
+
     def get_state(self) -> dict[str, Any]:
         """Return all that decides how the team goes on, random streams included.
 
@@ -115,7 +120,7 @@ class TeamState:
         Raises:
             ValueError: If `state` is not one of `get_state`, or of a team of another size.
         """
-        TeamCheck(self._num_robots, self.kept_readings).check("state", state)
+        TeamCheck(self._num_robots, self.kept_readings, (self.filter_options,)).check("state", state)
         self._go_on_from(state)
 
     def _go_on_from(self, state: Mapping[str, Any]) -> None:

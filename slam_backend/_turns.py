@@ -39,7 +39,7 @@ def assumed(options: FilterOptions) -> FloatArray:
         np.log(options.new_landmark_density), options.landmark_walk,
         options.proposal == "fastslam2", options.one_to_one,
         options.smoothing.closure_after, options.resample_threshold,
-    ])  # fmt: skip
+    ], np.float64)  # fmt: skip
 
 
 def spans_of(num_robots: int, one_by_one: bool) -> tuple[tuple[int, int, bool], ...]:

@@ -23,6 +23,9 @@ REASONS: tuple[Reason, ...] = (
 )
 RIVAL_DISTANCE = 0.5  # [m]; beyond these two an alignment counts as another one, and as a false one
 RIVAL_ANGLE = math.radians(5.0)
+LARGEST = 1e9  # of gates and distances; their squares are far from infinite
+MOST_LOOK_ALIKES = 10_000  # as many pairs as geometry alone may make
+MOST_COUNTED = 1 << 62  # of inliers and samples
 FEWEST_INLIERS = 3  # two matches fit any motion between them: only a third is evidence
 
 
@@ -70,16 +73,20 @@ class AlignmentOptions:
             raise bad_argument("options.appearance", "a bool", self.appearance, "Say True or False.")
         above = ("descriptor_gate", "position_gate", "position_floor", "max_sigma_position", "max_sigma_heading")
         for name in above:
-            check_float(f"options.{name}", getattr(self, name), "Give a positive number.", above=0.0)
+            check_float(f"options.{name}", getattr(self, name), "Give a positive number.", above=0.0, at_most=LARGEST)
         for name in ("descriptor_ratio", "max_ratio"):
             check_float(f"options.{name}", getattr(self, name), "Give a share.", above=0.0, at_most=1.0)
         for name in ("same_place", "min_spread"):
-            check_float(f"options.{name}", getattr(self, name), "Give a distance in metres.", at_least=0.0)
+            check_float(
+                f"options.{name}", getattr(self, name), "Give a distance in metres.", at_least=0.0, at_most=LARGEST
+            )
         probability = self.success_probability
         check_float("options.success_probability", probability, "Use e.g. 0.999.", above=0.0, at_most=1.0 - 1e-12)
-        check_int("options.look_alikes", self.look_alikes, 0, "Use 0 to demand that all stand out.")
-        check_int("options.min_inliers", self.min_inliers, FEWEST_INLIERS, "Two fit any motion: demand more.")
-        check_int("options.max_samples", self.max_samples, 1, "Allow at least one sample.")
+        check_int("options.look_alikes", self.look_alikes, 0, "Use 0 to demand that all stand out.", MOST_LOOK_ALIKES)
+        check_int(
+            "options.min_inliers", self.min_inliers, FEWEST_INLIERS, "Two fit any motion: demand more.", MOST_COUNTED
+        )
+        check_int("options.max_samples", self.max_samples, 1, "Allow at least one sample.", MOST_COUNTED)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

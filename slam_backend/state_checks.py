@@ -5,6 +5,7 @@ comes from a file or from a program.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import fields, is_dataclass
 from typing import Any, NoReturn
 
 import numpy as np
@@ -168,6 +169,29 @@ def check_ascending(name: str, values: NDArray[Any]) -> None:
     """Refuse values (n,) of which one is not above the one before."""
     if count_falls(values):
         refuse(name, "numbers in ascending order, each once", "others")
+
+
+def check_options(name: str, options: Any, kind: type, known: Iterable[Any] = ()) -> None:
+    """Refuse what are no options of a type, or such that its constructor refuses.
+
+    Args:
+        name: Of the part.
+        options: What came.
+        kind: A frozen dataclass.
+        known: Options that need not be looked at again.
+    """
+    check_kind(name, options, kind)
+    try:
+        if not any(options is other or options == other for other in known):
+            _rebuilt(options)
+    except Exception as error:  # of whatever kind: options may hold anything where no constructor looked at them
+        raise bad_argument(name, f"{kind.__name__} that can be built", f"'{error}'", CURE) from error
+
+
+def _rebuilt(options: Any) -> Any:
+    """Return options, and those that are parts of them, built once more."""
+    parts = {field.name: getattr(options, field.name) for field in fields(options)}
+    return type(options)(**{name: _rebuilt(part) if is_dataclass(part) else part for name, part in parts.items()})
 
 
 def check_generator(name: str, state: Any) -> None:

@@ -35,6 +35,7 @@ from slam_backend.state_checks import (
     check_wholes,
     refuse,
 )
+from vslam_env.belief import assumed_of_merges
 from vslam_env.config import EnvConfig
 from vslam_env.coverage import CoverageMeter
 from vslam_env.episode import Episode
@@ -174,7 +175,7 @@ class EpisodeCheck:
         if belief["tick"] != self._tick or type(belief["tick"]) is not int:
             refuse(f"{name}['tick']", f"{self._tick}, as the episode's", belief["tick"])
         own = None if self._own is None else self._own.belief
-        team = TeamCheck(self._count, {} if own is None else own.kept_readings)
+        team = TeamCheck(self._count, {} if own is None else own.kept_readings, (self._config.belief.filter,))
         team.check(f"{name}['team']", belief["team"])
         if belief["team"]["step"] != self._tick + 1:
             refuse(f"{name}['team']['step']", f"{self._tick + 1}", belief["team"]["step"])
@@ -183,10 +184,12 @@ class EpisodeCheck:
         if self._config.sensor == "landmark" and not team.descriptor_sizes <= {landmarks.descriptors.shape[1]}:
             sizes = sorted(team.descriptor_sizes)
             refuse(f"{name}['team']", f"descriptors of length {landmarks.descriptors.shape[1]}", sizes)
-        wanted = self._config.belief.filter
-        for options in team.options:
-            if options is not wanted and options != wanted:
-                refuse(f"{name}['team']", "filters of the environment's configuration", "another")
+        config, given = self._config.belief, belief["team"]
+        rhythm, merging = assumed_of_merges(config, not self._config.oracle_merge)
+        found = [*team.options, given["alignment"], given["schedule"]["alignment"], given["schedule"]["options"]]
+        wanted = [config.filter] * len(team.options) + [config.alignment, config.alignment, rhythm]
+        if [*found, given["merging"]] != [*wanted, merging]:
+            refuse(f"{name}['team']", "options of the environment's configuration", "others")
         strokes = {} if own is None else own.kept_strokes
         self._check_grids(f"{name}['grids']", belief["grids"], strokes)
         for where, slots in check_each(f"{name}['slots']", belief["slots"], self._count):

@@ -8,11 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend.alignment import Alignment
+from slam_backend.attempts import AttemptOptions
 from slam_backend.errors import FloatArray, bad_argument
 from slam_backend.filter_options import FilterOptions
 from slam_backend.geometry import rotate_covariances
 from slam_backend.input_log import StepInput
 from slam_backend.landmark_map import LandmarkMap, TeamOutlines
+from slam_backend.merge_options import MergeOptions
 from slam_backend.reports import MergeEvent, Renaming, TeamReport
 from slam_backend.standpoints import Standpoints
 from slam_backend.team import TeamSlam
@@ -59,8 +61,7 @@ class TeamBelief:
             # A sequence remembers how often it spawned: a fresh one makes the result depend on its seed alone.
             seed = np.random.SeedSequence(seed.entropy, spawn_key=seed.spawn_key)
         options = {f.name: getattr(config.filter, f.name) for f in fields(FilterOptions)}
-        rhythm = config.attempts if attempts else replace(config.attempts, enabled=False)
-        merging = config.merging if attempts else replace(config.merging, watch_steps=0)
+        rhythm, merging = assumed_of_merges(config, attempts)
         self._team = TeamSlam(num_robots, config.alignment, seed, rhythm, merging, **options)
         self.exchange = self._team.exchange
         self._grids = SharedGrids(num_robots, body)
@@ -260,6 +261,13 @@ class TeamBelief:
             start_from_group=points.starts[robot],
             group_map=self.group_map(robot),
         )
+
+
+def assumed_of_merges(config: BeliefConfig, attempts: bool) -> tuple[AttemptOptions, MergeOptions]:
+    """Return when groups try to align their maps, and how they merge; where they do not try, merges are final."""
+    if attempts:
+        return config.attempts, config.merging
+    return replace(config.attempts, enabled=False), replace(config.merging, watch_steps=0)
 
 
 def _turns(num_robots: int, decision_ticks: int | None) -> Sequence[Sequence[int]]:

@@ -1,0 +1,193 @@
+"""What is damaged of a state is refused by name before anything is taken over, or does no harm."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from damage import damaged, with_part
+from simulated_team import SimulatedTeam
+from test_undo import true_alignment
+
+from slam_backend.attempts import AttemptOptions
+from slam_backend.existence import ExistenceModel
+from slam_backend.filter import FastSlam
+from slam_backend.merge_options import MergeOptions
+from slam_backend.smoothing.options import SmoothingOptions
+from slam_backend.state_codec import ForeignObjectError, decoded, encoded
+from slam_backend.state_kinds import BACKEND_KINDS
+from slam_backend.team import TeamSlam
+from slam_backend.undoing import Undoing
+
+pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")  # overflows of what is out of place do no harm
+
+NEVER = AttemptOptions(enabled=False)
+SLICED = {"existence": ExistenceModel(), "rejuvenate_every": 8, "smoothing": SmoothingOptions(slice_steps=12)}
+FORKED = np.eye(3, dtype=np.bool_)
+FORKED[0, 2] = FORKED[2, 0] = True
+REPEATED = 20  # refusals after which the bytes of the state are compared
+
+Subject = tuple[FastSlam | TeamSlam, list[Any]]
+
+
+def filter_with_all(**options: Any) -> Subject:
+    """Return a filter that keeps existence and is rejuvenated, and what its robots read next."""
+    simulation = SimulatedTeam(2, seed=3)
+    slam = FastSlam(2, num_particles=60, rejuvenate_every=9, resample_threshold=0.9, **options)
+    for _ in range(20):
+        slam.step(*simulation.read())  # type: ignore[arg-type]
+    return slam, [simulation.read() for _ in range(8)]
+
+
+def merged(**options: Any) -> tuple[SimulatedTeam, TeamSlam]:
+    """Return a team of three robots, two of which have merged."""
+    simulation = SimulatedTeam(3, seed=104)
+    team = simulation.build(attempts=NEVER, num_particles=10, **options)
+    simulation.run(team, 60)
+    team.merge(0, 1, true_alignment(simulation, team, 0, 1))
+    simulation.run(team, 6)
+    return simulation, team
+
+
+def team_with_forks() -> Subject:
+    """Return a team of which a robot is out of contact with its group."""
+    simulation, team = merged(**SLICED)
+    simulation.run(team, 10, FORKED)
+    return team, [(*simulation.read(), FORKED if i < 2 else None) for i in range(5)]
+
+
+def team_in_a_replay() -> Subject:
+    """Return a team of which a robot has returned, and is not told all yet."""
+    simulation, team = merged(rejuvenate_every=6)
+    simulation.run(team, 30, FORKED)
+    simulation.run(team, 1)
+    return team, [simulation.read() for _ in range(5)]
+
+
+def team_in_an_undo() -> Subject:
+    """Return a team that takes back a merge."""
+    simulation, team = merged(**SLICED, merging=MergeOptions(watch_every=10_000))
+    simulation.run(team, 25)
+    group = team._groups[0]
+    group.undoing = Undoing.of(group.trunk, group.trunk.watches[0].number)
+    simulation.run(team, 2)
+    return team, [simulation.read() for _ in range(6)]
+
+
+def team_in_an_attempt() -> Subject:
+    """Return a team that straightens two maps to align them once more."""
+    simulation = SimulatedTeam(3, seed=101)
+    smoothing = SmoothingOptions(slice_steps=12)
+    attempts = AttemptOptions(every=5)
+    team = simulation.build(num_particles=10, rejuvenate_every=20, smoothing=smoothing, attempts=attempts)
+    while team._schedule.straightening is None:
+        simulation.run(team, 1)
+    return team, [simulation.read() for _ in range(8)]
+
+
+SUBJECTS: dict[str, Callable[[], Subject]] = {
+    "filter": filter_with_all,
+    "filter with existence": lambda: filter_with_all(existence=ExistenceModel()),
+    "forks": team_with_forks,
+    "replay": team_in_a_replay,
+    "undo": team_in_an_undo,
+    "attempt": team_in_an_attempt,
+}
+
+
+def play(subject: FastSlam | TeamSlam, readings: list[Any]) -> None:
+    """Let a filter or a team go on, and look at all that it knows."""
+    for read in readings:
+        subject.step(*read)
+    subject.get_state()
+    if isinstance(subject, TeamSlam):
+        subject.outlines(), subject.standpoints(), subject.diagnostics
+        for robot in range(subject.num_robots):
+            subject.map(robot, "mixture")
+    else:
+        subject.map("mixture"), subject.pose(0)
+
+
+def try_damaged(make: Callable[[], Subject], seeds: range) -> dict[str, int]:
+    """Set a filter or a team to damaged states, as they are and through bytes; count what was refused."""
+    subject, readings = make()
+    state = subject.get_state()
+    whole, refused, accepted = encoded(state, BACKEND_KINDS), 0, 0
+    for seed in seeds:
+        what, other = damaged(state, np.random.default_rng(seed))
+        try:
+            if seed % 4 == 0:
+                other = decoded(encoded(other, BACKEND_KINDS), BACKEND_KINDS)
+            subject.set_state(other)
+        except ForeignObjectError:
+            continue
+        except ValueError:
+            refused += 1
+            if refused % REPEATED == 0:
+                assert encoded(subject.get_state(), BACKEND_KINDS) == whole, what
+            continue
+        accepted += 1
+        try:
+            play(subject, readings)
+        except Exception as error:
+            raise AssertionError(f"seed {seed}: {what}") from error
+        subject.set_state(state)
+    return {"refused": refused, "accepted": accepted}
+
+
+@pytest.mark.parametrize("kind", SUBJECTS)
+def test_damaged_states_are_refused_or_harmless(kind: str) -> None:
+    """Of 350 damaged states of each kind most are refused, which changes nothing; from the others it goes on."""
+    counts = try_damaged(SUBJECTS[kind], range(350))
+    assert counts["refused"] > 200
+    assert counts["accepted"] > 20
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", SUBJECTS)
+def test_many_damaged_states_are_refused_or_harmless(kind: str) -> None:
+    """So it is with 2000 others."""
+    assert try_damaged(SUBJECTS[kind], range(1000, 3000))["refused"] > 1200
+
+
+@pytest.mark.parametrize(
+    ("way", "says"),
+    [
+        (("maps", "map_of"), r"state\['maps'\]\['map_of'\]: expected integers from 0 to \d+, got 'others'"),
+        (("maps", "maps"), r"state\['maps'\]\['maps'\]: expected integers from 0 to 59"),
+        (("rejuvenation", "graph", "tips"), r"state\['rejuvenation'\]\['graph'\]\['tips'\]: expected integers from"),
+        (("rejuvenation", "graph", "point_frames"), r"\['point_frames'\]: expected integers"),
+        (("rejuvenation", "graph", "previous"), r"\['previous'\]: expected integers|keys that lead back to a start"),
+    ],
+)
+def test_an_index_out_of_range_is_refused_by_name(way: tuple[str, ...], says: str) -> None:
+    """Kernels would read and write beyond their arrays."""
+    slam, _ = filter_with_all()
+    for index in (10**9, -7):
+        state: Any = slam.get_state()
+        array = state
+        for key in way:
+            array = array[key]
+        array = array.copy()
+        array.reshape(-1)[0] = index
+        with pytest.raises(ValueError, match=says):
+            slam.set_state(_replaced(state, way, array))
+
+
+def _replaced(state: Any, way: tuple[str, ...], new: Any) -> Any:
+    return new if not way else with_part(state, way[0], _replaced(state[way[0]], way[1:], new))
+
+
+@pytest.mark.parametrize("kind", ["MT19937", "Philox"])
+def test_random_streams_that_read_beyond_their_buffers_are_refused(kind: str) -> None:
+    """Numpy takes any place in the buffer of a stream."""
+    slam = FastSlam(1, seed=np.random.Generator(getattr(np.random, kind)(0)), num_particles=4)
+    state = slam.get_state()
+    slam.set_state(state)
+    rng = state["rng"]
+    for place in (-1, 10**9):
+        bad = rng | {"buffer_pos": place} if kind == "Philox" else rng | {"state": rng["state"] | {"pos": place}}
+        with pytest.raises(ValueError, match=r"state\['rng'\].*pos'\]: expected an int from 0 to"):
+            slam.set_state(state | {"rng": bad})
+    with pytest.raises(ValueError, match=r"state\['rng'\]\['bit_generator'\]: expected one of PCG64"):
+        slam.set_state(state | {"rng": rng | {"bit_generator": "load"}})
