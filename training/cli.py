@@ -1,7 +1,10 @@
 """The command line `vslam`: it only registers commands; each lives in a module of its own."""
 
+import errno
+import os
 import sys
 from signal import Signals
+from typing import NoReturn
 
 import typer
 from rich.console import Console
@@ -29,6 +32,7 @@ from training.train_command import train
 from training.worlds_command import worlds
 
 BAD_INPUT = 2
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 INTERRUPTED = 130  # typer's status after a KeyboardInterrupt
 
 app = typer.Typer(
@@ -82,8 +86,27 @@ def main() -> None:
             # Only errors in the project's own form explain themselves; others are faults and keep their traceback.
             if ": expected " not in str(error):
                 raise
-            Console(stderr=True, soft_wrap=True, highlight=False).print(f"[red]error[/] {escape(str(error))}")
-            sys.exit(BAD_INPUT)
+            _refuse(str(error))
+        except OSError as error:  # of stdout, or in a library that writes: our own writers have made it a ValueError
+            if error.errno not in NO_ROOM:
+                raise
+            _abandon_stdout()
+            where = "stdout" if error.filename is None else repr(error.filename)
+            _refuse(f"output: expected a place with room, got {where}. The system says: {error.strerror}.")
+
+
+def _refuse(text: str) -> NoReturn:
+    """End with one line on stderr."""
+    Console(stderr=True, soft_wrap=True, highlight=False).print(f"[red]error[/] {escape(text)}")
+    sys.exit(BAD_INPUT)
+
+
+def _abandon_stdout() -> None:
+    """Drop what cannot be printed on stdout: Python would try once more at its end, and complain."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115   # until the end
 
 
 if __name__ == "__main__":

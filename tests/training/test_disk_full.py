@@ -1,0 +1,124 @@
+"""A disk that is full ends a command with one line and status 2, and what was finished before stays."""
+
+import errno
+import json
+import os
+import resource
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from training import cli
+from training.kept_trials import open_folder, run_trials
+from training.video import VideoWriter
+
+SHORT = ("--world", "fig5", "--robots", "1", "--particles", "5", "--max-cycles", "20", "--out", "run")
+FULL = Path("/dev/full")
+
+
+@contextmanager
+def _files_up_to(size: int) -> Iterator[None]:
+    """Let no file grow beyond a number of bytes, as on a disk that is nearly full."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+
+@pytest.mark.parametrize(
+    ("options", "size", "file", "kept"),
+    [
+        (("--no-video",), 1_000, "environment.toml", {"config.toml"}),
+        (("--no-video",), 10_000, "map.png", {"config.toml", "environment.toml", "metrics.json"}),
+        ((), 4_000, "video.mp4", {"config.toml", "environment.toml"}),
+    ],
+)
+def test_a_run_that_finds_no_room_is_one_line(
+    options: tuple[str, ...],
+    size: int,
+    file: str,
+    kept: set[str],
+    vslam: Any,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The line names the file and the reason; files before it are whole, and nothing half-written is left."""
+    monkeypatch.chdir(tmp_path)
+    with _files_up_to(size):
+        said = vslam("run", *SHORT, *options)
+    assert said.status == 2
+    last = said.err.splitlines()[-1]
+    assert f"expected a file that can be written, got 'run/{file}'. The " in last
+    assert ("File too large" in last) == (file != "video.mp4")
+    assert "Traceback" not in said.err
+    found = {path.name for path in Path("run").iterdir() if path.suffix != ".tum"}
+    assert found == kept
+    if "metrics.json" in kept:
+        assert json.loads(Path("run/metrics.json").read_text())["complete"] is True
+
+
+def test_a_video_that_cannot_be_written_leaves_no_file(tmp_path: Path) -> None:
+    """A film that lacks frames, as its encoder found no room, is refused when it is closed; an older one stays."""
+    path = tmp_path / "film.mp4"
+    path.write_bytes(b"older")
+    frames = np.random.default_rng(0).integers(0, 256, (20, 64, 64, 3), dtype=np.uint8)
+
+    def film() -> None:
+        with _files_up_to(3_000), VideoWriter(path, (64, 64)) as video:
+            for frame in frames:
+                video.add(frame)
+
+    with pytest.raises(ValueError, match=r"path: expected a file that can be written, got .*film\.mp4"):
+        film()
+    assert [(file.name, file.read_bytes()) for file in tmp_path.iterdir()] == [("film.mp4", b"older")]
+
+
+def _row(trial: Any) -> dict[str, Any]:
+    return {"seed": trial, "text": "x" * 400}
+
+
+def test_finished_trials_stay(tmp_path: Path) -> None:
+    """Trials that found room are kept as whole lines."""
+    folder = open_folder(tmp_path / "run", "count", {}, 0)
+    with _files_up_to(1_000), pytest.raises(ValueError, match=r"out: expected a file .* says: File too large\."):
+        run_trials(folder, "trials.jsonl", _row, range(9), 1, lambda: False, lambda row: None)
+    rows = [json.loads(line) for line in (folder.path / "trials.jsonl").read_text().splitlines()]
+    assert [row["seed"] for row in rows] == [0, 1]
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT])
+def test_what_a_library_cannot_write_is_one_line(number: int, refusal: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An error of the system about room, from wherever it comes, is told; any other keeps its traceback."""
+
+    def app(raised: OSError) -> Callable[[str], None]:
+        def fail(prog_name: str) -> None:
+            raise raised
+
+        return fail
+
+    monkeypatch.setattr(cli, "app", app(OSError(number, os.strerror(number), "events")))
+    text = f"output: expected a place with room, got 'events'. The system says: {os.strerror(number)}."
+    assert refusal("anything") == f"error {text}\n"
+    monkeypatch.setattr(cli, "app", app(ConnectionError("another")))
+    with pytest.raises(ConnectionError, match="another"):
+        cli.main()
+
+
+@pytest.mark.skipif(not FULL.is_char_device(), reason="there is no device that is always full")
+def test_a_full_stdout_is_one_line() -> None:
+    """Tables that cannot be printed end the command with one line, without a word more when Python ends."""
+    environment = os.environ | {"PYTHONPATH": str(Path(cli.__file__).parents[1])}
+    with FULL.open("w") as full:
+        command = [sys.executable, "-m", "training", "worlds", "list", "--seeds", "1"]
+        done = subprocess.run(command, env=environment, stdout=full, stderr=subprocess.PIPE, text=True)
+    assert done.returncode == 2
+    told = "error output: expected a place with room, got stdout. The system says: No space left on device.\n"
+    assert done.stderr == told
