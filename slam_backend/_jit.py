@@ -16,7 +16,7 @@ from numba.extending import intrinsic
 from numba.np import arrayobj
 from numpy.typing import NDArray
 
-from slam_backend._kernel_cache import KernelCacheFile
+from slam_backend._kernel_cache import KernelCache
 from slam_backend.errors import FloatArray
 
 P = ParamSpec("P")
@@ -134,8 +134,7 @@ def _stamp(kernel: Any) -> None:
     folder = Path(kernel.py_func.__code__.co_filename).parent
     callees = _contents(folder) if folder.name.endswith(KERNELS) else b""
     options = sorted((name, sorted(x) if isinstance(x, set) else x) for name, x in kernel.targetoptions.items())
-    stamp = (cache._impl.locator.get_source_stamp(), callees, options)
-    cache._cache_file = KernelCacheFile(cache._cache_path, cache._impl.filename_base, stamp)
+    kernel._cache = KernelCache(cache, (cache._impl.locator.get_source_stamp(), callees, options))
 
 
 @lru_cache

@@ -7,7 +7,7 @@ from numba.core.errors import NumbaError
 from python_entry import python_entry
 
 from slam_backend import _jit
-from slam_backend._kernel_cache import KernelCacheFile
+from slam_backend._kernel_cache import CheckedFile
 
 
 def test_this_version_of_numba_can_leave_references_uncounted() -> None:
@@ -143,15 +143,15 @@ def test_a_device_kernel_refuses_a_call_from_python_and_serves_other_kernels() -
 
 def test_entries_of_two_processes_that_save_at_the_same_time_are_never_mixed_up(tmp_path: Any) -> None:
     """Whatever the order of their writes, an entry holds what was compiled for it, or is missing."""
-    one, other = (KernelCacheFile(str(tmp_path), "kernel-1", "stamp") for _ in range(2))
+    one, other = (CheckedFile(str(tmp_path), "kernel-1", "stamp") for _ in range(2))
     one._load_index = lambda: {}  # both have read the index before either wrote
     other._load_index = lambda: {}
     one.save("float64", "code of float64")
     other.save("int64", "code of int64")
-    reader = KernelCacheFile(str(tmp_path), "kernel-1", "stamp")
+    reader = CheckedFile(str(tmp_path), "kernel-1", "stamp")
     assert reader.load("int64") == "code of int64"
     assert reader.load("float64") in (None, "code of float64")
-    assert KernelCacheFile(str(tmp_path), "kernel-1", "another stamp").load("int64") is None
+    assert CheckedFile(str(tmp_path), "kernel-1", "another stamp").load("int64") is None
 
 
 def test_options_are_part_of_what_an_entry_of_the_cache_is_checked_for() -> None:
