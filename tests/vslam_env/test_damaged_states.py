@@ -101,7 +101,8 @@ def try_damaged(env: ExplorationEnv, seeds: range) -> dict[str, int]:
             if env.episode is not None:
                 look(env)
         except RuntimeError as error:
-            assert "got none. Call reset" in str(error), what  # a state of before the first reset
+            if "got none. Call reset" not in str(error):  # a state of before the first reset
+                raise AssertionError(f"seed {seed}: {what}") from error
         except Exception as error:
             raise AssertionError(f"seed {seed}: {what}") from error
         env.set_state(state)
