@@ -43,14 +43,16 @@ class Draws(NamedTuple):
     @property
     def landmarks(self) -> FloatArray:
         """(l, 9, M) float64. Means and covariances. A copy."""
-        rows = self.tiles.transpose(0, 2, 1, 3).reshape(len(self.tiles), 9, -1)
+        count, blocks = self.tiles.shape[:2]
+        rows = self.tiles.transpose(0, 2, 1, 3).reshape(count, 9, blocks * LANES)
         return np.ascontiguousarray(rows[:, :, : self.poses.shape[2]])
 
     def taken(self, ancestors: IntArray) -> "Draws":
         """Return as many paths as there are ancestors (M',), each a copy of its ancestor, weighed alike."""
         m = len(ancestors)
         padded = np.concatenate([ancestors, np.repeat(ancestors[:1], -m % LANES)])  # surplus lanes are copies
-        tiles = self.landmarks[:, :, padded].reshape(len(self.tiles), 9, -1, LANES).transpose(0, 2, 1, 3)
+        blocks = len(padded) // LANES
+        tiles = self.landmarks[:, :, padded].reshape(len(self.tiles), 9, blocks, LANES).transpose(0, 2, 1, 3)
         return Draws.weighed(self.poses[:, :, ancestors], np.ascontiguousarray(tiles), np.zeros(m), self.spreads)
 
 
