@@ -212,6 +212,21 @@ def test_covariances_stay_symmetric_and_positive_and_never_grow(proposal: Any) -
 
 
 @PROPOSALS
+def test_covariances_stay_positive_definite_where_depth_is_all_but_unknown(proposal: Any) -> None:
+    """Landmarks seen from all sides by a very poor camera, and predicted far beyond its range, stay definite."""
+    camera = StereoCamera(sigma_px=0.4, sigma_disparity_px=50.0)
+    rng = np.random.default_rng(5)
+    slam = FastSlam(1, 1, camera, proposal=proposal, position_gate=1e12, dead_zone=1e12)
+    for step in range(200):
+        bearing, away = rng.uniform(-np.pi, np.pi), 10.0 ** rng.uniform(0.0, 2.7) if step else 3.0
+        pose = np.array([-away * np.cos(bearing), -away * np.sin(bearing), bearing + rng.uniform(-0.3, 0.3)])
+        seen = min(away, 9.0) * np.array([np.sin(pose[2] - bearing), -0.1, np.cos(pose[2] - bearing)])
+        slam.step([None], [Measurements(seen[None], LOOK)], identities=[[0]], poses=[pose])
+        assert least_eigenvalue(slam.map().covariances) > 0.0
+    assert slam.map().counts[0] > 100
+
+
+@PROPOSALS
 def test_weights_never_underflow(proposal: Any) -> None:
     """After a thousand steps without resampling the weights are finite and sum to one."""
     world = StereoWorld(np.random.default_rng(0), 9)
