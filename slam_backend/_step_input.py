@@ -8,14 +8,12 @@ import numpy as np
 
 from slam_backend import _kernels
 from slam_backend._step_table import are_kinds, in_one_table, read_by_team, seen_by_each
-from slam_backend.camera import StereoCamera
+from slam_backend.camera import FARTHEST_POINT, StereoCamera
 from slam_backend.errors import FloatArray, IntArray, bad_argument, check_array
 from slam_backend.input_log import StepInput
 from slam_backend.measurements import LARGEST_DESCRIPTOR, Measurements, TeamMeasurements
 
 FARTHEST_MOVE = 1e4  # [m, rad]; no robot moves so far between two steps
-FARTHEST_POINT = 1e4  # [m]; no camera measures so far; at a million times this, covariances overflow
-FLATTEST = 1e4  # depth over breadth of a stereo point's covariance; flatter ones lose their digits
 FARTHEST_POSE = 1e6  # [m, rad]; no robot goes so far from its start
 
 
@@ -33,7 +31,7 @@ def check_step(
     Raises:
         ValueError: If one is ill-formed; the text names it.
     """
-    limit = min(FARTHEST_POINT, FLATTEST * camera.baseline * camera.sigma_px / camera.sigma_disparity_px)
+    limit = camera.farthest_usable
     if isinstance(measurements, TeamMeasurements):
         if identities is None and poses is None:
             inputs = read_by_team(k, size, odometry, measurements, FARTHEST_MOVE, limit)

@@ -6,6 +6,8 @@ import numpy as np
 
 from slam_backend.errors import FloatArray, bad_argument, check_array, check_float, check_int
 
+FARTHEST_POINT = 1e4  # [m]; no camera measures so far; at a million times this, covariances overflow
+FLATTEST = 1e4  # depth over breadth of a stereo point's covariance; flatter ones lose their digits
 # Columns: the camera's X (right), Y (down), Z (ahead) axes in the robot's x (ahead), y (left), z (up).
 ROBOT_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
@@ -51,6 +53,11 @@ class StereoCamera:
     def half_vertical_fov(self) -> float:
         """Half of the vertical field of view [rad]."""
         return float(np.arctan2(0.5 * self.height, self.focal_px))
+
+    @property
+    def farthest_usable(self) -> float:
+        """Largest coordinate [m] of a point whose covariance under this noise is not too flat for a filter."""
+        return min(FARTHEST_POINT, FLATTEST * self.baseline * self.sigma_px / self.sigma_disparity_px)
 
     def robot_from_camera(self, points: FloatArray) -> FloatArray:
         """Move points (..., 3) [m] from the camera frame to the robot frame."""

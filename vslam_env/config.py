@@ -139,6 +139,12 @@ class EnvConfig:
             cure = 'Use sensor="stereo" and observation_type="dict".'
             raise bad_argument("observe_images", "False without rendered eyes or named arrays", True, cure)
         check_float("scan.half_fov", self.scan.half_fov, "A scan spans less than a half circle.", at_most=1.57)
+        eyes = self.stereo if self.sensor == "stereo" else self.landmark_sensor
+        usable = self.belief.filter.camera.farthest_usable
+        if eyes.farthest > usable:
+            expected = f"noise under which points {eyes.farthest:g} m away can be used"
+            cure = "Raise sigma_px or baseline, lower sigma_disparity_px, or the max_range of the true camera."
+            raise bad_argument("belief.filter.camera", expected, f"a limit of {usable:g} m", cure)
 
     @property
     def always_in_contact(self) -> bool:

@@ -125,6 +125,16 @@ def test_a_file_changes_what_it_names(tmp_path: Path) -> None:
     assert EnvConfig.from_toml(path) == EnvConfig(num_robots=2).replace(belief={"filter": {"num_particles": 7}})
 
 
+@pytest.mark.parametrize(
+    "camera", [{"sigma_px": 1e-9}, {"sigma_disparity_px": 70.0}, {"baseline": 1e-6}, {"sigma_disparity_px": 1e9}]
+)
+@pytest.mark.parametrize("sensor", ["landmark", "stereo"])
+def test_noise_under_which_filters_can_use_no_point_is_refused(camera: dict[str, float], sensor: str) -> None:
+    """A filter whose camera makes covariances too flat for the points of the sensor is refused by name, at once."""
+    with pytest.raises(ValueError, match=r"^belief\.filter\.camera: expected noise under which points .* m away"):
+        preset_config("standard", sensor).replace(belief={"filter": {"camera": camera}})
+
+
 def test_none_against_a_standard_value_is_written(tmp_path: Path) -> None:
     """TOML has no None: the text "none" stands for it where the standard is something else, and nothing elsewhere."""
     config = EnvConfig().replace(belief={"filter": {"rejuvenate_every": None}})

@@ -5,6 +5,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from python_entry import python_entry
 
 from slam_backend import FastSlam
@@ -167,7 +169,8 @@ def test_a_frame_is_the_plain_definition() -> None:
     pixels = camera.project(true) + sigmas * noise[sharp, :3]
     disturbed = np.where(is_true, looks[ids[sharp]], false_looks[made_up]) + 0.15 * noise[sharp, 3:]
 
-    optics = np.array([*camera.mount, camera.focal_px, camera.baseline, camera.sigma_px, camera.sigma_disparity_px])
+    lens = camera.focal_px, camera.baseline, camera.sigma_px, camera.sigma_disparity_px
+    optics = np.array([*camera.mount, *lens, 1e3])
     made_of = np.hstack([positions, looks]), np.hstack([false, false_looks[:2]])
     got_points, got_looks = np.empty((6, 3)), np.empty((6, 4), np.float32)
     assert measure(in_rows, counts, poses, *made_of, noise, optics, 0.3, got_points, got_looks) == 4
@@ -338,6 +341,32 @@ def test_all_that_is_measured_can_be_taken_in() -> None:
         told.append(len(frame.true_ids))
     assert min(told) == 0
     assert max(told) == 2
+
+
+@settings(max_examples=40)
+@given(
+    camera=st.builds(
+        StereoCamera,
+        focal_px=st.floats(20.0, 2000.0),
+        baseline=st.floats(0.01, 1.0),
+        max_range=st.floats(0.1, 60.0),
+        sigma_px=st.floats(1e-3, 50.0),
+        sigma_disparity_px=st.floats(1e-3, 50.0),
+    ),
+    false_points=st.floats(0.0, 5.0),
+    seed=st.integers(0, 2**32),
+)
+def test_no_camera_reports_what_a_filter_cannot_use(camera: StereoCamera, false_points: float, seed: int) -> None:
+    """Whatever the camera and its noise: points are ahead, and no farther than 1.2 times its range."""
+    rng = np.random.default_rng(seed)
+    config = LandmarkSensorConfig(camera=camera, false_points=false_points, max_measurements=20)
+    sensor = LandmarkSensor(config, WALL, on_wall([[0.2 * i - 0.6, 0.3 - 0.1 * i] for i in range(7)]))
+    for x in (0.0, 2.0, 3.5):
+        for _ in range(10):
+            (frame,) = sensor.measure(np.array([[x, 0.0, 0.0]]), rng).of_each()
+            points = frame.measurements.points
+            assert np.all(points[:, 2] >= NEAREST)
+            assert np.all(np.linalg.norm(points, axis=1) <= 1.2 * camera.max_range * (1.0 + 1e-9))
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,8 @@ from slam_backend._jit import device, in_place
 from slam_backend.errors import FloatArray, IntArray
 
 NEAREST_FALSE_POINT = 0.5  # [m]
-NEAREST, FARTHEST = 0.05, 1e3  # [m] no matcher reports depths beyond these; filters take none that are nearer
+NEAREST = 0.05  # [m] no matcher reports smaller depths, and filters take none
+FARTHEST, BEYOND = 1e3, 1.2  # [m], and in ranges of the camera: no camera reports points farther than either
 
 
 @device
@@ -93,7 +94,8 @@ def measure(
     """Measure points and descriptors.
 
     Points are projected, their image coordinates and disparities disturbed, and triangulated again. Where the disparity
-    vanishes in the noise, or is that of a point before the lens, no matcher reports a point: the later ones move up.
+    vanishes in the noise, or is that of a point before the lens or far out of range, no camera reports a point: the
+    later ones move up.
 
     Args:
         ids: (K, B) int64. In each row the landmarks that a robot reports; -1 - j for false point j. Changed to those
@@ -103,8 +105,8 @@ def measure(
         landmarks: (N, 3 + d) float64. Their positions [m], world frame, and descriptors, unit vectors.
         false_points: (m, 3 + d) float64. Likewise, but in the camera frame.
         noise: (n, 3 + d) float64, standard normal. Overwritten.
-        optics: (7,) float64. Place of the camera in the robot frame [m], its focal length [px] and baseline [m], and
-            its sigmas of image coordinates and disparity [px].
+        optics: (8,) float64. Place of the camera in the robot frame [m], its focal length [px] and baseline [m], its
+            sigmas of image coordinates and disparity [px], and how far off measured points may be [m].
         descriptor_noise: Root mean square length of the noise of a descriptor.
         points: (n, 3) float64 [m], camera frame. Written to, as what follows.
         looks: (n, d) float32, unit vectors.
@@ -112,7 +114,7 @@ def measure(
     Returns:
         How many are written.
     """
-    forward, aside, height, focal, baseline, sigma, sigma_disparity = optics
+    forward, aside, height, focal, baseline, sigma, sigma_disparity, farthest = optics
     size = looks.shape[1]
     each = descriptor_noise / np.sqrt(size)
     i = kept = 0
@@ -131,11 +133,14 @@ def measure(
                 right, down, ahead = row[:3]
             scale = focal / ahead
             disparity = baseline * scale + sigma_disparity * noise[i, 2]
-            depth = focal * baseline / disparity if disparity > 0.0 else np.inf
-            if NEAREST <= depth <= FARTHEST:
-                points[kept, 0] = (right * scale + sigma * noise[i, 0]) * baseline / disparity
-                points[kept, 1] = (down * scale + sigma * noise[i, 1]) * baseline / disparity
-                points[kept, 2] = depth
+            reported = False
+            if disparity > 0.0:
+                across = (right * scale + sigma * noise[i, 0]) * baseline / disparity
+                below = (down * scale + sigma * noise[i, 1]) * baseline / disparity
+                depth = focal * baseline / disparity
+                points[kept, 0], points[kept, 1], points[kept, 2] = across, below, depth
+                reported = depth >= NEAREST and across**2 + below**2 + depth**2 <= farthest**2
+            if reported:
                 look, square = noise[i, 3:], 0.0
                 for j in range(size):
                     look[j] = row[3 + j] + each * look[j]

@@ -8,7 +8,7 @@ import numpy as np
 from slam_backend.camera import StereoCamera
 from slam_backend.errors import BoolArray, FloatArray, IntArray, bad_argument, check_array, check_float, check_int
 from slam_backend.measurements import Measurements, TeamMeasurements
-from vslam_env.sensors._landmark_kernels import make_up, measure, mix_in
+from vslam_env.sensors._landmark_kernels import BEYOND, FARTHEST, make_up, measure, mix_in
 from vslam_env.world.sight_kernels import detect
 from vslam_env.world.spec import Landmarks
 from vslam_env.world.visibility import marks_of, view_limits, visible_landmarks
@@ -44,6 +44,11 @@ class LandmarkSensorConfig:
         check_float("sensor.false_points", self.false_points, "Give points per frame.", at_least=0.0)
         check_float("sensor.descriptor_noise", self.descriptor_noise, "Give an L2 length.", at_least=0.0)
         check_float("sensor.max_incidence", self.max_incidence, "Give radians.", above=0.0, at_most=np.pi / 2)
+
+    @property
+    def farthest(self) -> float:
+        """No point is reported whose measured place is farther from the camera [m], whatever its noise."""
+        return min(FARTHEST, BEYOND * self.camera.max_range)
 
 
 class Frame(NamedTuple):
@@ -106,7 +111,7 @@ class LandmarkSensor:
         self.robot_radius = check_float("robot_radius", robot_radius, "Give metres.", at_least=0.0)
         camera = config.camera
         lens = camera.focal_px, camera.baseline, camera.sigma_px, camera.sigma_disparity_px
-        self._optics = np.array([*camera.mount, *lens])
+        self._optics = np.array([*camera.mount, *lens, config.farthest])
         self._view = view_limits(camera, config.max_incidence)
         walls_by_rows = self._walls.T.copy()
         self._sight = marks_of(landmarks), landmarks.walls.copy(), walls_by_rows, self.robot_radius, self._view

@@ -62,6 +62,11 @@ class StereoSensorConfig:
         for name in ("working_distance", "tolerance"):
             check_float(f"stereo.{name}", getattr(self, name), "Give metres.", above=0.0)
 
+    @property
+    def farthest(self) -> float:
+        """No point is reported that is farther from the camera than this [m]."""
+        return self.camera.max_range
+
 
 class EyeFrame(NamedTuple):
     """What one robot's eyes saw in one tick, and what was made of it.
