@@ -1,5 +1,6 @@
 """`ExplorationEnv`: the PettingZoo parallel environment."""
 
+import copy
 import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
@@ -100,28 +101,26 @@ class ExplorationEnv(EnvKnowledge):
             Observations and infos by agent.
 
         Raises:
-            ValueError: If the seed, an option or the world is bad; the text says what would do.
+            ValueError: If the seed, an option or the world is bad; the text says what would do. Nothing has changed
+                then: a running episode goes on, and the next reset draws what it would have drawn.
         """
         if seed is not None:
-            self._root = np.random.SeedSequence(check_int("seed", seed, 0, "Give an int >= 0, or None."))
-        elif self._root is None:
-            self._root = np.random.SeedSequence()
+            root = np.random.SeedSequence(check_int("seed", seed, 0, "Give an int >= 0, or None."))
+        else:  # a copy: a reset that is refused leaves everything as it was
+            root = np.random.SeedSequence() if self._root is None else copy.deepcopy(self._root)
         options = {} if options is None else options
         if not isinstance(options, Mapping):
             raise bad_argument("options", "a dict or None", options, "E.g. {'world_seed': 3}.")
         world_seed = options.get("world_seed")
         if world_seed is not None:
             check_int("options['world_seed']", world_seed, 0, "Give an int >= 0.")
-        self.agents = []  # a reset that fails leaves no episode to step
-        setting = draw_setting(
-            self.config, self._source, self._root.spawn(1)[0], world_seed, options.get("start_poses")
-        )
-        self._episode = Episode(self.config, setting, self._tap)
-        self._episode.begin()
+        setting = draw_setting(self.config, self._source, root.spawn(1)[0], world_seed, options.get("start_poses"))
+        episode = Episode(self.config, setting, self._tap)
+        episode.begin()
+        self._standing = episode.standing()
+        self._root, self._episode, self._drivers = root, episode, Drivers(self.config)
         self.agents = self.possible_agents[:]
         self._cycle = 0
-        self._drivers = Drivers(self.config)
-        self._standing = self._episode.standing()
         nothing = dict.fromkeys((term.name for term in self._terms), self._nothing)
         return self._told(self._episode, nothing, [0] * len(self.agents))
 

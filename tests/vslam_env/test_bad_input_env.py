@@ -438,8 +438,34 @@ def test_refused_actions_move_nothing() -> None:
     assert np.array_equal(env.state(), before)
 
 
-def test_a_failed_reset_leaves_no_episode(tmp_path: Path) -> None:
-    """After a reset that failed there is nothing to step, and a good reset works."""
+@pytest.mark.parametrize(
+    "refused",
+    [
+        {"seed": 2, "options": {"world_seed": -1}},
+        {"seed": 2, "options": {"start_poses": [[-50.0, 0.0, 0.0]]}},
+        {"options": {"start_poses": [[-50.0, 0.0, 0.0]]}},
+        {"seed": -1},
+        {"options": 5},
+    ],
+)
+def test_a_refused_reset_changes_nothing(refused: dict[str, Any]) -> None:
+    """The running episode goes on, and the next reset draws what it would have drawn."""
+    shown = []
+    for is_refused in (False, True):
+        env = vslam_v0.parallel_env(num_robots=1, num_particles=5, world="fig5")
+        env.reset(seed=0)
+        if is_refused:
+            with pytest.raises(ValueError, match="expected"):
+                env.reset(**refused)
+        assert env.agents == ["robot_0"]
+        stepped = env.step({"robot_0": np.array([0.5, 0.5])})[0]["robot_0"]
+        shown.append([stepped["scan"], env.reset()[0]["robot_0"]["scan"], env.true_poses])
+    for one, other in zip(*shown, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_after_a_refused_first_reset_there_is_no_episode() -> None:
+    """A reset that was refused before any other leaves nothing to step, and a good one works."""
     env = vslam_v0.parallel_env(num_robots=1, num_particles=5, world="fig5")
     with pytest.raises(ValueError, match="start_poses"):
         env.reset(seed=0, options={"start_poses": [[-50.0, 0.0, 0.0]]})
