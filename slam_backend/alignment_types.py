@@ -7,6 +7,7 @@ from typing import Literal, Self
 import numpy as np
 
 from slam_backend.errors import FloatArray, IntArray, bad_argument, check_array, check_float, check_int
+from slam_backend.read_only import as_read_only
 
 Reason = Literal[
     "", "too few candidates", "too many candidates", "too few inliers", "ambiguous", "mirrored", "poorly spread",
@@ -126,8 +127,7 @@ class Alignment:
         covariance = check_array("covariance", self.covariance, (3, 3), cure, finite=self.success)
         inliers = check_array("inliers", self.inliers, (None, 2), "Give rows (a, b).", dtype=np.int64)
         for name, array in (("covariance", covariance), ("inliers", inliers)):
-            array.setflags(write=False)
-            object.__setattr__(self, name, array)
+            object.__setattr__(self, name, as_read_only(array))
 
     @property
     def transform(self) -> FloatArray:

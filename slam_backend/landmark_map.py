@@ -13,6 +13,7 @@ from slam_backend.array_files import read_arrays
 from slam_backend.errors import FloatArray, IntArray, bad_argument, check_array
 from slam_backend.files import write_file
 from slam_backend.geometry import rotate_covariances, transform_points
+from slam_backend.read_only import as_read_only
 
 FORMAT = "vslam landmark map"
 FORMAT_VERSION = 1
@@ -135,8 +136,7 @@ class LandmarkMap:
                 "ids", "unique ids", f"a repeated id {int(values[repeats.argmax()])}", "Give each its own name."
             )
         for name, array in fields.items():
-            array.setflags(write=False)
-            object.__setattr__(self, name, array)
+            object.__setattr__(self, name, as_read_only(array))
 
     @classmethod
     def _trusted(
@@ -151,9 +151,7 @@ class LandmarkMap:
         self = object.__new__(cls)
         arrays: tuple[NDArray[Any], ...] = (means, covariances, descriptors, counts, ids)
         for name, array in zip(FIELDS, arrays, strict=True):
-            view = array.view()
-            view.setflags(write=False)
-            object.__setattr__(self, name, view)
+            object.__setattr__(self, name, as_read_only(array))
         return self
 
     def __len__(self) -> int:

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from slam_backend import _kernels
 from slam_backend.errors import FloatArray, IntArray, bad_argument, check_array
+from slam_backend.read_only import as_read_only
 
 LARGEST_DESCRIPTOR = 1e6  # of one component; squares of distances then stay far from the end of float32
 LEAST_VARIANCE, LARGEST_VARIANCE = 1e-14, 1e12  # [m^2]; log-weights then keep their differences in float64
@@ -49,10 +50,10 @@ class Measurements:
             covariances: Any = check_array("covariances", self.covariances, (len(points), 3, 3), cure)
             _check_covariances(covariances)
             object.__setattr__(self, "covariances", covariances)
-        for array in (self.points, self.descriptors, self.covariances):
-            if array is not None:
-                array.setflags(write=False)
-        object.__setattr__(self, "extent", _kernels.extent(points))
+        for name in ("points", "descriptors", "covariances"):
+            if (array := getattr(self, name)) is not None:
+                object.__setattr__(self, name, as_read_only(array))
+        object.__setattr__(self, "extent", _kernels.extent(self.points))
 
     def __len__(self) -> int:
         return len(self.points)
@@ -85,10 +86,9 @@ class TeamMeasurements(NamedTuple):
     def of_each(self) -> list[Measurements]:
         """Return the frame of each robot. They are read-only, and share memory with this, not to be written to then."""
         ends = self.ends.tolist()
-        cut = [(self.points[a:b], self.descriptors[a:b]) for a, b in zip([0, *ends[:-1]], ends, strict=True)]
-        for points, _ in cut:
-            points.setflags(write=False)
-        return [_restored(points, looks, None, _kernels.extent(points)) for points, looks in cut]
+        points, looks = as_read_only(self.points), as_read_only(self.descriptors)
+        cut = [(points[a:b], looks[a:b]) for a, b in zip([0, *ends[:-1]], ends, strict=True)]
+        return [_restored(own, described, None, _kernels.extent(own)) for own, described in cut]
 
 
 def _restored(
@@ -97,9 +97,7 @@ def _restored(
     """Return a frame of arrays that were checked before and that nobody else writes to."""
     frame, put = object.__new__(Measurements), object.__setattr__
     for name, value in zip(Measurements.__slots__, (points, descriptors, covariances, extent), strict=True):
-        if isinstance(value, np.ndarray):
-            value.setflags(write=False)
-        put(frame, name, value)
+        put(frame, name, as_read_only(value) if isinstance(value, np.ndarray) and value.flags.writeable else value)
     return frame
 
 

@@ -15,6 +15,7 @@ from slam_backend.errors import BoolArray, FloatArray, IntArray, check_int
 from slam_backend.filter_options import FilterOptions
 from slam_backend.landmark_map import LandmarkMap, TeamOutlines
 from slam_backend.merge_options import MergeOptions
+from slam_backend.read_only import as_read_only
 from slam_backend.smoothing.options import SmoothingOptions
 from slam_backend.standpoints import Standpoints
 from vslam_env.navigation import SeenGrid
@@ -214,6 +215,4 @@ def _freeze_arrays(record: Any) -> None:
     for item in fields(record):
         value = getattr(record, item.name)
         if isinstance(value, np.ndarray):
-            copy = value.copy()
-            copy.setflags(write=False)
-            object.__setattr__(record, item.name, copy)
+            object.__setattr__(record, item.name, as_read_only(value.copy()))

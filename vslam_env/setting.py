@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from slam_backend.errors import FloatArray, bad_argument
+from slam_backend.read_only import as_read_only
 from vslam_env.config import EnvConfig
 from vslam_env.coverage import CoverageMeter
 from vslam_env.errors_of_maps import ClaimLedger
@@ -95,14 +96,13 @@ def draw_setting(
         raise bad_argument("world", "landmarks that robots can see", got, cure)
     world = World(bare.name, bare.walls, landmarks, bare.start_poses)
     true_starts = _starts(config, world, free_space, start_poses, np.random.default_rng(starts))
-    true_starts.setflags(write=False)
     streams = {
         name: np.random.default_rng(stream)
         for name, stream in (("odometry", odometry), ("sensor", sensor), ("scan", scan), ("radio", radio))
     }
     return Setting(
         world=world,
-        true_starts=true_starts,
+        true_starts=as_read_only(true_starts),
         bias=draw_bias(config.odometry, config.num_robots, streams["odometry"]),
         belief_seed=belief_seed,
         stream_states={name: stream.bit_generator.state for name, stream in streams.items()},

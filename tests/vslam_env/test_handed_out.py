@@ -63,6 +63,26 @@ def test_what_is_kept_stays_as_it_was(action_type: str) -> None:
         assert held[0][-1] == then[0][-1]  # infos
 
 
+def test_what_is_read_only_cannot_be_made_writable() -> None:
+    """No array of a belief, a map, an event, a frame or the world lets who holds it lift the protection."""
+    env = small_env(max_cycles=200)
+    for _ in _episode(env):
+        pass
+    beliefs = [env.belief(agent) for agent in env.possible_agents]
+    maps = [belief.map for belief in beliefs] + [env.episode.belief.filter_map(0)]
+    kept = [beliefs, [belief.grid.cells for belief in beliefs], maps, env.events, env.world, env.readings]
+    found = [array for array in _arrays(kept) if not array.flags.writeable]
+    assert len(found) > 40
+    for array in [*found, *(array[:1] for array in found), *(array.T for array in found)]:
+        with pytest.raises(ValueError, match="cannot set WRITEABLE flag"):
+            array.flags.writeable = True
+        with pytest.raises(ValueError, match="cannot set WRITEABLE flag"):
+            array.setflags(write=True)
+    for record in (*beliefs, *maps):
+        for array in _arrays(record):
+            assert not array.flags.writeable
+
+
 @pytest.mark.parametrize("kind", [{}, {"observation_type": "flat"}, {"action_type": "goal"}])
 def test_who_writes_to_what_is_returned_changes_nothing(kind: dict[str, Any]) -> None:
     """An episode goes on with the same bytes though all arrays that can be written were filled with ones."""

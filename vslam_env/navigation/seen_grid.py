@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from slam_backend.errors import FloatArray, IntArray, bad_argument, check_array, check_float
+from slam_backend.read_only import as_read_only
 from vslam_env.navigation import _painting_kernels as _painting
 from vslam_env.navigation._arguments import check_ranges, pose_floats, ray_directions
 from vslam_env.navigation._painting_kernels import CELL, FREE, GRID_SIZE, HALF_WIDTH, OCCUPIED, UNKNOWN
@@ -77,8 +78,7 @@ class SeenGrid:
         """Make arrays, as the kernels expect them, this grid's own."""
         self._evidence, self._cells, self._changes, self._bounds = evidence, cells, changes, bounds
         self._read_only = read_only
-        self.cells = cells.view()
-        self.cells.flags.writeable = False
+        self.cells = as_read_only(cells)
         return self
 
     @classmethod

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend.errors import FloatArray, IntArray, bad_argument, check_array
+from slam_backend.read_only import as_read_only
 
 SHORTEST_WALL = 1e-3  # [m] anything shorter has no direction worth the name
 LARGEST_EXTENT = 200.0  # [m] grids of free space grow with its square
@@ -47,8 +48,7 @@ class Landmarks:
                 worst = float(lengths[np.argmax(np.abs(lengths - 1.0))])
                 raise bad_argument(f"landmarks.{name}", "unit vectors", f"a length of {worst:g}", "Normalise them.")
         for name, array in zip(self.__slots__, (positions, normals, walls, descriptors), strict=True):
-            array.setflags(write=False)
-            object.__setattr__(self, name, array)
+            object.__setattr__(self, name, as_read_only(array))
 
     def __len__(self) -> int:
         return len(self.positions)
@@ -102,8 +102,7 @@ class World:
                 f"a width or height of {extent:g} m",
                 "Check that the unit is metres.",
             )
-        walls.setflags(write=False)
-        object.__setattr__(self, "walls", walls)
+        object.__setattr__(self, "walls", as_read_only(walls))
         if self.landmarks is not None:
             if not isinstance(self.landmarks, Landmarks):
                 raise bad_argument("world.landmarks", "Landmarks or None", self.landmarks, "Build them with Landmarks.")
@@ -118,8 +117,7 @@ class World:
         if self.start_poses is not None:
             cure = "Give rows x y theta in metres and radians."
             starts: Any = check_array("world.start_poses", self.start_poses, (None, 3), cure, within=FARTHEST_PLACE)
-            starts.setflags(write=False)
-            object.__setattr__(self, "start_poses", starts)
+            object.__setattr__(self, "start_poses", as_read_only(starts))
 
     @property
     def bounds(self) -> tuple[float, float, float, float]:
