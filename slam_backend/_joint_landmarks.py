@@ -7,9 +7,11 @@ from numpy.typing import NDArray
 
 from slam_backend._joint_map_kernels import join, places, read
 from slam_backend._kernels import LANES
+from slam_backend._packed import UNPACK
 from slam_backend._particle_maps import ParticleMaps
 from slam_backend.errors import FloatArray, IntArray, bad_argument
 from slam_backend.existence import ExistenceModel
+from slam_backend.geometry import rotation
 
 
 class Landmarks(NamedTuple):
@@ -68,6 +70,50 @@ class Landmarks(NamedTuple):
         return np.asarray(self.maps.odds[self.slots[:, None], particles])
 
 
+def agreed(a: ParticleMaps, b: ParticleMaps, pairs: IntArray) -> tuple[IntArray, IntArray]:
+    """Let the caller's names decide which landmarks of two filters are the same, where there are names on both sides.
+
+    Args:
+        a: Landmarks of one filter.
+        b: Landmarks of the other.
+        pairs: (k, 2) int64 rows (id in a, id in b) that an alignment takes for the same, one-to-one.
+
+    Returns:
+        The rows of `pairs` that no name contradicts; and the rows of landmarks that have one name and are in none of
+        these.
+    """
+    (ids_a, names_a), (ids_b, names_b) = ((maps.ids[slots], maps.identities[slots]) for maps, slots in _used(a, b))
+    known = np.intersect1d(names_a[names_a >= 0], names_b[names_b >= 0])
+    of_a, of_b = names_a[np.searchsorted(ids_a, pairs[:, 0])], names_b[np.searchsorted(ids_b, pairs[:, 1])]
+    differ = (of_a != of_b) & (np.isin(of_a, known) | np.isin(of_b, known) | ((of_a >= 0) & (of_b >= 0)))
+    kept = pairs[~differ]
+    told = []
+    for name in known.tolist():
+        free_a = np.setdiff1d(ids_a[names_a == name], kept[:, 0]).tolist()
+        free_b = np.setdiff1d(ids_b[names_b == name], kept[:, 1]).tolist()
+        told += list(zip(free_a, free_b, strict=False))  # particles may hold it under several ids, each under one
+    return kept, np.array(told, dtype=np.int64).reshape(-1, 2)
+
+
+def _used(*both: ParticleMaps) -> list[tuple[ParticleMaps, IntArray]]:
+    """Return maps with the slots of their landmarks, by ascending id."""
+    return [(maps, maps.used_slots()) for maps in both]
+
+
+def hold_once(counts: IntArray, names: IntArray) -> None:
+    """Let no particle hold two landmarks of one name: of those that it holds the first stays.
+
+    Args:
+        counts: (n, M) of landmarks in particles, changed: 0 where a particle lacks it now.
+        names: (n,) the caller's own, -1 = none.
+    """
+    found, times = np.unique(names[names >= 0], return_counts=True)
+    for name in found[times > 1].tolist():
+        rows = np.flatnonzero(names == name)
+        held = counts[rows] > 0
+        counts[rows] *= held & (np.cumsum(held, axis=0) == 1)
+
+
 def joint_counts(a: Landmarks, b: Landmarks, rows_a: IntArray, rows_b: IntArray) -> IntArray:
     """Return how often each of M particles measured joint landmarks (n, M): on both sides together.
 
@@ -83,8 +129,8 @@ def joint_counts(a: Landmarks, b: Landmarks, rows_a: IntArray, rows_b: IntArray)
 
 
 def write_joint(
-    a: Landmarks, b: Landmarks, rows_a: IntArray, rows_b: IntArray, motion: FloatArray, extra: float, scale: float,
-    blocks: FloatArray,
+    a: Landmarks, b: Landmarks, rows_a: IntArray, rows_b: IntArray, motion: FloatArray, extra: float,
+    scales: FloatArray, blocks: FloatArray,
 ) -> None:  # fmt: skip
     """Bring the landmarks of two filters into the map frame of the first, and fuse those that both have.
 
@@ -92,16 +138,43 @@ def write_joint(
         a, b, rows_a, rows_b: As of `joint_counts`.
         motion: (M, 3) by which each particle moves those of b.
         extra: Added to all variances of either side before [m^2].
-        scale: Factor on all covariances then [-].
+        scales: (n,) factor on the covariances of each then [-].
         blocks: (>= n, P / lanes, 9, lanes) of the joint map, see `MapStore`, of which the first n are written.
 
     Raises:
         ValueError: If two estimates of a landmark are exact along one direction.
     """
     sides = a.maps.values, a.where, a.counts, b.maps.values, b.where, b.counts
-    if not join(*sides, rows_a, rows_b, motion, extra, scale, LANES, blocks):
+    if not join(*sides, rows_a, rows_b, motion, extra, scales, LANES, blocks):
         cure = "Give each landmark some uncertainty in every direction."
         raise bad_argument("landmarks in common", "positive definite covariances", "singular ones", cure)
+
+
+def contradictions(a: Landmarks, b: Landmarks, motion: FloatArray, extra: float) -> FloatArray:
+    """Return by how much the covariances of landmarks that two filters share understate their differences (n,) [-].
+
+    It is the Birge ratio of each: the median over the particles that hold it on both sides of chi^2 / 3, at least 1.
+
+    Args:
+        a: Of one filter, in M particles.
+        b: The same landmarks of the other.
+        motion: (M, 3) by which each particle moves those of b.
+        extra: Added to all variances of either side before [m^2].
+    """
+    ratios = np.ones(len(a.slots))
+    values_a, values_b, turns = a.values, b.values, rotation(motion[:, 2])
+    for row, both in enumerate((a.counts > 0) & (b.counts > 0)):
+        if not both.any():
+            continue
+        one, two, turn = values_a[row][:, both].T, values_b[row][:, both].T, np.tile(np.eye(3), (both.sum(), 1, 1))
+        turn[:, :2, :2] = turns[both]
+        moved = (turn @ two[:, :3, None])[..., 0]
+        moved[:, :2] += motion[both, :2]
+        covariance = one[:, 3:][:, UNPACK] + turn @ two[:, 3:][:, UNPACK] @ turn.transpose(0, 2, 1)
+        apart = (one[:, :3] - moved)[..., None]
+        chi2 = (apart * np.linalg.solve(covariance + 2.0 * extra * np.eye(3), apart)).sum(axis=(1, 2))
+        ratios[row] = max(1.0, float(np.median(chi2)) / 3.0)
+    return ratios
 
 
 def fuse_odds(

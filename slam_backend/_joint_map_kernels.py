@@ -111,7 +111,7 @@ def _fuse(one: FloatArray, two: FloatArray, work: FloatArray) -> bool:
 @jit
 def join(
     values_a: Any, where_a: Any, times_a: Any, values_b: Any, where_b: Any, times_b: Any, rows_a: Any, rows_b: Any,
-    motion: Any, extra: float, scale: float, lanes: int, tiles: Any,
+    motion: Any, extra: float, scales: Any, lanes: int, tiles: Any,
 ) -> bool:  # fmt: skip
     """Write the landmarks of a joint map, those of b moved, those of both fused where a particle holds both.
 
@@ -120,7 +120,7 @@ def join(
         rows_a: (n,) row in a of each joint landmark, -1 if only b has it; `rows_b` likewise.
         motion: (M, 3) from b's map frame to a's, of each particle.
         extra: Added to all variances of either side first [m^2].
-        scale: Factor on all covariances then [-].
+        scales: (n,) factor on the covariances of each then [-].
         lanes: Particles in a block.
         tiles: (>= n, blocks, 9, lanes), of which the first n are written; zeros where a particle holds neither.
 
@@ -130,7 +130,7 @@ def join(
     one, two, work = np.empty(9), np.empty(9), np.empty((5, 3, 3))
     cos, sin = np.cos(motion[:, 2]), np.sin(motion[:, 2])
     for i in range(len(rows_a)):
-        j, k = rows_a[i], rows_b[i]
+        j, k, scale = rows_a[i], rows_b[i], scales[i]
         for block in range(tiles.shape[1]):
             tile, first = tiles[i, block], block * lanes
             for lane in range(lanes):

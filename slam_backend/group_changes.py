@@ -131,7 +131,8 @@ def merge_groups(
         new_ids = dict(renamed.tolist())
         older = [*(watch.copy() for watch in a.watches), *(watch.copy(new_ids) for watch in b.watches)]
         sides = Side.of(a.get_state()), Side.of(b.get_state())
-        fresh = begin_watch(number, alignment, sides, plan.maps, renamed, pairs)
+        common = renamed[np.isin(renamed[:, 1], a.filter._maps.ids), ::-1]
+        fresh = begin_watch(number, alignment, sides, plan.maps, renamed, common)
         trunk.watches = [*sorted(older, key=lambda watch: watch.number), fresh]
     renaming = Renaming(a.robots, b.robots, renamed, (a.number, b.number, number))
     records.entries.append(renaming)

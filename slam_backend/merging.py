@@ -23,7 +23,16 @@ import math
 
 import numpy as np
 
-from slam_backend._joint_landmarks import Landmarks, fuse_odds, joint_counts, stack_descriptors, write_joint
+from slam_backend._joint_landmarks import (
+    Landmarks,
+    agreed,
+    contradictions,
+    fuse_odds,
+    hold_once,
+    joint_counts,
+    stack_descriptors,
+    write_joint,
+)
 from slam_backend._joint_robots import finish, joined_robots
 from slam_backend._pairing import Pairing, pair_up
 from slam_backend.alignment import Alignment
@@ -61,7 +70,9 @@ def merge_filters(
         b: The other filter.
         alignment: Motion a_from_b of the maps, successful; where Gauss-Newton starts, and what is used where two
             particles share fewer than three landmarks.
-        pairs: (k, 2) int64 rows (landmark id in a, landmark id in b) in common, one-to-one.
+        pairs: (k, 2) int64 rows (landmark id in a, landmark id in b) in common, one-to-one. Where the caller has named
+            landmarks on both sides, names decide: pairs of different names are left out, and landmarks of one name are
+            one in the joint map, whether or not they are listed here. These say nothing of the motion.
         rng: For the pairing and the draws of T.
         num_particles: Of the joint filter; None: as many as the larger of the two.
         known: The motion is drawn from the alignment, whatever the landmarks in common say of it.
@@ -74,6 +85,8 @@ def merge_filters(
     if pairing is None:
         pairing = paired(a, b, alignment, pairs, rng, num_particles, known)
     from_a, from_b, motion, evidence, extra, scale = pairing
+    fitting, told = agreed(a._maps, b._maps, pairs)
+    pairs = np.concatenate([fitting, told])
     joint = joined_robots(a, from_a, b, from_b, motion, rng)
     joint._path_log_weights[:] = a._path_log_weights[from_a] + b._path_log_weights[from_b] + evidence
 
@@ -95,7 +108,8 @@ def merge_filters(
     own = np.setdiff1d(np.arange(len(ids_b)), shared_b)  # b's landmarks that a does not have
     rows_a, rows_b = np.arange(len(ids_a) + len(own)), np.full(len(ids_a) + len(own), -1)
     rows_a[len(ids_a) :], rows_b[len(ids_a) :], rows_b[shared_a] = -1, own, shared_b
-    counts = joint_counts(of_a, of_b, rows_a, rows_b)
+    counts, names = joint_counts(of_a, of_b, rows_a, rows_b), np.concatenate([identities, of_b.identities[own]])
+    hold_once(counts, names)
     next_id = a._maps.next_id
     new_ids = next_id + np.arange(len(own))
     held = np.flatnonzero((counts > 0).any(axis=1))
@@ -103,12 +117,16 @@ def merge_filters(
         counts[held],
         stack_descriptors(descriptors, looks_b[own])[held],
         np.concatenate([ids_a, new_ids])[held],
-        np.concatenate([identities, of_b.identities[own]])[held],
+        names[held],
         next_id + len(own),
         np.concatenate([odds_a, odds_b[own]])[held],
     )
     # Either map bears half of what they do not explain.
-    write_joint(of_a, of_b, rows_a[held], rows_b[held], motion, 0.5 * extra, scale, joint._maps.blocks)
+    scales = np.full(len(counts), scale)
+    if len(told):
+        sides = Landmarks.of(a._maps, from_a, told[:, 0]), Landmarks.of(b._maps, from_b, told[:, 1])
+        scales[np.searchsorted(ids_a, told[:, 0])] = np.maximum(scale, contradictions(*sides, motion, 0.5 * extra))
+    write_joint(of_a, of_b, rows_a[held], rows_b[held], motion, 0.5 * extra, scales[held], joint._maps.blocks)
     renamed = np.concatenate([pairs[:, ::-1], np.column_stack([ids_b[own], new_ids])]).astype(np.int64)
     finish(joint, a, b, renamed)
     return joint, renamed
@@ -124,6 +142,7 @@ def paired(
         a, b, alignment, pairs, rng, num_particles, known: As of `merge_filters`, which draws it first of all.
     """
     count = max(a.num_particles, b.num_particles) if num_particles is None else num_particles
+    pairs, _ = agreed(a._maps, b._maps, pairs)
     common_a, common_b = Landmarks.of(a._maps, ids=pairs[:, 0]), Landmarks.of(b._maps, ids=pairs[:, 1])
     return pair_up(a.weights, common_a, b.weights, common_b, alignment, count, rng, known)
 

@@ -8,6 +8,7 @@ and is the default.
 
 import numpy as np
 
+from slam_backend._joint_landmarks import agreed
 from slam_backend._joint_robots import finish, joined_robots
 from slam_backend._packed import UPPER
 from slam_backend.alignment import Alignment
@@ -34,7 +35,8 @@ def merge_mixtures(
         a: Filter whose map frame and landmark ids stay.
         b: The other filter.
         alignment: Motion a_from_b of the maps, successful.
-        pairs: (k, 2) int64 rows (landmark id in a, landmark id in b) in common, one-to-one.
+        pairs: (k, 2) int64 rows (landmark id in a, landmark id in b) in common, one-to-one; names that the caller has
+            given decide, as in `merge_filters`.
         rng: For the pairing and the draws.
         num_particles: Of the joint filter; None: as many as the larger of the two.
 
@@ -44,6 +46,8 @@ def merge_mixtures(
     """
     count = max(a.num_particles, b.num_particles) if num_particles is None else num_particles
     map_a, map_b = a.map("mixture"), b.map("mixture")
+    pairs = np.concatenate(agreed(a._maps, b._maps, pairs))
+    pairs = pairs[np.isin(pairs[:, 0], map_a.ids) & np.isin(pairs[:, 1], map_b.ids)]
     inliers = np.column_stack([np.searchsorted(map_a.ids, pairs[:, 0]), np.searchsorted(map_b.ids, pairs[:, 1])])
     matched = Alignment(
         True, "", alignment.tx, alignment.ty, alignment.theta, alignment.covariance, inliers, alignment.ratio

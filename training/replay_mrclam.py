@@ -188,11 +188,13 @@ def replay(
     attempts, seconds, rejuvenations = 0, 0.0, RejuvenationCount()
     for step in range(num_steps):
         seen = [own.measurements[step] for own in readings.robots]
+        rows = [_true_rows(frame) for frame in seen]
+        names = rows if config.identities == "given" else None
         told = seen if config.identities == "given" else [_alike(frame) for frame in seen]
         groups = {robot: group for group in team.groups for robot in group}
         maps = {group: team.map(group[0]) for group in team.groups}
         started = time.perf_counter()
-        report = team.step([own.odometry[step] if step else None for own in readings.robots], told, contacts)
+        report = team.step([own.odometry[step] if step else None for own in readings.robots], told, contacts, names)
         seconds += time.perf_counter() - started
         for _, told_of in report.rejuvenations:
             rejuvenations.add(told_of)
@@ -207,7 +209,7 @@ def replay(
             if event.kind == "undo":
                 when = float(readings.times[step] - readings.times[0])
                 merges = [replace(m, undone=when) if m.event.alignment is event.alignment else m for m in merges]
-        ledger.record(report, [_true_rows(frame) for frame in seen])
+        ledger.record(report, rows)
         for robot in robots:
             paths[robot, step] = team.pose_from_start(robot).mean
         on_step((step + 1) / num_steps, report)

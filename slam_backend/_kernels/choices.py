@@ -163,6 +163,33 @@ def start_none_beyond(match: FloatArray, real: int) -> None:
 
 @device
 @lanes
+def start_none_held(match: FloatArray, seen: Int32Array) -> None:
+    """Let a named measurement start no landmark in lanes that hold the one of its name, wherever they predict it."""
+    for i in range(len(match)):
+        match[i] = -1.0 if match[i] == -2.0 and seen[i] > 0 else match[i]
+
+
+@lanes
+def start_none_again(match: FloatArray, earlier: FloatArray) -> None:
+    """Let a named measurement start no landmark in lanes in which an earlier one of its name and frame starts it."""
+    for i in range(len(match)):
+        match[i] = -1.0 if match[i] == -2.0 and earlier[i] == -2.0 else match[i]
+
+
+@lanes
+def start_once(
+    match: FloatArray, b: int, first: int, counts: Int32Array, row_of: IntArray, starts: IntArray, slots: IntArray,
+    names: IntArray,
+) -> None:  # fmt: skip
+    """Let no lane of a block, of particles from `first` on, hold two landmarks of the name of measurement b."""
+    for q in range(starts[b], starts[b + 1]):
+        start_none_held(match[b], counts[row_of[slots[q]], first : first + LANES])
+    for a in range(b):
+        if names[a] == names[b]:
+            start_none_again(match[b], match[a])
+
+
+@lanes
 def write_found(
     found: Int32Array, distances: FloatArray, first: int, match: FloatArray, starts: IntArray, slots: IntArray,
     records: FloatArray, row: int, new_slots: IntArray,

@@ -6,7 +6,7 @@ import numpy as np
 
 from slam_backend._jit import device, fused, room
 from slam_backend._kernels.candidates import find_candidates
-from slam_backend._kernels.choices import admit, bar_taken, mask_of, write_found
+from slam_backend._kernels.choices import admit, bar_taken, mask_of, start_once, write_found
 from slam_backend._kernels.innovations import innovate
 from slam_backend._kernels.landmark_updates import gate_and_update, new_landmark
 from slam_backend._kernels.layout import CANDIDATE_ROWS, CLUTTER, LANES, Q_D, REJECTED
@@ -91,14 +91,18 @@ def update_fastslam1(
                 innovate(work, tile, points, noises, b, given, camera)
                 gate_and_update(work, tile, record, chosen, seen, float(q), mask, gate, walk)  # l. 33-37, 39
             log_clutter = log_p0 + (0.0 if given else 4.0 * math.log(points[b, 0]))
-            if mask_of(chosen, -2.0, mask) > 0:  # l. 28-32
+            unmatched = mask_of(chosen, -2.0, mask)
+            for i in range(LANES):
+                work[CLUTTER + i] += log_clutter if mask[i] > 0.0 else 0.0
+            if named:
+                start_once(match, b, first, counts, row_of, starts, slots, names)
+                unmatched = mask_of(chosen, -2.0, mask)
+            if unmatched > 0:  # l. 28-32
                 if new_slots[b] == REJECTED:
                     open_slot(b, new_slots, new_rows, row_of, map_of, values, counts, free_rows, free_slots, tops)
                 new_landmark(
                     work, values, counts, new_rows[b], block, points, noises, b, given, camera, mask, walk
                 )  # fmt: skip
-                for i in range(LANES):
-                    work[CLUTTER + i] += log_clutter if mask[i] > 0.0 else 0.0
         write_found(found, distances, first, match, starts, slots, records, Q_D, new_slots)
         for i in range(LANES):
             log_likelihood[first + i] += total_log_likelihood(work, i)

@@ -4,7 +4,7 @@ import numpy as np
 
 from slam_backend._jit import device, fused, room
 from slam_backend._kernels.candidates import find_candidates
-from slam_backend._kernels.choices import mask_of, start_none_beyond, write_found
+from slam_backend._kernels.choices import mask_of, start_none_beyond, start_once, write_found
 from slam_backend._kernels.first_pass import match_first
 from slam_backend._kernels.landmark_updates import new_landmark, update_matched
 from slam_backend._kernels.layout import CANDIDATE_ROWS, LANES, Q_FIRST_D, REJECTED, SPREAD00, X0, X
@@ -99,6 +99,9 @@ def update_fastslam2(
             position_gate, dead_zone, dead_radius, ambiguity, log_p0, one_to_one,
         )  # fmt: skip
         start_none_beyond(match, num_particles - first)
+        if named:
+            for b in range(num):
+                start_once(match, b, first, counts, row_of, starts, slots, names)
 
         # The pose: N(x^, P^) from all matches; weigh by the predictive likelihood; sample once.
         take_draws(work, normals, first)

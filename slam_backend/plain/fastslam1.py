@@ -6,7 +6,7 @@ from slam_backend.errors import FloatArray
 from slam_backend.filter_options import FilterOptions
 from slam_backend.plain.frame import Frame
 from slam_backend.plain.pose_belief import PoseBelief
-from slam_backend.plain.turn import NEW, REJECTED, Candidates, Landmarks, Turn
+from slam_backend.plain.turn import NEW, REJECTED, Candidates, Landmarks, Turn, is_held
 
 
 def fastslam1_turn(
@@ -38,8 +38,9 @@ def fastslam1_turn(
                 match, distance, log_likelihood = name, gate.distance, gate.log_density  # l. 39, before the update
                 break
         if match == REJECTED:  # l. 28-32
-            match = NEW - b
-            landmarks[match] = frame.new_landmark(pose, b, options.landmark_walk)
+            if frame.names is None or not is_held(b, possible, chosen, frame.names):
+                match = NEW - b
+                landmarks[match] = frame.new_landmark(pose, b, options.landmark_walk)
         else:  # l. 33-37
             frame.update(pose, landmarks[match], b, options.landmark_walk)
         chosen.append(match)

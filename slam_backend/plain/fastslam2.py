@@ -11,7 +11,7 @@ from slam_backend.errors import FloatArray
 from slam_backend.filter_options import FilterOptions
 from slam_backend.plain.frame import Frame, Innovation, log_density
 from slam_backend.plain.pose_belief import PoseBelief, WhitenedPose
-from slam_backend.plain.turn import NEW, REJECTED, Candidates, Landmarks, Turn
+from slam_backend.plain.turn import NEW, REJECTED, Candidates, Landmarks, Turn, is_held
 
 WIDE_HEADING = 0.03  # [rad]; a predicted heading less certain than this asks for more iterations
 MORE_ITERATIONS = 3
@@ -190,7 +190,7 @@ def decide(
     chosen: list[int] = []
     total = 0.0
     for b, possible in enumerate(candidates):
-        is_dead = False
+        is_dead = frame.names is not None and is_held(b, possible, chosen, frame.names)
         costs = []
         for e, name in possible:
             gate = gates.get((b, name))

@@ -39,6 +39,18 @@ class Turn:
     log_likelihood: float
 
 
+def is_held(b: int, possible: Sequence[tuple[float, int]], chosen: Sequence[int], names: Sequence[int]) -> bool:
+    """Tell whether a particle has a landmark of a measurement's name: then it starts no second one.
+
+    Args:
+        b: The measurement.
+        possible: The landmarks of the particle that have its name.
+        chosen: What became of the measurements before it.
+        names: The caller's names of all measurements of the frame.
+    """
+    return bool(possible) or any(chosen[a] == NEW - a and names[a] == names[b] for a in range(b))
+
+
 class RobotStep:
     """What one robot's step came to: per measurement of its frame (n) and per particle (M).
 

@@ -54,7 +54,7 @@ def test_the_join_agrees_with_matrices(sizes: tuple[int, int]) -> None:
     motion = rng.uniform(-2.0, 2.0, (40, 3))
     before = [side.get_state() for side in maps]
     tiles = np.full((len(rows_a) + 1, 1, 9, LANES), np.nan)
-    write_joint(a, b, rows_a, rows_b, motion, EXTRA, SCALE, tiles)
+    write_joint(a, b, rows_a, rows_b, motion, EXTRA, np.full(len(rows_a), SCALE), tiles)
     plain, plain_counts = plain_join(a, b, rows_a, rows_b, motion)
     found = tiles[:-1].transpose(0, 1, 3, 2).reshape(len(rows_a), -1, 9)
     np.testing.assert_array_equal(joint_counts(a, b, rows_a, rows_b), plain_counts)
@@ -86,4 +86,4 @@ def test_two_exact_estimates_cannot_be_fused() -> None:
     maps.load(exact, np.ones((1, 2), np.int64), np.eye(1, 4, dtype=np.float32), np.arange(1), np.full(1, -1), 1)
     side, row = Landmarks.of(maps), np.zeros(1, np.int64)
     with pytest.raises(ValueError, match="landmarks in common: expected positive definite covariances, got 'singular"):
-        write_joint(side, side, row, row, np.zeros((2, 3)), 0.0, 1.0, maps.blocks)
+        write_joint(side, side, row, row, np.zeros((2, 3)), 0.0, np.ones(1), maps.blocks)
