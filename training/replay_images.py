@@ -24,7 +24,7 @@ from slam_backend.readers.kitti_images import KittiImages, load_kitti_images
 from slam_backend.readers.stereo_files import StereoFiles, load_stereo_images
 from slam_backend.reports import StepReport
 from training.plain_config import PlainConfig
-from training.replay_config import check_common
+from training.replay_config import REJUVENATE_EVERY, check_common
 from training.replay_kitti import mean_drift
 from training.replay_one import (
     PLANAR_GATE,
@@ -62,7 +62,7 @@ class ImagesConfig(PlainConfig):
         particles: Of the filter.
         estimator: Its proposal.
         rejuvenate_every: Steps of the log after which particles are drawn anew from smoothed paths, as `FilterOptions`
-            has it; None or 0: never.
+            has it; 0: never.
         seed: Of all random draws.
         descriptor: "usurf", "sift" or "orb".
         max_range: Points farther than this are dropped [m].
@@ -80,7 +80,7 @@ class ImagesConfig(PlainConfig):
     duration: float | None = None
     particles: int = 100
     estimator: Literal["fastslam2", "fastslam1"] = "fastslam2"
-    rejuvenate_every: int | None = None
+    rejuvenate_every: int = REJUVENATE_EVERY
     seed: int = 0
     descriptor: Literal["usurf", "sift", "orb"] = "usurf"
     max_range: float = 40.0

@@ -13,7 +13,7 @@ from slam_backend.geometry import between, compose
 from slam_backend.readers.kitti import KittiLog
 from slam_backend.readers.kitti_steps import make_camera, motion_noise, steps
 from training.plain_config import PlainConfig
-from training.replay_config import check_common
+from training.replay_config import REJUVENATE_EVERY, check_common
 from training.replay_one import (
     PLANAR_GATE,
     OneReplay,
@@ -48,7 +48,7 @@ class KittiConfig(PlainConfig):
         particles: Of the filter.
         estimator: Its proposal.
         rejuvenate_every: Steps of the log after which particles are drawn anew from smoothed paths, as `FilterOptions`
-            has it; None or 0: never.
+            has it; 0: never.
         seed: Of all random draws.
         sigma_px: Assumed standard deviation of a feature's column [px]: features creep along while they are tracked.
         sigma_disparity_px: Assumed standard deviation of its disparity [px]. The rows of both images, which should
@@ -60,7 +60,7 @@ class KittiConfig(PlainConfig):
     duration: float | None = None
     particles: int = 100
     estimator: Literal["fastslam2", "fastslam1"] = "fastslam2"
-    rejuvenate_every: int | None = None
+    rejuvenate_every: int = REJUVENATE_EVERY
     seed: int = 0
     sigma_px: float = 1.0
     sigma_disparity_px: float = 0.5

@@ -22,7 +22,7 @@ from slam_backend.reports import MergeEvent, TeamReport
 from slam_backend.team import TeamSlam
 from training.plain_config import PlainConfig
 from training.rejuvenation_count import RejuvenationCount
-from training.replay_config import check_common
+from training.replay_config import REJUVENATE_EVERY, check_common
 from training.replay_one import PLANAR_GATE
 from vslam_env.errors_of_maps import ClaimLedger
 
@@ -73,7 +73,7 @@ class ReplayConfig(PlainConfig):
         particles: Per filter; None: 100 for each robot that may come to share it.
         estimator: Proposal of the filters.
         rejuvenate_every: Steps of the log after which particles are drawn anew from smoothed paths, as `FilterOptions`
-            has it; None or 0: never.
+            has it; 0: never.
         dt: Time between steps [s].
         seed: Of all random draws.
         drive: How robots are taken to follow their commands, the same for all. The default was calibrated on data sets
@@ -91,7 +91,7 @@ class ReplayConfig(PlainConfig):
     alone: bool = False
     particles: int | None = None
     estimator: Literal["fastslam2", "fastslam1"] = "fastslam2"
-    rejuvenate_every: int | None = None
+    rejuvenate_every: int = REJUVENATE_EVERY
     dt: float = 0.25
     seed: int = 0
     drive: Drive = DRIVE

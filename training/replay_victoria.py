@@ -18,7 +18,7 @@ from slam_backend.readers.victoria import VictoriaLog
 from slam_backend.readers.victoria_steps import SENSOR, TreeNoise, steps
 from slam_backend.trajectory import Trajectory
 from training.plain_config import PlainConfig
-from training.replay_config import check_common
+from training.replay_config import REJUVENATE_EVERY, check_common
 from training.replay_one import PLANAR_GATE, OneReplay, PositionScore, metrics_of, replay_one, score_positions
 
 # Against the motion that fits the trees of two scans best, a second apart, the odometry turns 4 % and 0.0014 rad/m too
@@ -56,7 +56,7 @@ class VictoriaConfig(PlainConfig):
         particles: Of the filter.
         estimator: Its proposal.
         rejuvenate_every: Steps of the log after which particles are drawn anew from smoothed paths, as `FilterOptions`
-            has it; None or 0: never.
+            has it; 0: never.
         seed: Of all random draws.
         motion: Assumed noise of the odometry.
         sensor: Assumed noise of the trees' readings.
@@ -66,7 +66,7 @@ class VictoriaConfig(PlainConfig):
     duration: float | None = None
     particles: int = 100
     estimator: Literal["fastslam2", "fastslam1"] = "fastslam2"
-    rejuvenate_every: int | None = None
+    rejuvenate_every: int = REJUVENATE_EVERY
     seed: int = 0
     motion: OdometryModel = MOTION
     sensor: TreeNoise = field(default_factory=TreeNoise)

@@ -11,6 +11,9 @@ from small_logs import write_drive, write_log, write_park
 
 from slam_backend import _rejuvenation_step
 from training.replay_images import ImagesConfig
+from training.replay_kitti import KittiConfig
+from training.replay_mrclam import ReplayConfig
+from training.replay_victoria import VictoriaConfig
 from training.run_config import RunConfig
 from vslam_env.config import EnvConfig
 from vslam_env.presets import preset_config
@@ -55,7 +58,7 @@ def test_a_replay_is_rejuvenated_and_repeats_itself(
     WRITERS[command](log)
     options = ("replay", command, "--path", str(log), "--duration", "8", "--seed", "104")
     options += ("--particles", str(PARTICLES))
-    assert vslam(*options, "--out", str(plain)).status == 0
+    assert vslam(*options, "--rejuvenate-every", "0", "--out", str(plain)).status == 0
     assert not reasons
     assert vslam(*options, "--rejuvenate-every", "8", "--out", str(one)).status == 0
     assert reasons.count("") > 0.5 * len(reasons) > 0.0
@@ -69,11 +72,18 @@ def test_a_replay_is_rejuvenated_and_repeats_itself(
     assert json.loads((off / "metrics.json").read_text())["rejuvenations"] == {"drawn": 0, "refused": {}}
     assert estimates(off) == estimates(plain)
     assert "rejuvenate_every = 8" in (one / "config.toml").read_text()
-    assert "rejuvenate_every" not in (plain / "config.toml").read_text()
+    assert "rejuvenate_every = 0" in (plain / "config.toml").read_text()
     assert estimates(one) == estimates(two)
     assert all(with_it != without for with_it, without in zip(estimates(one), estimates(plain), strict=True))
     first, second = (json.loads((folder / "metrics.json").read_text()) for folder in (one, two))
     assert first == second
+
+
+def test_all_replays_are_rejuvenated_as_often_as_environments_unless_told_otherwise() -> None:
+    """The default is one interval, that of the environments' filters."""
+    usual = preset_config("standard").belief.filter.rejuvenate_every
+    for config in (ReplayConfig, VictoriaConfig, KittiConfig, ImagesConfig):
+        assert config(path="log").rejuvenate_every == usual
 
 
 @pytest.mark.parametrize("sensor", ["landmark", "stereo"])
