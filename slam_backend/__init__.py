@@ -7,6 +7,7 @@ from slam_backend.alignment import Alignment, AlignmentOptions, align_maps
 from slam_backend.attempts import AttemptOptions
 from slam_backend.camera import StereoCamera
 from slam_backend.compilation import log_compilation
+from slam_backend.consistency import Consistency
 from slam_backend.duplicates import DuplicateOptions, find_duplicates, fuse_duplicates
 from slam_backend.existence import ExistenceModel
 from slam_backend.filter import FastSlam
@@ -27,6 +28,7 @@ __all__ = [
     "Alignment",
     "AlignmentOptions",
     "AttemptOptions",
+    "Consistency",
     "DuplicateOptions",
     "ExistenceModel",
     "FastSlam",

@@ -10,6 +10,7 @@ from slam_backend._existence_step import ExistenceStep
 from slam_backend._jit import in_place, jit
 from slam_backend._kernels import LANES
 from slam_backend._particle_maps import MAPS_KEPT
+from slam_backend.consistency import LISTS, SIGN_OF, SIGNS, WEIGHTS
 from slam_backend._rejuvenation_step import SCHEDULE
 from slam_backend._turns import assumed
 from slam_backend.errors import FloatArray, IntArray, bad_argument
@@ -50,7 +51,7 @@ from slam_backend.state_checks import (
 
 POSES = ("_poses", "_starts", "_means", "_covariances")  # (K, 3 or 6, P), of each robot
 KEPT = (*POSES, "_frame", "_blind", "_log_weights", "_path_log_weights", "_weights")
-OTHERS_KEPT = ("steps", "estimates", "maps", "logs", "options", "rng")
+OTHERS_KEPT = ("steps", "estimates", "maps", "logs", "consistency", "options", "rng")
 LONGEST_DESCRIPTOR = 1 << 16
 MOST_LANDMARKS = 1 << 30  # names of landmarks: tables are as long as the largest of them
 LEAST = float(np.finfo(np.float64).min)  # of log-weights
@@ -100,7 +101,22 @@ def check_filter(name: str, state: Any, known: Sequence[FilterOptions] = ()) -> 
         check_keys(name, state, ("rejuvenation",))
         size = state["maps"]["descriptors"].shape[1]
         check_rejuvenation(f"{name}['rejuvenation']", state["rejuvenation"], state["logs"], size)
+    check_consistency(f"{name}['consistency']", state["consistency"])
     check_generator(f"{name}['rng']", state["rng"])
+
+
+def check_consistency(name: str, state: Any) -> None:
+    """Refuse what are not the running sums of a consistency test."""
+    check_keys(name, state, ("frames", *LISTS))
+    check_whole(f"{name}['frames']", state["frames"])
+    total, matched = check_each(f"{name}['nis']", state["nis"], 2)
+    check_number(*total, 0.0)
+    check_whole(*matched)
+    for part, count in (("counts", len(SIGN_OF)), ("since", len(SIGNS))):
+        for where, number in check_each(f"{name}[{part!r}]", state[part], count):
+            check_whole(where, number, -1)
+    for where, number in check_each(f"{name}['evidence']", state["evidence"], len(WEIGHTS)):
+        check_number(where, number, 0.0)
 
 
 def _check_fit(name: str, options: FilterOptions) -> None:

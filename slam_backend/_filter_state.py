@@ -17,6 +17,7 @@ from slam_backend._particle_maps import ParticleMaps
 from slam_backend._rejuvenated_maps import write_maps
 from slam_backend._rejuvenation_step import RejuvenationStep
 from slam_backend._turns import assumed, spans_of
+from slam_backend.consistency import ConsistencyTest
 from slam_backend.errors import IntArray, bad_argument, check_int, check_seed
 from slam_backend.filter_options import MOST_ROBOTS, FilterOptions
 from slam_backend.reports import PoseEstimates
@@ -37,6 +38,7 @@ class FilterState(FilterArrays):
         _maps: The landmarks of all particles.
         _estimates: The poses of all robots over all particles; written to in each step.
         _journal: What the last steps came to that the logs do not hold yet.
+        _consistency: Whether it errs as little as it claims, as far as its frames tell.
         _steps: Number of the next step.
         _rng: The filter's own random stream.
     """
@@ -61,6 +63,7 @@ class FilterState(FilterArrays):
         self._steps = 0
         self._robot_logs = [RobotLog() for _ in range(k)]
         self._journal = Journal(k)
+        self._consistency = ConsistencyTest()
         self._estimates = self._mixtures()
 
     @property
@@ -132,7 +135,7 @@ class FilterState(FilterArrays):
         logs = tuple(log.get_state() for log in self._logs)  # first, for it tells the smoother as well
         state: dict[str, Any] = {name: getattr(self, name).copy() for name in KEPT}
         state |= {"steps": self._steps, "estimates": self._estimates.copy(), "maps": self._maps.get_state()}
-        state["logs"] = logs
+        state |= {"logs": logs, "consistency": self._consistency.get_state()}
         if self._rejuvenation is not None:
             state["rejuvenation"] = self._rejuvenation.get_state()
         return state | {"options": self.options, "rng": copy.deepcopy(self._rng.bit_generator.state)}
@@ -164,5 +167,6 @@ class FilterState(FilterArrays):
             log.set_state(logged)
         if self._rejuvenation is not None:
             self._rejuvenation.set_state(state["rejuvenation"])
+        self._consistency.set_state(state["consistency"])
         self._steps, self._estimates = state["steps"], state["estimates"].copy()
         self._rng = generator_of(state["rng"])  # of its own: the old one may be the caller's, or of another kind

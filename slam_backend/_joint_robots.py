@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from slam_backend._packed import UNPACK, UPPER
+from slam_backend.consistency import ConsistencyTest
 from slam_backend.errors import FloatArray, IntArray
 from slam_backend.filter import FastSlam
 from slam_backend.geometry import compose, rotation
@@ -50,9 +51,13 @@ def _join_poses(
 
 
 def finish(joint: FastSlam, a: FastSlam, b: FastSlam, renamed: IntArray) -> None:
-    """Give a joint filter, whose map is loaded, its step count, estimates and logs; `renamed` as of `merge_filters`."""
+    """Give a joint filter, whose map is loaded, its step count, warnings, estimates and logs.
+
+    `renamed` is that of `merge_filters`.
+    """
     joint._look_at_weights()
     joint._steps = max(a._steps, b._steps)
+    joint._consistency = ConsistencyTest.joined(a._consistency, b._consistency)
     joint._estimates = joint._mixtures()
     joint._widen()
     joint._robot_logs = [log.copy() for log in a._logs] + [log.renamed(renamed[:, 0], renamed[:, 1]) for log in b._logs]

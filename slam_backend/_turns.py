@@ -56,7 +56,9 @@ def place(arrays: FilterArrays, robot: int, exact: FloatArray) -> None:
     arrays._frame.fill(0.0)  # it is known now
 
 
-def take_turns(slam: "FilterState", inputs: StepInput, seats: Seats, told: IntArray) -> tuple[Summary, list[IntArray]]:
+def take_turns(
+    slam: "FilterState", inputs: StepInput, seats: Seats, told: IntArray
+) -> tuple[Summary, list[IntArray], int]:
     """Move all robots of a filter, match what they saw, weigh and update (Algorithm 1, l. 6-8), and sum it up.
 
     Where one did and saw nothing no random number is drawn. The step waits in the journal then.
@@ -68,8 +70,8 @@ def take_turns(slam: "FilterState", inputs: StepInput, seats: Seats, told: IntAr
         told: (2, n) int64, written: what becomes of their measurements, see `Findings`.
 
     Returns:
-        What all of it came to; and slots of landmarks that turned out not to exist, to be released when nobody asks for
-        their ids.
+        What all of it came to; slots of landmarks that turned out not to exist, to be released when nobody asks for
+        their ids; and the number of measurements that were used.
     """
     maps, journal = slam._maps, slam._journal
     active = used = 0
@@ -105,4 +107,4 @@ def take_turns(slam: "FilterState", inputs: StepInput, seats: Seats, told: IntAr
                 deserted.append(slam._existence.weigh(maps, slam._poses[low], slam._best, found, new_slots))
     journal.steps.append(slam._steps)
     journal.num_measured += used
-    return summary, deserted
+    return summary, deserted, used

@@ -170,9 +170,11 @@ class FastSlam(FilterKnowledge):
             seats: Of these robots there.
             findings: Of `inputs`; what becomes of these robots' measurements is written there.
         """
-        summary, deserted = take_turns(self, inputs, seats, findings.told)
+        summary, deserted, used = take_turns(self, inputs, seats, findings.told)
         self._best, long_unseen, created, new, matched, rejected, ess, nis, is_depleted = summary
         report = StepReport(findings, seats.rows, created, new, matched, rejected, ess, nis, is_depleted)
+        if used:
+            self._consistency.note(self._steps, nis, ess / self.num_particles, used, used - new - matched)
         if rejected and self._rejuvenation is not None:
             tell_refused(self._rejuvenation, self._steps, inputs, seats, findings.told)
         self._steps += 1

@@ -9,6 +9,7 @@ from slam_backend import _kernels
 from slam_backend._best_map import best_map, slots_held, write_outline
 from slam_backend._filter_state import FilterState
 from slam_backend._mixtures import map_mixture
+from slam_backend.consistency import Consistency
 from slam_backend.errors import FloatArray, IntArray, bad_argument, check_choice
 from slam_backend.geometry import between
 from slam_backend.landmark_map import LandmarkMap, MapOutline, OutlineRows
@@ -42,6 +43,11 @@ class FilterKnowledge(FilterState):
     def descriptor_size(self) -> int:
         """Length of the descriptors in the map, 0 before the first one."""
         return int(self._maps.descriptors.shape[1])
+
+    @property
+    def consistency(self) -> Consistency:
+        """Whether the filter errs as little as it claims, as far as its frames tell, and what to try if not."""
+        return self._consistency.report()
 
     def log(self, robot: int = 0) -> RobotLog:
         """Return what the robot did and measured so far: odometry, points, and the landmarks they were taken for."""

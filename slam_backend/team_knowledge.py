@@ -7,6 +7,7 @@ import numpy as np
 from slam_backend._best_map import write_outline
 from slam_backend._team_state import TeamState
 from slam_backend.branches import Branch, restored_filter
+from slam_backend.consistency import Consistency
 from slam_backend.errors import FloatArray, IntArray, bad_argument
 from slam_backend.exchange import ExchangeLedger
 from slam_backend.geometry import inverse
@@ -51,7 +52,11 @@ class TeamKnowledge(TeamState):
 
     @property
     def diagnostics(self) -> tuple[dict[str, float], ...]:
-        """Per robot: ESS, NIS, landmarks held, and its accepted, new and rejected measurements of the last step."""
+        """Per robot: ESS, NIS, landmarks held, and its accepted, new and rejected measurements of the last step.
+
+        Of the whole life of its filter: `nis_mean`, `nis_share`, `ess_share` and `rejected_share` of `Consistency`,
+        and `warnings`, how many there are; `consistency` has their texts.
+        """
         rows: list[dict[str, float]] = []
         for robot in range(self.num_robots):
             branch, index = self._find(robot)
@@ -59,6 +64,7 @@ class TeamKnowledge(TeamState):
             found = np.empty(0, np.int64) if report is None else report.associations[index]
             made = np.empty(0, np.int64) if report is None else report.created[index]
             new = int(np.count_nonzero((found >= 0) & (found == made)))
+            told = branch.filter.consistency
             rows.append(
                 {
                     "ess": self.ess(robot),
@@ -67,9 +73,18 @@ class TeamKnowledge(TeamState):
                     "accepted": float(np.count_nonzero(found >= 0) - new),
                     "new": float(new),
                     "rejected": float(np.count_nonzero(found < 0)),
+                    "nis_mean": told.nis_mean,
+                    "nis_share": told.nis_share,
+                    "ess_share": told.ess_share,
+                    "rejected_share": told.rejected_share,
+                    "warnings": float(len(told.warnings)),
                 }
             )
         return tuple(rows)
+
+    def consistency(self, robot: int) -> Consistency:
+        """Return whether the filter that a robot goes by errs as little as it claims; see `FastSlam.consistency`."""
+        return self._find(robot)[0].filter.consistency
 
     def members(self, robot: int) -> tuple[int, ...]:
         """Return the robots whose places the robot's filter knows, itself included, in ascending order.

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from agents.policy import Policy
+from slam_backend.consistency import Consistency
 from slam_backend.errors import FloatArray, IntArray, bad_argument
 from slam_backend.geometry import between
 from slam_backend.landmark_map import LandmarkMap
@@ -74,6 +75,7 @@ class EpisodeRecord:
         map_claims: Per robot the true landmark (n,) int64 behind each one of its map, as `map_rmse` reads claims.
         maps: Per robot its map at the end, own start frame.
         true_landmarks: (N, 3) float64 [m], world frame.
+        consistency: Per robot whether its filter at the end errs as little as it claims.
         scene: The last picture: truth and maps in the world frame.
         complete: Whether the episode ran to its end.
     """
@@ -93,6 +95,7 @@ class EpisodeRecord:
     map_claims: tuple[IntArray, ...]
     maps: tuple[LandmarkMap, ...]
     true_landmarks: FloatArray
+    consistency: tuple[Consistency, ...]
     scene: Scene
     complete: bool
 
@@ -223,6 +226,7 @@ class _Log:
             map_claims=tuple(self._env.episode.ledger.claims(robot, own.map.ids) for robot, own in last.items()),
             maps=tuple(own.map for own in last.values()),
             true_landmarks=self._env.true_landmarks,
+            consistency=tuple(map(self._env.episode.belief.consistency, last)),
             scene=self._env.scene(),
             complete=not self._env.agents,
         )

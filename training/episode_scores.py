@@ -7,6 +7,7 @@ import numpy as np
 
 from slam_backend.geometry import compose, transform_points
 from slam_backend.metrics import align_se2, ate, map_rmse
+from training.consistency_table import consistency_rows
 from training.episode import EpisodeRecord, is_false_merge
 
 
@@ -44,6 +45,7 @@ def score_episode(record: EpisodeRecord) -> dict[str, Any]:
         "coverage": float(record.coverage[-1]),
         "duration_s": float(record.times[-1]),
         "complete": record.complete,
+        "consistency": consistency_rows(range(len(robots)), record.consistency),
     }
 
 

@@ -10,6 +10,7 @@ from rich.table import Table
 from training.command_folder import begin, choose, finish
 from training.command_options import Config, Duration, Estimator, Json, Out, RejuvenateEvery, Seed, numbers
 from training.command_progress import share_shown
+from training.consistency_table import print_consistency
 from training.rejuvenation_count import sentence_of
 
 if TYPE_CHECKING:  # what computes is imported when the command runs, so that --help answers at once
@@ -79,6 +80,7 @@ def replay_mrclam(
     paths = [score_path(result, robot, own.truth) for robot, own in enumerate(log.robots)]
     scores = plain(summarise(result, log, paths))
     _print_tables(console, scores, {own.robot for own in log.robots if own.truth is not None})
+    print_consistency(console, scores["consistency"])
     if told := sentence_of(scores["rejuvenations"]):
         console.print(told, highlight=False)
     speed = float(result.times[-1] - result.times[0]) / result.seconds

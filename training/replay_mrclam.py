@@ -12,6 +12,7 @@ import numpy as np
 
 from slam_backend.alignment import AlignmentOptions
 from slam_backend.attempts import AttemptOptions
+from slam_backend.consistency import Consistency
 from slam_backend.errors import FloatArray, IntArray, bad_argument, check_choice, check_float
 from slam_backend.landmark_map import LandmarkMap
 from slam_backend.measurements import Measurements
@@ -146,6 +147,7 @@ class Replay:
         merges: In order.
         attempts: How often two maps were compared.
         rejuvenations: What came of drawing particles anew, all filters together, see `RejuvenationCount.to_mapping`.
+        consistency: Per robot whether its filter at the end errs as little as it claims.
         seconds: What the filters took to live through the log [s].
     """
 
@@ -159,6 +161,7 @@ class Replay:
     merges: tuple[Merge, ...]
     attempts: int
     rejuvenations: dict[str, Any]
+    consistency: tuple[Consistency, ...]
     seconds: float
 
 
@@ -226,6 +229,7 @@ def replay(
         merges=tuple(merges),
         attempts=attempts,
         rejuvenations=rejuvenations.to_mapping(),
+        consistency=tuple(map(team.consistency, robots)),
         seconds=seconds,
     )
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from slam_backend.consistency import Consistency
 from slam_backend.errors import FloatArray
 from slam_backend.filter import FastSlam
 from slam_backend.geometry import compose, inverse, transform_points
@@ -15,6 +16,7 @@ from slam_backend.measurements import Measurements
 from slam_backend.metrics import align_se2
 from slam_backend.reports import StepReport
 from slam_backend.trajectory import dead_reckoning
+from training.consistency_table import consistency_rows
 from training.rejuvenation_count import RejuvenationCount
 
 # Of what moves in the plane a measurement fixes two coordinates: 99.9 % of right matches have a smaller squared
@@ -35,6 +37,7 @@ class OneReplay:
         created: Landmarks that it made.
         rejected: Measurements of which it made nothing.
         rejuvenations: What came of drawing particles anew, see `RejuvenationCount.to_mapping`.
+        consistency: Whether the filter errs as little as it claims.
         seconds: What the filter took to live through the log [s].
     """
 
@@ -46,6 +49,7 @@ class OneReplay:
     created: int
     rejected: int
     rejuvenations: Mapping[str, Any]
+    consistency: Consistency
     seconds: float
 
     @property
@@ -115,6 +119,7 @@ def replay_one(
         created=created,
         rejected=rejected,
         rejuvenations=rejuvenations.to_mapping(),
+        consistency=slam.consistency,
         seconds=seconds,
     )
 
@@ -183,6 +188,7 @@ def metrics_of(
         **more,
         "measurements": {"matched": result.matched, "created": result.created, "rejected": result.rejected},
         "rejuvenations": result.rejuvenations,
+        "consistency": consistency_rows([1], [result.consistency]),
         "merges": [],
         "groups": [[1]],
         "coverage": nan,

@@ -13,6 +13,7 @@ from rich.table import Table
 from training.command_folder import begin, choose, finish, gather
 from training.command_options import Config, Duration, Estimator, Json, Out, Particles, RejuvenateEvery, Seed
 from training.command_progress import share_shown
+from training.consistency_table import print_consistency
 from training.rejuvenation_count import sentence_of
 from training.replay_images_command import replay_folder_of_images
 
@@ -178,6 +179,7 @@ def finish_one(
 
     shown = plain(metrics)
     print_table(console, shown, result, unknown)
+    print_consistency(console, shown["consistency"])
     told = [*told, sentence_of(metrics["rejuvenations"]), write_maps(folder, {"1": result.landmarks})]
     for line in filter(None, told):
         console.print(line, soft_wrap=True, highlight=False)

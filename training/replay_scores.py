@@ -12,6 +12,7 @@ from slam_backend.landmark_map import LandmarkMap
 from slam_backend.metrics import MapScore, align_se2, ate, map_error, map_rmse
 from slam_backend.readers.mrclam import MrclamLog
 from slam_backend.trajectory import Trajectory
+from training.consistency_table import consistency_rows
 from training.episode_scores import merge_row
 from training.replay_mrclam import Merge, Replay
 
@@ -171,6 +172,7 @@ def summarise(replay: Replay, log: MrclamLog, paths: Sequence[PathScore | None])
         "robots": robots, "merges": merges, "groups": named, "coverage": nan,
         "attempts": replay.attempts, "rejuvenations": replay.rejuvenations, "duration_s": duration,
         "notes": log.notes,
+        "consistency": consistency_rows(numbers, replay.consistency),
     }  # fmt: skip
 
 

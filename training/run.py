@@ -8,6 +8,7 @@ from rich.console import Console
 
 from training.command_folder import begin, choose, finish
 from training.command_options import Config, EnvRejuvenateEvery, Json, Noise, Out, Particles, Seed, Sensor
+from training.consistency_table import print_consistency
 
 if TYPE_CHECKING:  # what computes is imported when the command runs, so that --help answers at once
     from training.episode import EpisodeRecord
@@ -78,6 +79,7 @@ def run(
     record = _run_live(console, env, policies, chosen, folder.path / "video.mp4" if video else None)
     scores = plain(score_episode(record))
     print_tables(console, scores)
+    print_consistency(console, scores["consistency"])
     metrics = folder.write_metrics(scores)
     _write_paths(folder, record)
     maps = {group_name(group): record.maps[group[0]] for group in record.groups}

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from slam_backend.alignment import Alignment
 from slam_backend.attempts import AttemptOptions
+from slam_backend.consistency import Consistency
 from slam_backend.errors import FloatArray, bad_argument
 from slam_backend.filter_options import FilterOptions
 from slam_backend.geometry import rotate_covariances
@@ -143,6 +144,10 @@ class TeamBelief:
     def speaker(self, group: tuple[int, ...]) -> int:
         """Return the first robot of a group that goes by its joint filter, and so can merge it with another."""
         return self._team.keepers(group[0])[0]
+
+    def consistency(self, robot: int) -> Consistency:
+        """Return whether the filter that a robot goes by errs as little as it claims; see `FastSlam.consistency`."""
+        return self._team.consistency(robot)
 
     def filter_map(self, robot: int) -> LandmarkMap:
         """Return the whole map of a robot's group, unconfirmed landmarks included, in the group's map frame."""

@@ -86,6 +86,22 @@ def test_all_replays_are_rejuvenated_as_often_as_environments_unless_told_otherw
         assert config(path="log").rejuvenate_every == usual
 
 
+@pytest.mark.parametrize("command", WRITERS)
+def test_a_replay_tells_whether_its_filters_are_consistent(command: str, vslam: Any, tmp_path: Path) -> None:
+    """The table and metrics.json have a row for each robot, with a warning in words where there is one."""
+    log, run = tmp_path / "log", tmp_path / "run"
+    log.mkdir()
+    WRITERS[command](log)
+    done = vslam("replay", command, "--path", str(log), "--duration", "8", "--particles", "9", "--out", str(run))
+    rows = json.loads((run / "metrics.json").read_text())["consistency"]
+    assert len(rows) == len(json.loads((run / "metrics.json").read_text())["robots"])
+    assert all(row["frames"] > 0 and 0.0 <= row["nis_share"] <= 1.0 for row in rows)
+    assert "Consistency" in done.out
+    for row in rows:
+        for warning in row["warnings"]:
+            assert " ".join(warning["text"].split()) in " ".join(done.out.split())
+
+
 @pytest.mark.parametrize("sensor", ["landmark", "stereo"])
 def test_the_filters_of_a_run_are_told(sensor: str) -> None:
     """The environment's filters get the particles and the interval of the run; all else is that of the preset."""

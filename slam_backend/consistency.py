@@ -1,0 +1,197 @@
+"""`ConsistencyTest`: whether a filter errs as little as it claims, with a stated rate of false alarms.
+
+Three signs are watched, each by one or two questions that a frame answers with yes or no:
+
+- "nis": does the mean squared innovation of the frame lie beyond the 95 % bound of chi-square? The 99 % bound? However
+  much the measurements of a frame err together, their mean does so in no more than some 5 and 1 % of the frames of an
+  honest filter.
+- "ess": do less than a tenth of the particles carry the weight?
+- "rejected": of three measurements or more, do more than half match nothing and begin nothing?
+
+Where the probability of a yes is at most p0 (5 %, and 1 % beyond the 99 % bound) whatever came before, the likelihood
+ratio L of p1 > p0 against p0, multiplied over the frames, is a supermartingale: by Ville's inequality it ever exceeds
+1/a with a probability of at most a [1]. So there is no window, and the rate of false alarms holds for runs of any
+length. The filter may fail late: at every 25th frame a new product begins, and all of them add up under weights w whose
+sum is at most one,
+
+    S_t = (S_{t-1} + w_t) L_t,     P(S_t >= 1/a for any t) <= a.
+
+That is the recursion of Shiryaev and Roberts [2] with a prior for the frame at which the filter fails. Filters fail a
+little all the time, or much for a while: for each sign the mean S over its questions and two p1 is taken. Filters that
+claim too little, as those which assume twice the true noise, show no sign: that does no harm.
+
+1. A. Ramdas, P. Gruenwald, V. Vovk, G. Shafer: Game-theoretic statistics and safe anytime-valid inference. Statistical
+   Science 38(4), 2023.
+2. M. Pollak: Optimal detection of a change in distribution. Annals of Statistics 13(1), 1985.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Self
+
+FALSE_ALARMS = 0.01  # at most this share of honest filters is ever warned of, all signs together
+NIS_BOUNDS = (7.81, 11.34)  # 95 and 99 % of chi-square with three degrees of freedom; with two it is more
+LOW_ESS = 0.1  # of the particles
+LEAST_MEASURED = 3  # measurements of a frame of which most may be rejected
+SIGNS = ("nis", "ess", "rejected")
+SIGN_OF = (0, 0, 1, 2)  # of each question
+USUAL = (0.05, 0.01, 0.05, 0.05)  # p0 of each
+BETS = (0.1, 0.3)  # p1
+# By which evidence changes, for each set of answers, whose bits are the questions.
+FACTORS = tuple(
+    tuple(
+        p / usual if answers >> row & 1 else (1.0 - p) / (1.0 - usual) for row, usual in enumerate(USUAL) for p in BETS
+    )
+    for answers in range(1 << len(USUAL))
+)
+RENEWED = 25  # frames
+SHARE = 0.47  # the sum of 1 / (n ln^2 n) over n = 2, 3, ... is 2.11
+WEIGHTS = tuple(SHARE / len(BETS) / SIGN_OF.count(sign) for sign in SIGN_OF for _ in BETS)
+THRESHOLD = len(SIGNS) / FALSE_ALARMS
+HIGHEST = 1e6 * THRESHOLD  # of the evidence: what is certain need not grow
+LISTS = ("nis", "counts", "evidence", "since")
+CURES = {
+    "nis": "measurements lie farther from where the filter expects them than it allows for: it is too sure of itself. "
+    "Assume more odometry noise, or more measurement noise, or set rejuvenate_every, or use more particles",
+    "ess": "less than a tenth of the particles carry all the weight. Use more particles, or set rejuvenate_every, or "
+    "assume more measurement noise",
+    "rejected": "most measurements match nothing. Assume more odometry noise, or check time stamps and units",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Warned:
+    """A sign that a filter is not consistent.
+
+    Attributes:
+        sign: "nis", "ess" or "rejected".
+        step: In which the evidence sufficed.
+        share: Share of all frames that show the sign [-].
+    """
+
+    sign: str
+    step: int
+    share: float
+
+    @property
+    def text(self) -> str:
+        """What is wrong, and what to try."""
+        return f"From step {self.step} on, {CURES[self.sign]} ({self.share:.0%} of the frames)."
+
+
+@dataclass(frozen=True, slots=True)
+class Consistency:
+    """What is known so far of whether a filter errs as little as it claims.
+
+    Attributes:
+        frames: In which something was measured.
+        nis_mean: Mean over the frames of their mean squared innovation [-]; 3 is honest, or 2 where all is in one
+            plane, less is cautious. NaN if nothing was matched.
+        nis_share: Share of the frames beyond the 95 % bound [-].
+        ess_share: Share of the frames with an effective sample size below a tenth of the particles [-].
+        rejected_share: Share of the frames of which most measurements were rejected [-].
+        warnings: One for each sign of which there is enough evidence, in the order of `SIGNS`.
+    """
+
+    frames: int
+    nis_mean: float
+    nis_share: float
+    ess_share: float
+    rejected_share: float
+    warnings: tuple[Warned, ...]
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return it as plain numbers and texts."""
+        return {
+            "frames": self.frames,
+            "nis_mean": self.nis_mean,
+            "nis_share": self.nis_share,
+            "ess_share": self.ess_share,
+            "rejected_share": self.rejected_share,
+            "warnings": [{"sign": one.sign, "step": one.step, "text": one.text} for one in self.warnings],
+        }
+
+
+class ConsistencyTest:
+    """The running sums of one filter."""
+
+    __slots__ = ("_counts", "_evidence", "_frames", "_nis", "_since")
+
+    def __init__(self) -> None:
+        self._frames = 0
+        self._nis = [0.0, 0]  # sum of the frames' means, and number of frames with matches
+        self._counts = [0] * len(SIGN_OF)
+        self._evidence = [0.0] * len(WEIGHTS)
+        self._since = [-1] * len(SIGNS)  # step of the warning
+
+    def note(self, step: int, nis: float, ess: float, used: int, rejected: int) -> None:
+        """Take note of a frame.
+
+        Args:
+            step: Number of the filter's step.
+            nis: Mean squared innovation of what was matched [-]; NaN if nothing was.
+            ess: Effective sample size, as a share of the particles [-].
+            used: Measurements, without those that the caller rejected.
+            rejected: How many of these neither matched nor began a landmark.
+        """
+        if self._frames % RENEWED == 0:
+            n = 2 + self._frames // RENEWED
+            begun = 1.0 / (n * math.log(n) ** 2)
+            self._evidence = [old + begun * weight for old, weight in zip(self._evidence, WEIGHTS, strict=True)]
+        self._frames += 1
+        answers = 4 * (ess < LOW_ESS) + 8 * (2 * rejected > used >= LEAST_MEASURED)
+        if nis == nis:  # not NaN
+            self._nis[0] += nis
+            self._nis[1] += 1
+            answers += (nis > NIS_BOUNDS[0]) + 2 * (nis > NIS_BOUNDS[1])
+        self._evidence = [old * factor for old, factor in zip(self._evidence, FACTORS[answers], strict=True)]
+        if answers:
+            self._heed(answers, step)
+
+    def _heed(self, answers: int, step: int) -> None:
+        """Count the questions with a yes, and see whether the evidence for their signs is enough."""
+        self._evidence = [min(each, HIGHEST) for each in self._evidence]
+        for row, sign in enumerate(SIGN_OF):
+            if answers >> row & 1:
+                self._counts[row] += 1
+                if self._since[sign] < 0 and self._evidence_of(sign) >= THRESHOLD:
+                    self._since[sign] = step
+
+    def _evidence_of(self, sign: int) -> float:
+        """Return the evidence of a sign."""
+        pairs = zip(self._evidence[::2], self._evidence[1::2], strict=True)
+        return sum(one + two for of, (one, two) in zip(SIGN_OF, pairs, strict=True) if of == sign)
+
+    def report(self) -> Consistency:
+        """Return what is known so far."""
+        beyond, _, low, rejected = (count / max(self._frames, 1) for count in self._counts)
+        shares = (beyond, low, rejected)
+        told = tuple(
+            Warned(sign, since, share)
+            for sign, since, share in zip(SIGNS, self._since, shares, strict=True)
+            if since >= 0
+        )
+        total, matched = self._nis
+        return Consistency(self._frames, total / matched if matched else float("nan"), *shares, told)
+
+    @classmethod
+    def joined(cls, a: Self, b: Self) -> Self:
+        """Return the test of a filter that two were merged to: it begins afresh, and remembers what was warned of."""
+        joint = cls()
+        for sign, both in enumerate(zip(a._since, b._since, strict=True)):
+            joint._since[sign] = min((since for since in both if since >= 0), default=-1)
+        return joint
+
+    # ------------------------------------------------------------------ snapshots
+
+    def get_state(self) -> dict[str, Any]:
+        """Return all that decides how the test goes on."""
+        lists = {name: tuple(getattr(self, f"_{name}")) for name in LISTS}
+        return {"frames": self._frames} | lists
+
+    def set_state(self, state: Mapping[str, Any]) -> None:
+        """Go on exactly as the one that gave `state`."""
+        self._frames = state["frames"]
+        for name in LISTS:
+            setattr(self, f"_{name}", list(state[name]))
