@@ -26,7 +26,7 @@ claim too little, as those which assume twice the true noise, show no sign: that
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -50,7 +50,7 @@ SHARE = 0.47  # the sum of 1 / (n ln^2 n) over n = 2, 3, ... is 2.11
 WEIGHTS = tuple(SHARE / len(BETS) / SIGN_OF.count(sign) for sign in SIGN_OF for _ in BETS)
 THRESHOLD = len(SIGNS) / FALSE_ALARMS
 HIGHEST = 1e6 * THRESHOLD  # of the evidence: what is certain need not grow
-LISTS = ("nis", "counts", "evidence", "since")
+SUMS, LISTS = ("frames", "quiet", "nis", "matched"), ("counts", "evidence", "since")
 CURES = {
     "nis": "measurements lie farther from where the filter expects them than it allows for: it is too sure of itself. "
     "Assume more odometry noise, or more measurement noise, or set rejuvenate_every, or use more particles",
@@ -77,7 +77,7 @@ class Warned:
     @property
     def text(self) -> str:
         """What is wrong, and what to try."""
-        return f"From step {self.step} on, {CURES[self.sign]} ({self.share:.0%} of the frames)."
+        return f"By step {self.step} it is clear that {CURES[self.sign]} ({self.share:.1%} of all frames show it)."
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,11 +116,12 @@ class Consistency:
 class ConsistencyTest:
     """The running sums of one filter."""
 
-    __slots__ = ("_counts", "_evidence", "_frames", "_nis", "_since")
+    __slots__ = ("_counts", "_evidence", "_frames", "_matched", "_nis", "_quiet", "_since")
 
     def __init__(self) -> None:
         self._frames = 0
-        self._nis = [0.0, 0]  # sum of the frames' means, and number of frames with matches
+        self._quiet = 0  # frames without a yes that the evidence does not hold yet
+        self._nis, self._matched = 0.0, 0  # sum of the frames' means, and number of frames with matches
         self._counts = [0] * len(SIGN_OF)
         self._evidence = [0.0] * len(WEIGHTS)
         self._since = [-1] * len(SIGNS)  # step of the warning
@@ -136,27 +137,41 @@ class ConsistencyTest:
             rejected: How many of these neither matched nor began a landmark.
         """
         if self._frames % RENEWED == 0:
-            n = 2 + self._frames // RENEWED
-            begun = 1.0 / (n * math.log(n) ** 2)
-            self._evidence = [old + begun * weight for old, weight in zip(self._evidence, WEIGHTS, strict=True)]
+            self._renew()
         self._frames += 1
-        answers = 4 * (ess < LOW_ESS) + 8 * (2 * rejected > used >= LEAST_MEASURED)
         if nis == nis:  # not NaN
-            self._nis[0] += nis
-            self._nis[1] += 1
-            answers += (nis > NIS_BOUNDS[0]) + 2 * (nis > NIS_BOUNDS[1])
-        self._evidence = [old * factor for old, factor in zip(self._evidence, FACTORS[answers], strict=True)]
-        if answers:
-            self._heed(answers, step)
+            self._nis += nis
+            self._matched += 1
+        if nis > NIS_BOUNDS[0] or ess < LOW_ESS or 2 * rejected > used >= LEAST_MEASURED:
+            answers = 4 * (ess < LOW_ESS) + 8 * (2 * rejected > used >= LEAST_MEASURED)
+            self._heed(answers + (nis > NIS_BOUNDS[0]) + 2 * (nis > NIS_BOUNDS[1]), step)
+        else:
+            self._quiet += 1
+
+    def _renew(self) -> None:
+        """Let a filter that fails from here on be found, too."""
+        n = 2 + self._frames // RENEWED
+        begun = 1.0 / (n * math.log(n) ** 2)
+        self._multiply(FACTORS[0], self._quiet)
+        self._evidence = [old + begun * weight for old, weight in zip(self._evidence, WEIGHTS, strict=True)]
+        self._quiet = 0
 
     def _heed(self, answers: int, step: int) -> None:
-        """Count the questions with a yes, and see whether the evidence for their signs is enough."""
-        self._evidence = [min(each, HIGHEST) for each in self._evidence]
+        """Weigh a frame that answers yes to a question, count it, and see whether the evidence is enough."""
+        self._multiply(FACTORS[0], self._quiet)
+        self._multiply(FACTORS[answers], 1)
+        self._quiet = 0
         for row, sign in enumerate(SIGN_OF):
             if answers >> row & 1:
                 self._counts[row] += 1
                 if self._since[sign] < 0 and self._evidence_of(sign) >= THRESHOLD:
                     self._since[sign] = step
+
+    def _multiply(self, factors: Sequence[float], times: int) -> None:
+        """Change the evidence by so many frames of one kind."""
+        self._evidence = [
+            min(old * factor**times, HIGHEST) for old, factor in zip(self._evidence, factors, strict=True)
+        ]
 
     def _evidence_of(self, sign: int) -> float:
         """Return the evidence of a sign."""
@@ -172,8 +187,8 @@ class ConsistencyTest:
             for sign, since, share in zip(SIGNS, self._since, shares, strict=True)
             if since >= 0
         )
-        total, matched = self._nis
-        return Consistency(self._frames, total / matched if matched else float("nan"), *shares, told)
+        nis_mean = self._nis / self._matched if self._matched else float("nan")
+        return Consistency(self._frames, nis_mean, *shares, told)
 
     @classmethod
     def joined(cls, a: Self, b: Self) -> Self:
@@ -187,11 +202,12 @@ class ConsistencyTest:
 
     def get_state(self) -> dict[str, Any]:
         """Return all that decides how the test goes on."""
-        lists = {name: tuple(getattr(self, f"_{name}")) for name in LISTS}
-        return {"frames": self._frames} | lists
+        sums = {name: getattr(self, f"_{name}") for name in SUMS}
+        return sums | {name: tuple(getattr(self, f"_{name}")) for name in LISTS}
 
     def set_state(self, state: Mapping[str, Any]) -> None:
         """Go on exactly as the one that gave `state`."""
-        self._frames = state["frames"]
+        for name in SUMS:
+            setattr(self, f"_{name}", state[name])
         for name in LISTS:
             setattr(self, f"_{name}", list(state[name]))
