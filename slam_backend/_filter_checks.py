@@ -10,9 +10,9 @@ from slam_backend._existence_step import ExistenceStep
 from slam_backend._jit import in_place, jit
 from slam_backend._kernels import LANES
 from slam_backend._particle_maps import MAPS_KEPT
-from slam_backend.consistency import LISTS, SIGN_OF, SIGNS, WEIGHTS
 from slam_backend._rejuvenation_step import SCHEDULE
 from slam_backend._turns import assumed
+from slam_backend.consistency import LISTS, RENEWED, SIGN_OF, SIGNS, SUMS, WEIGHTS
 from slam_backend.errors import FloatArray, IntArray, bad_argument
 from slam_backend.filter_options import MOST_ROBOTS, FilterOptions
 from slam_backend.landmark_map import LandmarkMap
@@ -107,11 +107,11 @@ def check_filter(name: str, state: Any, known: Sequence[FilterOptions] = ()) -> 
 
 def check_consistency(name: str, state: Any) -> None:
     """Refuse what are not the running sums of a consistency test."""
-    check_keys(name, state, ("frames", *LISTS))
+    check_keys(name, state, (*SUMS, *LISTS))
     check_whole(f"{name}['frames']", state["frames"])
-    total, matched = check_each(f"{name}['nis']", state["nis"], 2)
-    check_number(*total, 0.0)
-    check_whole(*matched)
+    check_whole(f"{name}['quiet']", state["quiet"], 0, RENEWED)
+    check_whole(f"{name}['matched']", state["matched"])
+    check_number(f"{name}['nis']", state["nis"], 0.0)
     for part, count in (("counts", len(SIGN_OF)), ("since", len(SIGNS))):
         for where, number in check_each(f"{name}[{part!r}]", state[part], count):
             check_whole(where, number, -1)
