@@ -9,7 +9,10 @@ the sum of both covariances and the floor that alignments have). What the other 
 within its own uncertainty, so that beyond the gate lies next to nothing; where maps are bent to agree, much does.
 
 *Place.* Landmarks that either side found for itself are aligned with each other, by the test that every merge has to
-pass. If they are seen to fit by another motion than the one in force (0.5 m or 5 degrees off), the merge was wrong.
+pass. If they are seen to fit by another motion than the one in force (0.5 m or 5 degrees off), the merge was wrong,
+unless it rests on more: for that test the pairs of landmarks alike that it joined are a rival, and may be no more than
+`max_ratio` of those that fit now. So a robot that is lost after a right merge, and maps landmarks a second time, does
+not undo it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -110,7 +113,16 @@ class Watch:
             return False
         parts = [joint.subset(mask) for mask in masks]
         rival = align_maps(parts[0], parts[1], options=options)
-        return rival.success and differs(rival.transform, parts[1].means[rival.inliers[:, 1]])
+        if not rival.success or self._joined(options) > options.max_ratio * len(rival.inliers):
+            return False
+        return differs(rival.transform, parts[1].means[rival.inliers[:, 1]])
+
+    def _joined(self, options: AlignmentOptions) -> int:
+        """Return how many landmarks the merge joined that look alike."""
+        _, rows, others = np.intersect1d(self.before[0].ids, self.before[1].ids, return_indices=True)
+        apart = np.linalg.norm(self.before[0].descriptors[rows] - self.before[1].descriptors[others], axis=1)
+        alike = apart <= options.descriptor_gate
+        return int(np.count_nonzero(alike)) if options.appearance else len(rows)
 
 
 def moved_share(old: LandmarkMap, joint: LandmarkMap, options: AlignmentOptions) -> float:
