@@ -149,8 +149,23 @@ def covariance_of(h: FloatArray) -> FloatArray | None:
     return np.asarray(0.5 * (covariance + covariance.T))
 
 
-def is_certain(covariance: FloatArray, influence: tuple[float, float], options: AlignmentOptions) -> bool:
-    """Tell whether an alignment is certain enough to be believed, and no single match, left out, says otherwise."""
+def worst_bound(
+    covariance: FloatArray | None, influence: tuple[float, float], options: AlignmentOptions
+) -> tuple[str, float]:
+    """Return which bound an alignment keeps worst, one of `BOUNDS`, and its figure over the bound; above 1 is a miss.
+
+    Args:
+        covariance: (3, 3) [m, m, rad] of the motion; None if it leaves a direction open.
+        influence: By how much leaving one match out moves the result at most [m, rad].
+        options: The bounds of the motion.
+    """
+    if covariance is None:
+        return "translation", math.inf
     position = math.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1])
-    sure = position <= options.max_sigma_position and math.sqrt(covariance[2, 2]) <= options.max_sigma_heading
-    return sure and influence[0] <= 0.5 * RIVAL_DISTANCE and influence[1] <= 0.5 * RIVAL_ANGLE
+    figures = {
+        "translation": position / options.max_sigma_position,
+        "rotation": math.sqrt(covariance[2, 2]) / options.max_sigma_heading,
+        "one match": max(influence[0] / (0.5 * RIVAL_DISTANCE), influence[1] / (0.5 * RIVAL_ANGLE)),
+    }
+    name = max(figures, key=lambda bound: figures[bound])
+    return name, figures[name]

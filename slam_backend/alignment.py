@@ -12,10 +12,10 @@ from slam_backend._evidence import (
     covariance_of,
     extent,
     fitting,
-    is_certain,
     is_mirrored,
     one_to_one,
     strongest_rival,
+    worst_bound,
 )
 from slam_backend._recurrence import recurs
 from slam_backend.alignment_types import (
@@ -126,8 +126,9 @@ def align_maps(
     contradiction = kernels.unexplained(table, members, pose, variance)
     covariance = covariance_of(kernels.information(table, members, pose, variance)[0] / contradiction)
     influence = kernels.largest_influence(table, members, pose, variance)
-    if covariance is None or not is_certain(covariance, influence, options):
-        return Alignment.refused("too uncertain", ratio)
+    missed, excess = worst_bound(covariance, influence, options)
+    if covariance is None or not excess <= 1.0:
+        return Alignment.refused("too uncertain", ratio, missed, excess)
     return Alignment(True, "", pose[0], pose[1], pose[2], covariance, inliers, ratio)
 
 

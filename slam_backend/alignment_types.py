@@ -22,6 +22,7 @@ REASONS: tuple[Reason, ...] = (
     "poorly spread",
     "too uncertain",
 )
+BOUNDS = ("translation", "rotation", "one match", "paths", "repeat")  # that a refusal as "too uncertain" may miss
 RIVAL_DISTANCE = 0.5  # [m]; beyond these two an alignment counts as another one, and as a false one
 RIVAL_ANGLE = math.radians(5.0)
 LARGEST = 1e9  # of gates and distances; their squares are far from infinite
@@ -105,6 +106,10 @@ class Alignment:
         ratio: How near the best alignment that differs (by more than 0.5 m or 5 degrees) comes to this one: its own
             inliers, over this one's own or half of this one's if those are more; own are those that the other has not.
             0 if there was none.
+        missed: Of a refusal as "too uncertain" the bound that is missed most, one of `BOUNDS`: the standard deviation
+            of the translation or of the rotation, the shift by leaving one match out; in a team also the spread that
+            the robots' paths leave open, or the change since the last trial; else empty.
+        excess: The missed figure over its bound, above 1 [-]; NaN where none is missed.
     """
 
     success: bool
@@ -115,6 +120,8 @@ class Alignment:
     covariance: FloatArray
     inliers: IntArray
     ratio: float
+    missed: str = ""
+    excess: float = math.nan
 
     def __post_init__(self) -> None:
         if self.reason not in (REASONS if not self.success else ("",)):
@@ -135,7 +142,7 @@ class Alignment:
         return np.array([self.tx, self.ty, self.theta])
 
     @classmethod
-    def refused(cls, reason: Reason, ratio: float = 0.0) -> Self:
+    def refused(cls, reason: Reason, ratio: float = 0.0, missed: str = "", excess: float = math.nan) -> Self:
         """Return a refusal: NaN motion and covariance, no inliers."""
-        nan = float("nan")
-        return cls(False, reason, nan, nan, nan, np.full((3, 3), nan), np.empty((0, 2), np.int64), ratio)
+        nan, none = math.nan, np.empty((0, 2), np.int64)
+        return cls(False, reason, nan, nan, nan, np.full((3, 3), nan), none, ratio, missed, excess)

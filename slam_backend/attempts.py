@@ -6,8 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from slam_backend.alignment import Alignment, AlignmentOptions, candidate_matches
-from slam_backend.errors import bad_argument, check_int
+from slam_backend.alignment import RIVAL_ANGLE, RIVAL_DISTANCE, Alignment, AlignmentOptions, candidate_matches
+from slam_backend.errors import FloatArray, bad_argument, check_int
+from slam_backend.geometry import wrap_angle
 from slam_backend.landmark_map import LandmarkMap
 
 PairKey = tuple[tuple[int, ...], tuple[int, ...]]  # two groups, as tuples of robots
@@ -88,6 +89,7 @@ class AttemptSchedule:
         self._proposed: dict[PairKey, set[tuple[int, int]]] = {}
         self._bars: list[tuple[PairKey, int]] = []
         self._doubts: dict[tuple[int, int], float] = {}  # robot of either side -> the least that there has been
+        self._trials: dict[tuple[int, int], FloatArray] = {}  # robots whose starts are the frames -> the last motion
         self.straightening: Straightening | None = None
 
     def is_due(self, step: int) -> bool:
@@ -121,21 +123,41 @@ class AttemptSchedule:
                 self._proposed = {pair: found}
         return best
 
-    def should_wait(self, pair: PairKey, doubt: float) -> bool:
+    def should_wait(self, pair: PairKey, doubt: float, most: float = math.inf) -> bool:
         """Tell whether a pair whose maps align had better try again later, and remember its doubt.
 
-        It had at first, and as long as the doubt falls by a good part from one attempt to the next. Where it does not,
-        the ways of the robots to what they have in common are as uncertain as they will ever be, the particles of the
-        merge know it, and the joint filter is the first that may find out more.
+        It had at first, as long as the doubt falls by a good part from one attempt to the next, and while the doubt is
+        beyond what can be taken at all. Where it does not fall, the ways of the robots to what they have in common are
+        as uncertain as they will be for long, and the particles of the merge know it.
 
         Args:
             pair: That tries; what either group's robots went through before they were in it counts.
             doubt: How uncertain the motion between its maps is, 1 = just sure enough [-].
+            most: Doubt beyond which no pair merges, whether waiting helps or not [-].
         """
         robots = [(a, b) for a in pair[0] for b in pair[1]]
         before = min(self._doubts.get(key, math.inf) for key in robots)
         self._doubts |= {key: min(doubt, self._doubts.get(key, math.inf)) for key in robots}
-        return 1.0 < doubt < HELPS * before
+        return doubt > 1.0 and (doubt > most or doubt < HELPS * before)
+
+    def change(self, pair: PairKey, motion: FloatArray) -> float:
+        """Return by how much the last trial of two groups was another motion, and remember this one.
+
+        Args:
+            pair: That tries.
+            motion: (3,) [m, m, rad] between the frames of the two groups, as their joint filter has it on trial.
+
+        Returns:
+            The shift over 0.25 m or the turn over 2.5 degrees, whichever is more; infinite if there was no trial of
+            these frames.
+        """
+        frames = pair[0][0], pair[1][0]
+        before = self._trials.get(frames)
+        self._trials[frames] = motion
+        if before is None:
+            return math.inf
+        x, y, turn = (motion - before).tolist()
+        return max(math.hypot(x, y) / (0.5 * RIVAL_DISTANCE), abs(float(wrap_angle(turn))) / (0.5 * RIVAL_ANGLE))
 
     def record(self, pair: PairKey, step: int, success: bool, straightened: bool = False) -> None:
         """Remember an attempt of the pair that `choose` returned: its evidence, and how long it now waits.
@@ -164,7 +186,8 @@ class AttemptSchedule:
 
     def get_state(self) -> dict[str, Any]:
         """Return the options and a copy of the memory."""
-        memory = {"records": copy.deepcopy(self._records), "bars": tuple(self._bars), "doubts": dict(self._doubts)}
+        memory: dict[str, Any] = {"records": copy.deepcopy(self._records), "bars": tuple(self._bars)}
+        memory |= {"doubts": dict(self._doubts), "trials": dict(self._trials)}
         fixed = {"options": self._options, "alignment": self._alignment, "straightening": self.straightening}
         return fixed | memory
 
@@ -174,7 +197,7 @@ class AttemptSchedule:
         self.straightening = state["straightening"]
         self._records = copy.deepcopy(state["records"])
         self._bars = list(state["bars"])
-        self._doubts = dict(state["doubts"])
+        self._doubts, self._trials = dict(state["doubts"]), dict(state["trials"])
 
 
 def _touches(pair: PairKey, barred: PairKey) -> bool:

@@ -21,8 +21,9 @@ from slam_backend.merging import merge_filters, motion_covariance, paired
 from slam_backend.mixture_merging import merge_mixtures
 from slam_backend.records import Records
 from slam_backend.reports import MergeUndone, Renaming
+from slam_backend.smoothing.graph import mean_pose, scattered
 from slam_backend.undoing import Undoing
-from slam_backend.watching import Side, Watch, begin_watch
+from slam_backend.watching import Side, Watch, begin_watch, moved_share, renamed_map
 
 
 def straightened(group_a: Group, group_b: Group) -> tuple[LandmarkMap, LandmarkMap] | None:
@@ -46,12 +47,14 @@ class MergePlan(NamedTuple):
         maps: Of their joint filters as they are, with mixture covariances.
         alignment: Motion from b's map frame to a's; `inliers` are rows of the maps.
         pairing: Of the joint filters' particles, if that is drawn already.
+        joint: What `merge_filters` made of it, if that is done already.
     """
 
     groups: tuple[Group, Group]
     maps: tuple[LandmarkMap, LandmarkMap]
     alignment: Alignment
     pairing: Pairing | None = None
+    joint: tuple[FastSlam, IntArray] | None = None
 
     @classmethod
     def of(cls, group_a: Group, group_b: Group, alignment: Alignment) -> Self:
@@ -80,6 +83,35 @@ class MergePlan(NamedTuple):
         pairing = paired(*self.filters, self.alignment, self.pairs, rng, merging.merged_particles)
         return self._replace(pairing=pairing)
 
+    def on_trial(
+        self, merging: MergeOptions, options: AlignmentOptions, rng: np.random.Generator
+    ) -> tuple[Self, float] | None:
+        """Merge both filters into one whose particles are drawn from its smoothed paths; both stay as they are.
+
+        Each map tells of the other robots' ways from their starts to what both have in common, so that the joint filter
+        may know well how the groups began where neither map does.
+
+        Returns:
+            The plan by the motion that the joint filter has, and the doubt about that, see `doubt_about`: infinite
+            where the merge would be undone for the shape of the joint map. None if the smoother finds nothing.
+        """
+        a, b = self.filters
+        joint, renamed = merge_filters(
+            a, b, self.alignment, self.pairs, rng, merging.merged_particles, pairing=self.pairing
+        )  # fmt: skip
+        if joint.rejuvenate().reason:
+            return None
+        starts = joint._starts[a.num_robots, :, : joint.num_particles]
+        motion = mean_pose(starts)
+        covariance = scattered(starts)
+        _kernels.add_share(joint._frame, motion[None], covariance[None])
+        x, y, theta = motion.tolist()
+        alignment = Alignment(True, "", x, y, theta, covariance, self.alignment.inliers, self.alignment.ratio)
+        sides = self.maps[0], renamed_map(self.maps[1], dict(renamed.tolist()))
+        bent = any(moved_share(old, joint.map("mixture"), options) > merging.max_moved for old in sides)
+        plan = self._replace(alignment=alignment, joint=(joint, renamed))
+        return plan, math.inf if bent else _in_bounds(covariance)
+
 
 def doubt_about(plan: MergePlan) -> float:
     """Return how uncertain the motion between two maps is, as the particles of a merge have it, which are paired.
@@ -95,6 +127,11 @@ def doubt_about(plan: MergePlan) -> float:
     a, b = plan.filters
     covariance = motion_covariance(plan.pairing.motion, plan.alignment)
     covariance += _of_frames(a._frame, b._frame, plan.alignment)
+    return _in_bounds(covariance)
+
+
+def _in_bounds(covariance: FloatArray) -> float:
+    """Return the largest standard deviation of a motion over what makes it another one."""
     position, heading = math.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1]), math.sqrt(covariance[2, 2])
     return max(position / RIVAL_DISTANCE, heading / RIVAL_ANGLE)
 
@@ -122,7 +159,7 @@ def merge_groups(
     combine = merge_mixtures
     if merging.method == "particles":
         combine = partial(merge_filters, known=known, pairing=plan.pairing)
-    joint, renamed = combine(a.filter, b.filter, alignment, pairs, rng, merging.merged_particles)
+    joint, renamed = plan.joint or combine(a.filter, b.filter, alignment, pairs, rng, merging.merged_particles)
     robots, live = a.robots + b.robots, a.live + b.live
     joint.reorder(np.argsort(robots))
     number = records.new_number()

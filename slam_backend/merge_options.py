@@ -1,5 +1,6 @@
 """`MergeOptions`: how two groups' filters become one, how sure they must be, and how long the team doubts it."""
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -23,6 +24,10 @@ class MergeOptions:
             more. False: maps are taken as the filters bent them.
         sure: An attempt is refused, as long as waiting helps, while so many standard deviations of the motion among the
             particles that the merge would make reach 0.5 m or 5 degrees; 0: never for that.
+        least_sure: Above 0 a pair that is less than `sure` merges on trial: the joint filter is smoothed, and kept if
+            the motion that it has passes twice running; where waiting does not help, so many standard deviations of it
+            suffice. 0: there are no trials, and where waiting does not help the pair merges however uncertain it is, as
+            is right where nothing would ever tell more about the robots' starts.
         watch_steps: A merge is watched for so many steps in which robots of both sides are in contact, and can be
             undone so long; then its snapshot is freed. 0: merges are final.
         watch_every: In so many steps the evidence is weighed once.
@@ -35,6 +40,7 @@ class MergeOptions:
     merged_particles: int | None = None
     straighten: bool = True
     sure: float = 5.0
+    least_sure: float = 0.0
     watch_steps: int = 200
     watch_every: int = 20
     barred_steps: int = 200
@@ -48,7 +54,14 @@ class MergeOptions:
         if not isinstance(self.straighten, bool):
             raise bad_argument("merging.straighten", "True or False", self.straighten, "Give a bool.")
         check_float("merging.sure", self.sure, "Use 5, or 0 to merge however uncertain it is.", at_least=0.0)
+        cure = "Use 5, or 0 to merge in the end however uncertain it is."
+        check_float("merging.least_sure", self.least_sure, cure, at_least=0.0)
         check_int("merging.watch_steps", self.watch_steps, 0, "Use 0 to make merges final.")
         check_int("merging.watch_every", self.watch_every, 1, "Weigh the evidence at every step or less often.")
         check_int("merging.barred_steps", self.barred_steps, 0, "Use 0 to let them try at once.")
         check_float("merging.max_moved", self.max_moved, "Give a share.", at_least=0.0, at_most=1.0)
+
+    @property
+    def most_doubt(self) -> float:
+        """Doubt, 1 = `sure`, beyond which no pair merges; infinite if any merges in the end."""
+        return self.sure / self.least_sure if self.least_sure else math.inf

@@ -70,7 +70,7 @@ def attempt(
     schedule.straightening = None
     maps = _mixtures(pair)
     outcome = _straight(pair, pending.bent, maps, alignment, records, rng)
-    return _concluded(MergePlan(pair, maps, outcome), step, pending.bent, schedule, merging, rng)
+    return _concluded(MergePlan(pair, maps, outcome), step, pending.bent, schedule, alignment, merging, rng)
 
 
 def _begun(
@@ -93,7 +93,7 @@ def _begun(
     records.exchange.record_maps(*speakers(pair), map_a, map_b)
     plan = MergePlan(pair, (map_a, map_b), bent)
     if not bent.success or not merging.straighten:
-        return _concluded(plan, step, None, schedule, merging, rng)
+        return _concluded(plan, step, None, schedule, options, merging, rng)
     if all(group.trunk.filter.smooths_in_slices for group in pair):
         for group in pair:
             group.trunk.filter.hasten()
@@ -102,9 +102,9 @@ def _begun(
     before = [group.trunk.filter.get_state() for group in pair]
     straight = straightened(*pair)
     if straight is None:
-        return _concluded(plan, step, None, schedule, merging, rng)
+        return _concluded(plan, step, None, schedule, options, merging, rng)
     outcome = _straight(pair, bent, straight, options, records, rng, before)
-    return _concluded(MergePlan(pair, straight, outcome), step, bent, schedule, merging, rng)
+    return _concluded(MergePlan(pair, straight, outcome), step, bent, schedule, options, merging, rng)
 
 
 def _straight(
@@ -126,23 +126,44 @@ def _straight(
 
 
 def _concluded(
-    plan: MergePlan, step: int, bent: Alignment | None, schedule: AttemptSchedule, merging: MergeOptions,
-    rng: np.random.Generator,
+    plan: MergePlan, step: int, bent: Alignment | None, schedule: AttemptSchedule, alignment: AlignmentOptions,
+    merging: MergeOptions, rng: np.random.Generator,
 ) -> Tried:  # fmt: skip
     """Ask whether a merge would be sure enough, and remember what came of the attempt."""
-    pair, alignment = plan.groups, plan.alignment
-    if alignment.success and merging.sure:
+    pair, found, doubt = plan.groups, plan.alignment, float("nan")
+    if found.success and merging.sure:
         before = rng.bit_generator.state
-        paired = plan.paired(merging, rng)
-        if schedule.should_wait(_key(pair), merging.sure * doubt_about(paired)):
-            alignment = Alignment.refused("too uncertain", alignment.ratio)
-        if alignment.success and merging.method == "particles":
-            plan = paired
-        else:  # nothing was drawn for a merge
+        plan, doubt, change = _on_trial(plan.paired(merging, rng), schedule, alignment, merging, rng)
+        found = plan.alignment
+        if schedule.should_wait(_key(pair), doubt, merging.most_doubt):
+            found = Alignment.refused("too uncertain", found.ratio, "paths", doubt)
+        elif change > 1.0:
+            found = Alignment.refused("too uncertain", found.ratio, "repeat", change)
+        if not found.success or merging.method != "particles":  # nothing was drawn for a merge
             rng.bit_generator.state = before
-    schedule.record(_key(pair), step, alignment.success, straightened=bent is not None)
-    event = MergeEvent(step, "attempt", pair[0].robots, pair[1].robots, alignment, bent)
-    return Tried(event, plan if alignment.success else None)
+            plan = plan._replace(pairing=None, joint=None)
+    schedule.record(_key(pair), step, found.success, straightened=bent is not None)
+    event = MergeEvent(step, "attempt", pair[0].robots, pair[1].robots, found, bent, doubt)
+    return Tried(event, plan if found.success else None)
+
+
+def _on_trial(
+    plan: MergePlan, schedule: AttemptSchedule, alignment: AlignmentOptions, merging: MergeOptions,
+    rng: np.random.Generator,
+) -> tuple[MergePlan, float, float]:  # fmt: skip
+    """Merge on trial where two maps alone are not sure enough.
+
+    Returns:
+        The plan, by the motion that was found last; the doubt about it, 1 = just sure enough; and by how much the last
+        trial of this pair found another one, 1 = just too much, 0 without a trial.
+    """
+    doubt = merging.sure * doubt_about(plan)
+    if doubt <= 1.0 or not (merging.least_sure and merging.straighten and merging.method == "particles"):
+        return plan, doubt, 0.0
+    trial = plan.on_trial(merging, alignment, rng)
+    if trial is None:
+        return plan, doubt, 0.0
+    return trial[0], merging.sure * trial[1], schedule.change(_key(plan.groups), trial[0].alignment.transform)
 
 
 def speakers(pair: Pair) -> tuple[int, int]:

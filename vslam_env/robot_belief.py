@@ -45,7 +45,8 @@ class BeliefConfig:
         filter: Of each robot's FastSLAM; its camera and motion hold the assumed noise, by default `cautious_filter`.
         alignment: When two maps are believed to fit together.
         attempts: When a pair of groups tries.
-        merging: How their filters are merged, and when a merge is undone.
+        merging: How their filters are merged, and when a merge is undone. By default robots merge on trial where they
+            are not sure (`MergeOptions.least_sure`): they are scored in the frames of their own starts.
         confirm_after: Landmarks measured fewer times than this are not yet part of a robot's map: what is seen but
             once may be a false point.
     """
@@ -53,7 +54,7 @@ class BeliefConfig:
     filter: FilterOptions = field(default_factory=cautious_filter)
     alignment: AlignmentOptions = field(default_factory=AlignmentOptions)
     attempts: AttemptOptions = field(default_factory=AttemptOptions)
-    merging: MergeOptions = field(default_factory=MergeOptions)
+    merging: MergeOptions = field(default_factory=lambda: MergeOptions(least_sure=4.0))
     confirm_after: int = 2
 
     def __post_init__(self) -> None:

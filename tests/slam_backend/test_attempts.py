@@ -239,3 +239,25 @@ def test_a_lone_robot_never_tries() -> None:
     team: TeamSlam = simulation.build()
     simulation.run(team, 55)
     assert team.events == ()
+
+
+def test_a_pair_too_doubtful_to_take_waits_however_long() -> None:
+    """Beyond the most that can be taken it waits though waiting does not help; below it only as long as that helps."""
+    plan = schedule()
+    assert [plan.should_wait(FIRST, 4.0, most=1.25) for _ in range(5)] == [True] * 5
+    assert [plan.should_wait(FIRST, doubt, most=1.25) for doubt in (1.3, 1.25, 1.0)] == [True, False, False]
+
+
+def test_trials_of_two_frames_are_compared() -> None:
+    """A trial says by how much of 0.25 m or 2.5 degrees the last one of the same starts differed; a snapshot knows."""
+    plan = schedule()
+    assert plan.change(FIRST, np.array([1.0, 2.0, 3.1])) == np.inf
+    other = schedule()
+    other.set_state(plan.get_state())
+    for known in (plan, other):
+        larger: PairKey = ((0, 2), (1, 3))  # joins the same frames
+        assert known.change(larger, np.array([1.3, 2.4, 3.1])) == pytest.approx(2.0)
+        turned = np.array([1.3, 2.4, 3.1 + np.radians(5.0) - 2.0 * np.pi])
+        assert known.change(FIRST, turned) == pytest.approx(2.0)
+        assert known.change(FIRST, turned) == 0.0
+        assert known.change(((1,), (3,)), turned) == np.inf
