@@ -22,6 +22,18 @@ REASONS: tuple[Reason, ...] = (
     "poorly spread",
     "too uncertain",
 )
+HINTS: dict[str, str] = {  # what helps, by the reason of a refusal
+    "too few candidates": "The maps hold too few landmarks that look alike: let robots see more of the same places.",
+    "too many candidates": "Compare maps by appearance, or compare smaller ones.",
+    "too few inliers": "Few landmarks lie alike in both maps: they share little, or one is bent. Let robots see more of"
+    " the same places, set `rejuvenate_every`, or raise `AlignmentOptions.position_floor` for rough maps.",
+    "ambiguous": "The shared landmarks fit at several places: let robots see more of what is there only once.",
+    "mirrored": "The mirror image fits better: check the sign of the measured coordinates.",
+    "poorly spread": "The shared landmarks stand too close together: let robots see more of the same places.",
+    "too uncertain": "The way of a robot to what the maps share is too uncertain: close loops or set"
+    " `rejuvenate_every`; or accept it, by a lower `MergeOptions.least_sure` where paths leave it open, by a higher"
+    " `AlignmentOptions.max_sigma_position` or `max_sigma_heading` where landmarks do.",
+}
 BOUNDS = ("translation", "rotation", "one match", "paths", "repeat")  # that a refusal as "too uncertain" may miss
 RIVAL_DISTANCE = 0.5  # [m]; beyond these two an alignment counts as another one, and as a false one
 RIVAL_ANGLE = math.radians(5.0)

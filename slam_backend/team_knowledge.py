@@ -13,6 +13,7 @@ from slam_backend.exchange import ExchangeLedger
 from slam_backend.geometry import inverse
 from slam_backend.groups import Group
 from slam_backend.landmark_map import LandmarkMap, TeamOutlines
+from slam_backend.refusals import PairAttempts, count_attempts, refusals_of
 from slam_backend.reports import MergeEvent, PoseEstimate
 from slam_backend.standpoints import Standpoints
 
@@ -36,6 +37,11 @@ class TeamKnowledge(TeamState):
         return tuple(self._events)
 
     @property
+    def pair_attempts(self) -> tuple[PairAttempts, ...]:
+        """What came of the attempts of each pair of groups so far, and why the last one was refused."""
+        return count_attempts(self._events)
+
+    @property
     def bytes_sent(self) -> IntArray:
         """(K,) bytes that each robot has sent; `slam_backend.exchange` says what is counted. A copy."""
         return np.array(self.exchange.sent, np.int64)
@@ -56,6 +62,7 @@ class TeamKnowledge(TeamState):
 
         Of the whole life of its filter: `nis_mean`, `nis_share`, `ess_share` and `rejected_share` of `Consistency`,
         and `warnings`, how many there are; `consistency` has their texts.
+        And of all steps so far the attempts of its groups to align maps, and how many were refused for each reason.
         """
         rows: list[dict[str, float]] = []
         for robot in range(self.num_robots):
@@ -78,6 +85,7 @@ class TeamKnowledge(TeamState):
                     "ess_share": told.ess_share,
                     "rejected_share": told.rejected_share,
                     "warnings": float(len(told.warnings)),
+                    **refusals_of(self._events, robot),
                 }
             )
         return tuple(rows)

@@ -11,6 +11,7 @@ from slam_backend.consistency import Consistency
 from slam_backend.errors import FloatArray, IntArray, bad_argument
 from slam_backend.geometry import between
 from slam_backend.landmark_map import LandmarkMap
+from slam_backend.refusals import PairAttempts, count_attempts
 from slam_backend.reports import MergeEvent
 from slam_backend.trajectory import dead_reckoning
 from vslam_env.config import TICK
@@ -68,6 +69,7 @@ class EpisodeRecord:
         coverage: (T + 1,) float64 [-].
         merges: In order.
         attempts: How often two maps were compared.
+        pairs: What came of these attempts, by pairs of groups.
         groups: The robots that share a map at the end.
         infos: Per robot its last info.
         own_maps: Per robot its map just before its first merge, own start frame; the last map if it never merged.
@@ -88,6 +90,7 @@ class EpisodeRecord:
     coverage: FloatArray
     merges: tuple[MergeRecord, ...]
     attempts: int
+    pairs: tuple[PairAttempts, ...]
     groups: tuple[tuple[int, ...], ...]
     infos: tuple[Mapping[str, Any], ...]
     own_maps: tuple[LandmarkMap, ...]
@@ -219,6 +222,7 @@ class _Log:
             coverage=np.array(self._coverage),
             merges=tuple(self._merges),
             attempts=sum(event.kind == "attempt" for event in self._env.events),
+            pairs=count_attempts(self._env.events),
             groups=tuple(sorted({belief.group for belief in last.values()})),
             infos=tuple(dict(self._infos[agent]) for agent in self._agents),
             own_maps=tuple(maps[robot] for robot in range(len(self._agents))),

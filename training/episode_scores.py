@@ -7,6 +7,7 @@ import numpy as np
 
 from slam_backend.geometry import compose, transform_points
 from slam_backend.metrics import align_se2, ate, map_rmse
+from training.attempt_tables import pair_rows
 from training.consistency_table import consistency_rows
 from training.episode import EpisodeRecord, is_false_merge
 
@@ -41,6 +42,7 @@ def score_episode(record: EpisodeRecord) -> dict[str, Any]:
             for merge in record.merges
         ],
         "attempts": record.attempts,
+        "refusals": pair_rows(record.pairs, record.groups),
         "groups": record.groups,
         "coverage": float(record.coverage[-1]),
         "duration_s": float(record.times[-1]),

@@ -7,6 +7,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from training.attempt_tables import print_refusals
 from training.command_folder import begin, choose, finish
 from training.command_options import Config, Duration, Estimator, Json, Out, RejuvenateEvery, Seed, numbers
 from training.command_progress import share_shown
@@ -171,6 +172,7 @@ def _print_tables(console: Console, metrics: dict[str, Any], with_poses: set[int
         off = [_number(row[key]) for key in errors.values()]
         merges.add_row(f"{row['time_s']:.1f}", *sides, str(row["landmarks"]), *off)
     console.print(merges if metrics["merges"] else "No merge.")
+    print_refusals(console, metrics["refusals"])
     console.print("Groups at the end: " + "; ".join(", ".join(map(str, group)) for group in metrics["groups"]))
 
 

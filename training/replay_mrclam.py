@@ -19,6 +19,7 @@ from slam_backend.measurements import Measurements
 from slam_backend.motion import OdometryModel
 from slam_backend.readers.mrclam import MrclamLog
 from slam_backend.readers.mrclam_steps import Drive, SightingNoise, steps
+from slam_backend.refusals import PairAttempts
 from slam_backend.reports import MergeEvent, TeamReport
 from slam_backend.team import TeamSlam
 from training.plain_config import PlainConfig
@@ -146,6 +147,7 @@ class Replay:
         groups: Robots, counted from 0, that share a map at the end.
         merges: In order.
         attempts: How often two maps were compared.
+        pairs: What came of these attempts, by pairs of groups; None: each robot stays by itself.
         rejuvenations: What came of drawing particles anew, all filters together, see `RejuvenationCount.to_mapping`.
         consistency: Per robot whether its filter at the end errs as little as it claims.
         seconds: What the filters took to live through the log [s].
@@ -160,6 +162,7 @@ class Replay:
     groups: tuple[tuple[int, ...], ...]
     merges: tuple[Merge, ...]
     attempts: int
+    pairs: tuple[PairAttempts, ...] | None
     rejuvenations: dict[str, Any]
     consistency: tuple[Consistency, ...]
     seconds: float
@@ -228,6 +231,7 @@ def replay(
         groups=team.groups,
         merges=tuple(merges),
         attempts=attempts,
+        pairs=None if config.alone else team.pair_attempts,
         rejuvenations=rejuvenations.to_mapping(),
         consistency=tuple(map(team.consistency, robots)),
         seconds=seconds,

@@ -12,6 +12,7 @@ from slam_backend.landmark_map import LandmarkMap
 from slam_backend.metrics import MapScore, align_se2, ate, map_error, map_rmse
 from slam_backend.readers.mrclam import MrclamLog
 from slam_backend.trajectory import Trajectory
+from training.attempt_tables import pair_rows
 from training.consistency_table import consistency_rows
 from training.episode_scores import merge_row
 from training.replay_mrclam import Merge, Replay
@@ -170,7 +171,8 @@ def summarise(replay: Replay, log: MrclamLog, paths: Sequence[PathScore | None])
     duration = float(replay.times[-1] - replay.times[0])
     return {
         "robots": robots, "merges": merges, "groups": named, "coverage": nan,
-        "attempts": replay.attempts, "rejuvenations": replay.rejuvenations, "duration_s": duration,
+        "attempts": replay.attempts, "refusals": pair_rows(replay.pairs, replay.groups, numbers),
+        "rejuvenations": replay.rejuvenations, "duration_s": duration,
         "notes": log.notes,
         "consistency": consistency_rows(numbers, replay.consistency),
     }  # fmt: skip

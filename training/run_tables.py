@@ -7,6 +7,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from training.attempt_tables import print_refusals
+
 ROWS = (
     ("map error E [m], errors cut at 1 m", "map_error", "{:.3f}", 1.0),
     ("map RMSE of matched landmarks [m]", "map_rmse_m", "{:.3f}", 1.0),
@@ -40,6 +42,7 @@ def print_tables(console: Console, metrics: Mapping[str, Any]) -> None:
         console.print(_merges(metrics["merges"]))
     else:
         console.print("No merge.")
+    print_refusals(console, metrics["refusals"])
     groups = "; ".join(", ".join(map(str, group)) for group in metrics["groups"])
     console.print(
         f"Groups at the end: {groups}.  Floor seen: {metrics['coverage']:.1%} in {metrics['duration_s']:.0f} s.  "

@@ -211,6 +211,7 @@ def test_robots_that_stay_alone_never_merge(tmp_path: Path) -> None:
     result = replay(both, config)
     assert result.groups == ((0,), (1,))
     assert not result.attempts
+    assert not summarise(result, both, [None, None])["refusals"]
     np.testing.assert_array_equal(result.paths[0][:80], replay(first, config).paths[0][:80])
 
 

@@ -124,7 +124,8 @@ def test_scores_of_a_perfect_path_are_zero_and_dead_reckoning_is_scored_beside_i
 def test_metrics_have_the_promised_names(record: EpisodeRecord) -> None:
     """Independent checks rely on these keys."""
     metrics = score_episode(record)
-    assert {"robots", "merges", "groups", "coverage"} <= set(metrics)
+    assert {"robots", "merges", "groups", "coverage", "attempts", "refusals"} <= set(metrics)
+    assert sum(row["attempts"] for row in metrics["refusals"]) == metrics["attempts"]
     promised = {
         "ate_aligned_m", "ate_start_m", "dead_reckoning_ate_aligned_m", "map_rmse_m", "map_recall", "map_precision",
         "map_error", "map_rmse_start_m", "map_rmse_aligned_m", "robot",
