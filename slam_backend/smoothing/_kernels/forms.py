@@ -55,9 +55,9 @@ def _inverse(a: FloatArray, out: FloatArray) -> float:
     if not d2 > 0.0:
         return 0.0
     k = m10 * m21 - m20
+    det = a[0] * d1 * d2
     out[0], out[1], out[2] = 1.0 / a[0] + m10 * m10 / d1 + k * k / d2, -m10 / d1 - k * m21 / d2, k / d2
     out[3], out[4], out[5] = 1.0 / d1 + m21 * m21 / d2, -m21 / d2, 1.0 / d2
-    det = a[0] * d1 * d2
     return det
 
 
