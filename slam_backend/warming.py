@@ -4,6 +4,8 @@ from typing import Literal
 
 import numpy as np
 
+from slam_backend import state_checks
+from slam_backend._filter_checks import are_linked
 from slam_backend.alignment import align_maps
 from slam_backend.attempts import AttemptOptions
 from slam_backend.camera import StereoCamera
@@ -61,8 +63,13 @@ def warm_up() -> float:
         smoothing = FastSlam(num_particles=4, rejuvenate_every=STEPS + 1, smoothing=few_keys)
         for _ in range(2 * (STEPS + 1)):
             smoothing.step([move], [plain])
+        for slam in (watching, smoothing):
+            slam.set_state(slam.get_state())
+        state_checks.warm()
         root = np.array([-1])
+        are_linked(root, root)  # of a state that was a pickle
         root.setflags(write=False)
+        are_linked(root, root)
         bend(np.zeros((1, 3)), root, np.zeros((1, 3, 1)))
         PathGraph.at_starts(np.zeros((1, 3))).known_as(names)  # of groups that merge
         Guesses.none().at(root)  # of what was refused

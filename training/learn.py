@@ -127,7 +127,7 @@ class Training:
             self._go_on_from(kept)
         except Exception as error:  # whatever torch says of parts that are none of this model's
             cure = f"Copy the checkpoint again, or train anew. It says: {error}."
-            raise bad_argument("resume", "the parts that a training saved", "others", cure) from error
+            raise bad_argument("resume", "the parts that a training saved", "'others'", cure) from error
 
     def _go_on_from(self, kept: Mapping[str, Any]) -> None:
         """Take over the parts of a checkpoint."""

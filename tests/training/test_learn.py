@@ -1,7 +1,9 @@
 """Trainings: they learn, repeat, go on where they stopped, and refuse what is damaged or not there."""
 
+import hashlib
 import json
 import os
+import pickle
 import signal
 import tomllib
 from pathlib import Path
@@ -24,13 +26,15 @@ from sb3_contrib import MaskablePPO
 
 from agents.goal_network import logits
 from agents.trained import load_model
+from slam_backend.state_codec import decoded, encoded
 from training.cli import app
-from training.learn import Training, check_device, kept_of
-from training.learn_checkpoint import CHECKPOINT_FILE, read_checkpoint, write_checkpoint
+from training.learn import Training, as_arrays, as_tensors, check_device, kept_of
+from training.learn_checkpoint import CHECKPOINT_FILE, FORMAT, MAGIC, read_checkpoint, write_checkpoint
 from training.learn_config import TrainConfig
 from training.learn_network import GoalPolicy
 from training.vec_env import ExplorationVecEnv
 from vslam_env.observation import observation_space
+from vslam_env.state_kinds import ENV_KINDS
 
 SMOKE = TrainConfig.from_mapping({"preset": "smoke", "seed": 5})
 SPACE = observation_space(32, 8.0, True, False)
@@ -184,6 +188,69 @@ def test_damaged_checkpoints_are_refused(whole: tuple[Path, dict[str, Any]], tmp
     write_checkpoint(file, {"config": {**SMOKE.to_mapping(), "gamma": 0.5}, "seed": 5})
     with pytest.raises(ValueError, match="resume: expected a checkpoint of the folder's configuration"):
         kept_of(tmp_path, SMOKE)
+
+
+class Trap:
+    """What a pickle of makes a file when it is read."""
+
+    def __init__(self, file: Path) -> None:
+        self.file = file
+
+    def __reduce__(self) -> Any:
+        return Path.touch, (self.file,)
+
+
+def _marked(body: bytes, number: int) -> bytes:
+    """Return a checkpoint of a format with another body, as if it had been written so."""
+    mark = {"format": number, "versions": {}, "bytes": len(body), "sha256": hashlib.sha256(body).hexdigest()}
+    return MAGIC + json.dumps(mark).encode() + b"\n" + body
+
+
+def test_a_pickle_in_the_place_of_a_checkpoint_is_not_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever its format and checksum say, it runs nothing; checkpoints of other formats are refused by number."""
+    monkeypatch.setattr("training.learn_checkpoint._versions", dict)
+    file, proof = tmp_path / CHECKPOINT_FILE, tmp_path / "proof"
+    body = pickle.dumps({"config": Trap(proof)})
+    for number, says in ((FORMAT, "got a broken file"), (1, "expected one of format 2, got a checkpoint of format 1")):
+        file.write_bytes(_marked(body, number))
+        with pytest.raises(ValueError, match=f"resume: .*{says}"):
+            kept_of(tmp_path, SMOKE)
+    assert not proof.exists()
+    file.write_bytes(_marked(encoded([1, 2], ENV_KINDS), FORMAT))
+    with pytest.raises(ValueError, match="resume: expected the checkpoint of a training, got a broken file"):
+        kept_of(tmp_path, SMOKE)
+
+
+def test_tensors_are_kept_as_arrays() -> None:
+    """The states of networks and optimizers come back as they were, moments and step counts included."""
+    layer = torch.nn.Linear(3, 2)
+    optimizer = torch.optim.Adam(layer.parameters())
+    layer(torch.ones(3)).sum().backward()
+    optimizer.step()
+    for state in (layer.state_dict(), optimizer.state_dict(), torch.get_rng_state(), None):
+        arrays = as_arrays(state)
+        back = as_tensors(decoded(encoded(arrays, ENV_KINDS), ENV_KINDS))
+        assert encoded(as_arrays(back), ENV_KINDS) == encoded(arrays, ENV_KINDS)
+    optimizer.load_state_dict(as_tensors(as_arrays(optimizer.state_dict())))
+
+
+@pytest.mark.slow
+def test_a_checkpoint_with_other_parts_is_refused(whole: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
+    """A checkpoint that is whole, but of which a part is none of this training's, is refused with its cure."""
+    kept = read_checkpoint(whole[0] / CHECKPOINT_FILE)
+    training = Training(SMOKE, tmp_path)
+    streams = kept["draws"]["numpy"]
+    beyond = streams | {"state": streams["state"] | {"pos": 10**9}}
+    for part in (
+        {"policy": {}},
+        {"optimizer": None},
+        {"environments": {"environments": [], "masks": None}},
+        {"draws": kept["draws"] | {"numpy": beyond}},
+        {"draws": kept["draws"] | {"torch": np.zeros(3, np.uint8)}},
+    ):
+        with pytest.raises(ValueError, match="resume: expected the parts that a training saved, got 'others'"):
+            training.restore(kept | part)
+    training.close()
 
 
 def test_a_missing_gpu_is_told(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,6 +1,7 @@
 import json
 import shutil
 import tomllib
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from slam_backend.trajectory import Trajectory
+from training.kept_trials import finished_trials
 from training.run_folder import METRICS_FILE, RunFolder, plain, read_config
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A trial that is known by its seed."""
+
+    seed: int
 
 
 def test_a_run_can_be_read_back(tmp_path: Path) -> None:
@@ -111,3 +120,29 @@ def test_plain_values_are_json_and_stay_themselves(value: object) -> None:
     once = plain(value)
     assert json.loads(json.dumps(once, allow_nan=False)) == once
     assert plain(once) == once
+
+
+def test_a_folder_of_another_format_is_refused(tmp_path: Path) -> None:
+    """A configuration says of which format the folder is; one that says nothing is of the present one."""
+    folder = RunFolder.create(tmp_path / "run", "run", {"many": 3}, 1)
+    file = folder.path / "config.toml"
+    text = file.read_text()
+    assert text.startswith("format = 1\n")
+    file.write_text(text.removeprefix("format = 1\n"))
+    assert read_config(file, "run") == ({"many": 3}, 1)
+    file.write_text(text.replace("format = 1", "format = 7", 1))
+    with pytest.raises(ValueError, match=r"config: expected one of format 1, got a run folder of format 7\. Use the"):
+        read_config(folder.path, "run")
+
+
+def test_kept_trials_that_are_none_are_refused(tmp_path: Path) -> None:
+    """A line that is cut off is dropped; one that is no trial is told, and the file stays as it is."""
+    folder = RunFolder.create(tmp_path / "run", "run", {}, 1)
+    file = folder.path / "trials.jsonl"
+    file.write_text('{"seed": 1, "figure": 2}\n{"seed": 2, "fig')
+    assert finished_trials(folder, file.name, Trial) == {Trial(1): {"seed": 1, "figure": 2}}
+    for line in ("[]", "3", '{"figure": 2}', "[" * 100_000, '{"seed": [1]}'):
+        file.write_text(line + "\n")
+        with pytest.raises(ValueError, match="out: expected trials that a run kept"):
+            finished_trials(folder, file.name, Trial)
+        assert file.read_text() == line + "\n"

@@ -1,5 +1,6 @@
 """Buildings: procedural offices and traced floor plans."""
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +9,15 @@ import numpy as np
 import pytest
 
 from slam_backend.camera import StereoCamera
-from vslam_env.world import FreeSpace, World, load_floorplan, make_world, place_landmarks
+from vslam_env.world import (
+    FreeSpace,
+    World,
+    load_floorplan,
+    load_walls_json,
+    make_world,
+    place_landmarks,
+    save_walls_json,
+)
 from vslam_env.world.spec import World as Spec
 
 
@@ -153,3 +162,15 @@ def test_a_room_like_fig5_is_open() -> None:
         assert len(world.walls) == 11
         width, height = world.bounds[2], world.bounds[3]
         assert 0.04 * len(FreeSpace(world).free_area_cells) > 0.88 * width * height
+
+
+def test_a_world_of_another_format_is_refused(tmp_path: Path) -> None:
+    """What is written bears the number of its format; what users write need not."""
+    file = tmp_path / "room.json"
+    world = World("room", [[0, 0, 4, 0], [4, 0, 4, 3], [4, 3, 0, 3], [0, 3, 0, 0]])
+    save_walls_json(world, file)
+    assert json.loads(file.read_text())["format"] == 1
+    np.testing.assert_array_equal(load_walls_json(file).walls, world.walls)
+    file.write_text(json.dumps({"format": 2, "walls": world.walls.tolist()}))
+    with pytest.raises(ValueError, match=r"world: expected one of format 1 in .*, got a world of format 2"):
+        load_walls_json(file)
