@@ -183,6 +183,7 @@ def check_maps(name: str, maps: Any, m: int, options: FilterOptions) -> None:
     if n and count_bad_values(maps["values"], maps["counts"], m, FARTHEST, LARGEST):
         refuse(f"{name}['values']", "means and positive variances", "others")
     check_indices(f"{name}['maps']", maps["maps"], (None, padded), 0, m - 1, m, INT32)
+    check_indices(f"{name}['maps']", maps["maps"], (None, padded), 0, padded - 1, dtype=INT32)  # of lanes beyond M, too
     check_indices(f"{name}['map_of']", maps["map_of"], (n,), 0, len(maps["maps"]))
     check_indices(f"{name}['identities']", maps["identities"], (n,), -1, MOST)
     check_indices(f"{name}['last_seen']", maps["last_seen"], (n,), 0, MOST)

@@ -164,7 +164,11 @@ class _Writer:
             return ["number", value.dtype.str, value.tobytes().hex()]
         if cls in self._kinds:
             kind = self._kinds[cls]
-            return ["object", kind.name, *(self._at(place, part) for place, part in enumerate(kind.apart(value)))]
+            try:
+                parts = list(kind.apart(value))
+            except Exception as error:  # of whatever kind: of an object that no constructor of its class has made
+                raise ForeignObjectError(f"a damaged {kind.name} ({error})") from error
+            return ["object", kind.name, *(self._at(place, part) for place, part in enumerate(parts))]
         raise ForeignObjectError(f"a {cls.__module__}.{cls.__qualname__}")
 
     def _at(self, place: Any, part: Any) -> Any:
