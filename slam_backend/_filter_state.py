@@ -23,7 +23,7 @@ from slam_backend.filter_options import MOST_ROBOTS, FilterOptions
 from slam_backend.reports import PoseEstimates
 from slam_backend.run_log import RobotLog
 from slam_backend.smoothing.rejuvenation import Particles
-from slam_backend.state_checks import CURE, generator_of
+from slam_backend.state_checks import CURE, generator_of, refusing
 
 
 class FilterState(FilterArrays):
@@ -146,7 +146,8 @@ class FilterState(FilterArrays):
         Raises:
             ValueError: If `state` is not one of `get_state`.
         """
-        check_filter("state", state, (self.options,))
+        with refusing("state"):
+            check_filter("state", state, (self.options,))
         if (last := max(map(last_step, state["logs"]))) >= state["steps"]:
             raise bad_argument("state['steps']", f"an int > {last}, the last step logged", state["steps"], CURE)
         self._go_on_from(state)

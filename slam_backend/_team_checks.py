@@ -90,6 +90,7 @@ class TeamCheck:
             check_length(f"{name}['groups'][{i}]['branches']", group["branches"])
             for branch in group["branches"]:
                 check_keys(f"{name}['groups'][{i}]['branches']", branch, BRANCH)
+                check_kind(f"{name}['groups'][{i}]['branches']['robots']", branch["robots"], tuple)
         found = sum(len(group["branches"][0]["robots"]) for group in state["groups"] if group["branches"])
         if found != self._count:
             raise bad_argument(name, f"one of {self._count} robots", found, "Build a team of the same size.")

@@ -21,6 +21,7 @@ from slam_backend.lineup import Lineup
 from slam_backend.merge_options import MergeOptions
 from slam_backend.records import Records
 from slam_backend.reports import MergeEvent
+from slam_backend.state_checks import refusing
 
 
 class TeamState:
@@ -120,7 +121,8 @@ class TeamState:
         Raises:
             ValueError: If `state` is not one of `get_state`, or of a team of another size.
         """
-        TeamCheck(self._num_robots, self.kept_readings, (self.filter_options,)).check("state", state)
+        with refusing("state"):
+            TeamCheck(self._num_robots, self.kept_readings, (self.filter_options,)).check("state", state)
         self._go_on_from(state)
 
     def _go_on_from(self, state: Mapping[str, Any]) -> None:

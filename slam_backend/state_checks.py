@@ -4,7 +4,8 @@ Kernels do not check the indices that they are given: what a state holds is chec
 comes from a file or from a program.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
 from typing import Any, NoReturn
 
@@ -53,6 +54,18 @@ def count_falls(values: Any) -> int:
 def refuse(name: str, expected: str, got: object) -> NoReturn:
     """Raise the error for a part of a state."""
     raise bad_argument(name, expected, got, CURE)
+
+
+@contextmanager
+def refusing(name: str) -> Iterator[None]:
+    """Turn what a check trips over, in a state of a form that it does not expect, into a refusal as well."""
+    try:
+        yield
+    except ValueError:
+        raise
+    except Exception as error:
+        got = f"'{type(error).__name__}: {error}' as it was looked at"
+        raise bad_argument(name, "what get_state returned", got, CURE) from error
 
 
 def check_kind(name: str, value: Any, *kinds: type) -> None:

@@ -10,6 +10,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from slam_backend.errors import bad_argument, check_choice, check_int
+from slam_backend.state_checks import refusing
 from vslam_env.actions import action_space, checked_actions
 from vslam_env.config import EnvConfig
 from vslam_env.driving import Drivers
@@ -223,8 +224,9 @@ class ExplorationEnv(EnvKnowledge):
             ValueError: If it is no state, one of another version of the package or of another configuration, or a part
                 of it is damaged; the environment is then as before.
         """
-        state = check_state(state, self.config, self._objects)
-        root = check_parts(state, self.config, self._episode)
+        with refusing("state"):
+            state = check_state(state, self.config, self._objects)
+            root = check_parts(state, self.config, self._episode)
         self._root, self.agents = root, []
         if state["episode"] is None:
             self._episode = None
