@@ -353,7 +353,7 @@ CASES: dict[str, tuple[Callable[[], Any], str]] = {
     "config at no path": (lambda: EnvConfig.from_toml(None), "config: expected a readable TOML file, got 'None'"),
     "walls to no path": (
         lambda: save_walls_json(CLOSET, None),
-        "path: expected a file that can be written, got 'None'",
+        "path: expected the path of a file, got None",
     ),
     "landmarks beyond all maps": (
         lambda: _blank_world(np.array([[1e308, 0.0, 0.0]])),
