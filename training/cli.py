@@ -87,7 +87,10 @@ def main() -> None:
             if ": expected " not in str(error):
                 raise
             _refuse(str(error))
-        except OSError as error:  # of stdout, or in a library that writes: our own writers have made it a ValueError
+        except OSError as error:
+            if _has_no_folder():
+                _refuse("folder: expected a current folder, got a deleted one. Change into one that exists.")
+            # Of stdout, or of a library that writes: our own writers have made theirs a ValueError.
             if error.errno not in NO_ROOM:
                 raise
             _abandon_stdout()
@@ -99,6 +102,15 @@ def _refuse(text: str) -> NoReturn:
     """End with one line on stderr."""
     Console(stderr=True, soft_wrap=True, highlight=False).print(f"[red]error[/] {escape(text)}")
     sys.exit(BAD_INPUT)
+
+
+def _has_no_folder() -> bool:
+    """Tell whether the folder in which the command was called is gone."""
+    try:
+        os.getcwd()
+    except FileNotFoundError:
+        return True
+    return False
 
 
 def _abandon_stdout() -> None:

@@ -1,5 +1,7 @@
+import os
 import subprocess
 import sys
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -86,3 +88,18 @@ def test_help_needs_no_heavy_import() -> None:
     code = f"import sys, training.cli; print(sorted({heavy} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("arguments", [("run", "--max-cycles", "3"), ("worlds", "preview", "fig5")])
+def test_a_deleted_folder_is_one_line(arguments: tuple[str, ...], tmp_path: Path) -> None:
+    """A command that is called in a folder that is gone says so; --help works there."""
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    shell = ["sh", "-c", 'rmdir "$0"; exec "$@"', str(gone), sys.executable, "-m", "training"]
+    environment = os.environ | {"PYTHONPATH": str(Path(cli.__file__).parents[1])}
+    done = subprocess.run([*shell, *arguments], cwd=gone, env=environment, capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (2, "")
+    told = "error folder: expected a current folder, got a deleted one. Change into one that exists."
+    assert done.stderr.splitlines() == [told]
+    gone.mkdir()
+    assert subprocess.run([*shell, "--help"], cwd=gone, env=environment, capture_output=True).returncode == 0
