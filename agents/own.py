@@ -4,15 +4,20 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import import_module
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
 from agents.policy import Policy
-from slam_backend.errors import bad_argument, check_choice
+from slam_backend.errors import bad_argument, check_choice, is_built_in
 
 ACTION_TYPES = ("continuous", "discrete", "goal")
 EXPECTED = "MODULE:NAME of a policy"
 METHODS = ("reset", "act")
+NEEDED = (
+    "A policy has the methods reset() and act(observation, belief, rng); name its class, or a function that makes it, "
+    "which take no arguments."
+)
 
 
 def is_own(name: str) -> bool:
@@ -45,7 +50,7 @@ def make_own(name: str) -> Policy:
     missing = [method for method in METHODS if not callable(getattr(policy, method, None))]
     if missing:
         got = f"a {type(policy).__name__} without {missing[0]}"
-        raise bad_argument("policy", EXPECTED, got, "A policy has the methods reset() and act(...).")
+        raise bad_argument("policy", EXPECTED, got, NEEDED)
     made: Policy = policy
     return made
 
@@ -64,7 +69,20 @@ def _find(name: str) -> Any:
     made = getattr(found, factory, None)
     if not callable(made):
         raise bad_argument("policy", EXPECTED, f"no class or function {factory!r} in {module}", "Check the name.")
+    if not _may_make_policies(made):
+        raise bad_argument("policy", EXPECTED, f"no maker of policies: {name}", NEEDED)
     return made
+
+
+def _may_make_policies(maker: Any) -> bool:
+    """Tell whether it is safe to call it to see what it makes: it is written in Python and asks for no arguments."""
+    if is_built_in(maker):
+        return False
+    try:
+        signature(maker).bind()
+    except (TypeError, ValueError):  # the latter: it does not tell
+        return False
+    return True
 
 
 @contextmanager

@@ -6,7 +6,7 @@ from typing import Literal, Self
 
 import numpy as np
 
-from slam_backend.errors import FloatArray, IntArray, bad_argument, check_array, check_float, check_int
+from slam_backend.errors import FloatArray, IntArray, bad_argument, check_array, check_float, check_int, known_names
 from slam_backend.read_only import as_read_only
 
 Reason = Literal[
@@ -43,6 +43,7 @@ MOST_COUNTED = 1 << 62  # of inliers and samples
 FEWEST_INLIERS = 3  # two matches fit any motion between them: only a third is evidence
 
 
+@known_names
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AlignmentOptions:
     """When two landmarks look alike, when they lie together, and when an alignment is believed.

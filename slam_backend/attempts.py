@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from slam_backend.alignment import RIVAL_ANGLE, RIVAL_DISTANCE, Alignment, AlignmentOptions, candidate_matches
-from slam_backend.errors import FloatArray, bad_argument, check_int
+from slam_backend.errors import FloatArray, bad_argument, check_int, known_names
 from slam_backend.geometry import wrap_angle
 from slam_backend.landmark_map import LandmarkMap
 
@@ -16,6 +16,7 @@ GROWN = 0.125  # of all that was read has to be new before logs are smoothed onc
 HELPS = 0.7  # waiting has helped where no more of a doubt is left
 
 
+@known_names
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AttemptOptions:
     """When groups try to align their maps.

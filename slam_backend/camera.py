@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slam_backend.errors import FloatArray, bad_argument, check_array, check_float, check_int
+from slam_backend.errors import FloatArray, bad_argument, check_array, check_float, check_int, known_names
 
 FARTHEST_POINT = 1e4  # [m]; no camera measures so far; at a million times this, covariances overflow
 FLATTEST = 1e4  # depth over breadth of a stereo point's covariance; flatter ones lose their digits
@@ -12,6 +12,7 @@ FLATTEST = 1e4  # depth over breadth of a stereo point's covariance; flatter one
 ROBOT_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
+@known_names
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StereoCamera:
     """A rectified stereo pair with its assumed noise.

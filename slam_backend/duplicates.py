@@ -6,11 +6,21 @@ from typing import Any
 import numpy as np
 from scipy.spatial import KDTree
 
-from slam_backend.errors import BoolArray, FloatArray, IntArray, bad_argument, check_array, check_float
+from slam_backend.errors import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    bad_argument,
+    check_array,
+    check_float,
+    check_kind,
+    known_names,
+)
 from slam_backend.fusion import fuse_descriptors, fuse_landmarks
 from slam_backend.landmark_map import LandmarkMap
 
 
+@known_names
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DuplicateOptions:
     """When two landmarks of one map are taken for the same one.
@@ -46,7 +56,8 @@ def find_duplicates(landmarks: LandmarkMap, options: DuplicateOptions | None = N
     Returns:
         (k, 2) int64 rows (kept, duplicate), by rising duplicate. No duplicate is kept or appears twice.
     """
-    options = DuplicateOptions() if options is None else options
+    options = DuplicateOptions() if options is None else check_kind("options", options, DuplicateOptions)
+    check_kind("landmarks", landmarks, LandmarkMap)
     if len(landmarks) < 2:
         return np.empty((0, 2), np.int64)
     near = KDTree(landmarks.means).query_pairs(options.same_place, output_type="ndarray").astype(np.int64)
@@ -84,6 +95,7 @@ def fuse_duplicates(landmarks: LandmarkMap, pairs: Any, independent: bool = True
     Raises:
         ValueError: If a row does not exist, a duplicate appears twice, or a kept one is a duplicate, too.
     """
+    check_kind("landmarks", landmarks, LandmarkMap)
     rows = check_array("pairs", pairs, (None, 2), "Give rows (kept, duplicate).", dtype=np.int64)
     _check(rows, len(landmarks))
     means, covariances = landmarks.means.copy(), landmarks.covariances.copy()

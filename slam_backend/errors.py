@@ -1,11 +1,15 @@
 """The one form in which bad input is refused: argument, what was expected, what came, and the cure."""
 
 import math
+from functools import wraps
+from inspect import isbuiltin, signature
 from numbers import Real
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+
+T = TypeVar("T")
 
 FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
@@ -13,6 +17,7 @@ IntArray = NDArray[np.int64]
 Int32Array = NDArray[np.int32]
 BoolArray = NDArray[np.bool_]
 
+WRITTEN_IN_PYTHON = 1 << 9  # Py_TPFLAGS_HEAPTYPE of a class
 NUMBERS = "biuf"  # kinds of dtypes that are real numbers
 
 
@@ -44,6 +49,55 @@ def _shown(got: object) -> str:
         return repr(got)
     except Exception:  # an int of 5000 digits has none, and an object of the caller's may raise anything
         return f"a {type(got).__name__} that cannot be shown"
+
+
+def check_kind(name: str, value: Any, kind: type[T], cure: str = "") -> T:
+    """Return `value` if it is an instance of a class, or raise.
+
+    Args:
+        name: The argument as the caller wrote it.
+        value: What came.
+        kind: The class.
+        cure: What to do about another, a full sentence; empty: to build one.
+
+    Raises:
+        ValueError: As `bad_argument` words it.
+    """
+    if not isinstance(value, kind):
+        article = "an" if kind.__name__[0] in "AEIOU" else "a"
+        raise bad_argument(name, f"{article} {kind.__name__}", value, cure or f"Build one: {kind.__name__}(...).")
+    return value
+
+
+def is_built_in(maker: object) -> bool:
+    """Tell whether a function or class is one of Python or of an extension, which nothing of the user's ever is."""
+    return isbuiltin(maker) or (isinstance(maker, type) and not maker.__flags__ & WRITTEN_IN_PYTHON)
+
+
+def known_names(kind: type[T]) -> type[T]:
+    """Let a class refuse keyword arguments that it does not have, with a list of those it has; to decorate a class.
+
+    >>> @known_names
+    ... class Gate:
+    ...     def __init__(self, width: float = 1.0) -> None: ...
+    >>> Gate(widht=2.0)
+    Traceback (most recent call last):
+    ...
+    ValueError: widht: expected a known argument, got a name that Gate does not have. It has width.
+    """
+    begin: Any = kind.__init__
+    known = tuple(signature(begin).parameters)[1:]  # without self
+
+    @wraps(begin)
+    def checked(self: Any, *values: Any, **named: Any) -> None:
+        for name in named:
+            if name not in known:
+                got, cure = f"a name that {kind.__name__} does not have", f"It has {', '.join(known)}."
+                raise bad_argument(name, "a known argument", got, cure)
+        begin(self, *values, **named)
+
+    kind.__init__ = checked  # type: ignore[method-assign]
+    return kind
 
 
 def check_int(name: str, value: Any, minimum: int, cure: str, maximum: int | None = None) -> int:

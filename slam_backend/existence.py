@@ -17,9 +17,10 @@ from math import exp, floor, log
 from typing import NamedTuple
 
 from slam_backend.camera import StereoCamera
-from slam_backend.errors import bad_argument, check_float, check_int
+from slam_backend.errors import bad_argument, check_float, check_int, known_names
 
 
+@known_names
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ExistenceModel:
     """How likely landmarks are seen, and when they are given up.

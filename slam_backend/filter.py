@@ -17,7 +17,7 @@ from slam_backend._rejuvenation_step import RejuvenationStep
 from slam_backend._step_input import FARTHEST_POSE, check_step
 from slam_backend._turns import take_turns
 from slam_backend.camera import StereoCamera
-from slam_backend.errors import check_array
+from slam_backend.errors import check_array, known_names
 from slam_backend.existence import ExistenceModel
 from slam_backend.filter_knowledge import FilterKnowledge
 from slam_backend.filter_options import FilterOptions
@@ -31,6 +31,7 @@ from slam_backend.resampling import RESAMPLING
 from slam_backend.smoothing.options import SmoothingOptions
 
 
+@known_names
 class FastSlam(FilterKnowledge):
     """Visual FastSLAM for one robot, or jointly for several that share a map frame.
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from slam_backend.camera import StereoCamera
-from slam_backend.errors import bad_argument, check_choice, check_float, check_int
+from slam_backend.errors import bad_argument, check_choice, check_float, check_int, known_names
 from slam_backend.existence import ExistenceModel
 from slam_backend.motion import OdometryModel
 from slam_backend.resampling import RESAMPLING
@@ -15,6 +15,7 @@ MOST_ROBOTS, MOST_PARTICLES = 1_000, 1_000_000  # memory ends before
 CALIBRATED_NOISE = 0.005  # [m]; chosen on simulated stereo runs, see docs/smoothing.md
 
 
+@known_names
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FilterOptions:
     """What a `FastSlam` assumes and how it decides; the arguments of `FastSlam` without the number of robots and seed.

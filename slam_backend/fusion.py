@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from slam_backend.alignment import Alignment
-from slam_backend.errors import FloatArray, IntArray, bad_argument
+from slam_backend.errors import FloatArray, IntArray, bad_argument, check_kind
 from slam_backend.geometry import rotate_covariances, rotation, transform_points
 from slam_backend.landmark_map import LandmarkMap
 
@@ -26,13 +26,14 @@ def fuse_landmarks(
         Means (..., 3) and covariances (..., 3, 3), symmetric, equal to (Sigma_1^-1 + Sigma_2^-1)^-1.
 
     Raises:
-        ValueError: If both estimates are exact along one direction: they can only contradict each other.
+        ValueError: If an argument is no such array, or both estimates are exact along one direction: they can only
+            contradict each other.
 
     >>> fuse_landmarks([0.0, 0.0, 0.0], np.eye(3), [3.0, 0.0, 0.0], 2.0 * np.eye(3))[0].round(12).tolist()
     [1.0, 0.0, 0.0]
     """
-    mu1, mu2 = np.asarray(mean1, dtype=np.float64), np.asarray(mean2, dtype=np.float64)
-    sigma1, sigma2 = np.asarray(cov1, dtype=np.float64), np.asarray(cov2, dtype=np.float64)
+    mu1, mu2 = _estimate("mean1", mean1, (3,)), _estimate("mean2", mean2, (3,))
+    sigma1, sigma2 = _estimate("cov1", cov1, (3, 3)), _estimate("cov2", cov2, (3, 3))
     try:
         gain = _transposed(np.linalg.solve(sigma1 + sigma2, sigma1))  # Eq. 13
     except np.linalg.LinAlgError as error:
@@ -43,6 +44,19 @@ def fuse_landmarks(
     # Eq. 15, of Sigma_1 and not of mu_1, in the form that stays symmetric and positive whatever the rounding.
     covariance = rest @ sigma1 @ _transposed(rest) + gain @ sigma2 @ _transposed(gain)
     return mean, 0.5 * (covariance + _transposed(covariance))
+
+
+def _estimate(name: str, value: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
+    """Return `value` as an array whose last axes have a shape, or raise."""
+    expected = f"an array of shape (..., {', '.join(map(str, shape))})"
+    cure = "Give one row, or one matrix, per landmark."
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise bad_argument(name, expected, value, cure) from error
+    if array.shape[-len(shape) :] != shape:
+        raise bad_argument(name, expected, f"shape {array.shape}", cure)
+    return array
 
 
 def alignment_jacobian(theta: float, points_b: ArrayLike) -> FloatArray:
@@ -117,9 +131,11 @@ def fuse_maps(map_a: LandmarkMap, map_b: LandmarkMap, alignment: Alignment) -> L
         A new map in a's frame: all of a's rows, then b's that were not fused. Counts are added.
 
     Raises:
-        ValueError: If the alignment was refused, names landmarks that do not exist or the same one twice, or the
-            descriptors differ in size.
+        ValueError: If an argument is of another kind, the alignment was refused, names landmarks that do not exist or
+            the same one twice, or the descriptors differ in size.
     """
+    check_kind("map_a", map_a, LandmarkMap), check_kind("map_b", map_b, LandmarkMap)
+    check_kind("alignment", alignment, Alignment, "Give what align_maps(map_a, map_b) returned.")
     if not alignment.success:
         cure = "Fuse maps only after a successful alignment."
         raise bad_argument("alignment", "a successful alignment", f"a refusal: {alignment.reason}", cure)

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from slam_backend.array_files import read_arrays
-from slam_backend.errors import FloatArray, IntArray, bad_argument, check_array
-from slam_backend.files import write_file
+from slam_backend.errors import FloatArray, IntArray, bad_argument, check_array, check_int
+from slam_backend.files import checked_path, write_file
 from slam_backend.geometry import rotate_covariances, transform_points
 from slam_backend.read_only import as_read_only
 
@@ -166,6 +166,7 @@ class LandmarkMap:
     @classmethod
     def empty(cls, descriptor_size: int = 64) -> Self:
         """Return a map without landmarks."""
+        check_int("descriptor_size", descriptor_size, 0, "Give the length of a descriptor.")
         return cls(np.empty((0, 3)), np.empty((0, 3, 3)), np.empty((0, descriptor_size), np.float32))
 
     def moved(self, a_from_b: ArrayLike) -> Self:
@@ -228,7 +229,7 @@ class LandmarkMap:
         Raises:
             ValueError: If the file is missing, broken, of another kind or of another format version.
         """
-        expected = "a file written by LandmarkMap.save"
+        path, expected = checked_path(path), "a file written by LandmarkMap.save"
         if not Path(path).is_file():
             raise bad_argument("path", expected, "no such file", f"Check the path {str(path)!r}.")
         cure = f"Save the map again; {str(path)!r} cannot be used."

@@ -4,12 +4,13 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
-from slam_backend.errors import bad_argument, check_choice, check_float, check_int
+from slam_backend.errors import bad_argument, check_choice, check_float, check_int, known_names
 from slam_backend.filter_options import MOST_PARTICLES
 
 METHODS = ("particles", "mixture")
 
 
+@known_names
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MergeOptions:
     """How filters are merged, and when a merge is undone.

@@ -6,10 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from slam_backend._jit import in_place
-from slam_backend.errors import FloatArray, check_float
+from slam_backend.errors import FloatArray, check_float, known_names
 from slam_backend.geometry import compose
 
 
+@known_names
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OdometryModel:
     """Gaussian noise of an odometry reading u = (dx, dy, dtheta) in the robot's previous frame.

@@ -8,7 +8,7 @@ from slam_backend._best_map import write_outline
 from slam_backend._team_state import TeamState
 from slam_backend.branches import Branch, restored_filter
 from slam_backend.consistency import Consistency
-from slam_backend.errors import FloatArray, IntArray, bad_argument
+from slam_backend.errors import FloatArray, IntArray, bad_argument, check_kind
 from slam_backend.exchange import ExchangeLedger
 from slam_backend.geometry import inverse
 from slam_backend.groups import Group
@@ -161,6 +161,7 @@ class TeamKnowledge(TeamState):
         Raises:
             ValueError: If it is no merge that is still watched.
         """
+        check_kind("merge", merge, MergeEvent, "Give one of the events of a step's report.")
         for group in self._groups:
             for watch in group.trunk.watches:
                 if watch.alignment is merge.alignment:

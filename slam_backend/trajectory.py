@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from slam_backend.errors import FloatArray, bad_argument, check_array
-from slam_backend.files import write_file
+from slam_backend.files import checked_path, write_file
 from slam_backend.geometry import wrap_angle
 
 PLANAR_TOLERANCE = 1e-6
@@ -65,7 +65,10 @@ class Trajectory:
         Raises:
             ValueError: If a time lies outside the recorded ones: nothing is extrapolated.
         """
-        wanted = np.asarray(times, dtype=np.float64)
+        try:
+            wanted = np.asarray(times, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise bad_argument("times", "numbers", times, "Give times in seconds.") from error
         outside = ~((wanted >= self.times[0]) & (wanted <= self.times[-1]))
         if outside.any():
             raise bad_argument(
@@ -108,7 +111,8 @@ class Trajectory:
             ValueError: If the file is missing, a line is malformed, a rotation is not about the vertical, or times do
                 not increase.
         """
-        if not Path(path).is_file():
+        path = checked_path(path)
+        if not path.is_file():
             raise bad_argument("path", "a TUM trajectory file", "no such file", f"Check the path {str(path)!r}.")
         times, poses = [], []
         lines = Path(path).read_text(encoding="utf-8", errors="replace").splitlines()

@@ -11,12 +11,13 @@ import cv2
 import numpy as np
 
 from slam_backend._jit import jit
-from slam_backend.errors import Float32Array, FloatArray, IntArray, check_float, check_int
+from slam_backend.errors import Float32Array, FloatArray, IntArray, check_float, check_int, known_names
 from slam_backend.frontend.images import Image, check_image
 
 SENSITIVITY = 0.04  # k of det - k trace^2
 
 
+@known_names
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CornerOptions:
     """What is a corner, and how many are kept.

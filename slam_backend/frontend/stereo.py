@@ -24,6 +24,7 @@ from slam_backend.errors import (
     check_choice,
     check_float,
     check_int,
+    known_names,
 )
 from slam_backend.frontend._matching_kernels import LARGEST_PATCH, match_rows, refine
 from slam_backend.frontend.corners import CornerOptions, Corners, find_corners, spread_order
@@ -36,6 +37,7 @@ LEAST_SCALE, LARGEST_SCALE = 1.0, 8.0  # px; of windows of constant physical siz
 SWAPPED = 12  # so many points the other way round, and three times as many as the right way, tell of swapped images
 
 
+@known_names
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrontEndOptions:
     """How a stereo pair is measured.

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from slam_backend._step_input import check_step
-from slam_backend.errors import FloatArray, IntArray, check_array, check_choice, check_int, check_seed
+from slam_backend.errors import FloatArray, IntArray, check_array, check_choice, check_int, check_kind, check_seed
 from slam_backend.filter_options import MOST_ROBOTS, FilterOptions
 from slam_backend.geometry import compose
 from slam_backend.landmark_map import LandmarkMap
@@ -55,6 +55,7 @@ class PlainFastSlam:
         initial_poses: ArrayLike | None = None,
     ) -> None:
         k = check_int("num_robots", num_robots, 1, "Use at least one robot.", MOST_ROBOTS)
+        check_kind("options", options, FilterOptions)
         given = np.zeros((k, 3)) if initial_poses is None else initial_poses
         starts = check_array("initial_poses", given, (k, 3), "Give one pose (x, y, theta) per robot.")
         poses = [wrapped(start) for start in starts]

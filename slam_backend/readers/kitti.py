@@ -16,6 +16,7 @@ import numpy as np
 
 from slam_backend.array_files import read_arrays
 from slam_backend.errors import FloatArray, IntArray, bad_argument, check_float
+from slam_backend.files import checked_path
 from slam_backend.trajectory import Trajectory
 
 KEYS = ("time_stamps", "features", "linear_velocity", "rotational_velocity", "K", "b", "cam_T_imu")
@@ -69,7 +70,7 @@ def load_kitti(path: str | Path, truth: str | Path | None = None, duration: floa
         ValueError: If a file is missing or cannot be read, an array is missing, has another shape or impossible
             numbers, or times go back; the text names the file.
     """
-    file = _find(Path(path))
+    file = _find(checked_path(path))
     content = _read(file)
     times = np.asarray(content["time_stamps"], dtype=np.float64).ravel()
     _check(file, "time_stamps", len(times) > 1 and bool((np.diff(times) > 0.0).all()), "two or more rising times")

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 
 from slam_backend.errors import FloatArray, bad_argument, check_float
+from slam_backend.files import checked_path
 from slam_backend.frontend.images import Image
 from slam_backend.readers.calibration import Rectified, RectifiedPair, Rectifier, load_kitti_calibration
 from slam_backend.readers.kitti import read_truth
@@ -66,7 +67,7 @@ def load_kitti_images(path: str | Path, truth: str | Path | None = None, duratio
     Raises:
         ValueError: If a file is missing or cannot be read, or the eyes have different images.
     """
-    folder = Path(path)
+    folder = checked_path(path)
     eyes = _eyes(folder)
     if eyes is None:
         names = " or ".join(f"{left} and {right}" for left, right in EYES)

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from slam_backend.errors import BoolArray, FloatArray, IntArray, bad_argument, check_float
+from slam_backend.files import checked_path
 from slam_backend.readers.time_order import MOST_JITTER, sorted_note, steps_back, time_order
 from slam_backend.trajectory import Trajectory
 
@@ -80,7 +81,7 @@ def load_mrclam(
             more than `MOST_JITTER` back, all sightings come before a robot's odometry, a robot is unknown,
             `Landmark_Groundtruth.dat` lacks a landmark, or `truth` is given for several robots.
     """
-    folder = Path(path)
+    folder = checked_path(path)
     if not folder.is_dir():
         raise bad_argument("path", "a folder of the MR.CLAM log", "no such folder", f"Check {str(path)!r}.")
     numbers = _check_robots(folder, robots)

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.io import loadmat
 
 from slam_backend.errors import FloatArray, bad_argument, check_float
+from slam_backend.files import checked_path
 from slam_backend.readers.time_order import MOST_JITTER, sorted_note, steps_back, time_order
 
 CONTROLS_FILE = "aa3_dr.mat"
@@ -59,7 +60,7 @@ def load_victoria(path: str | Path, duration: float | None = None) -> VictoriaLo
         ValueError: If the folder, a file or a variable in it is missing, a file cannot be read, numbers are not finite
             or impossible, lengths disagree, or a time lies more than `MOST_JITTER` back; the text names the file.
     """
-    folder = Path(path)
+    folder = checked_path(path)
     if not folder.is_dir():
         raise bad_argument("path", "a folder of the Victoria Park log", "no such folder", f"Check {str(path)!r}.")
     end = np.inf

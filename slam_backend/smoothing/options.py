@@ -2,9 +2,10 @@
 
 from dataclasses import dataclass
 
-from slam_backend.errors import check_float, check_int
+from slam_backend.errors import check_float, check_int, known_names
 
 
+@known_names
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SmoothingOptions:
     """All that decides a rejuvenation.

@@ -72,6 +72,23 @@ def test_a_policy_is_found_in_the_current_folder(module: str) -> None:
         ("{}:Moving", "goal", "policy: expected MODULE:NAME of a policy, got no class or function 'Moving' in"),
         ("{}:NUMBER", "goal", "policy: expected MODULE:NAME of a policy, got no class or function 'NUMBER' in"),
         ("{}:Mute", "goal", "policy: expected MODULE:NAME of a policy, got a Mute without act. A policy has"),
+        (
+            "os:system",
+            "goal",
+            "policy: expected MODULE:NAME of a policy, got no maker of policies: os:system. A policy has",
+        ),
+        (
+            "os:abort",
+            "goal",
+            "policy: expected MODULE:NAME of a policy, got no maker of policies: os:abort. A policy has",
+        ),
+        (
+            "builtins:int",
+            "goal",
+            "policy: expected MODULE:NAME .* got no maker of policies: builtins:int. A policy has",
+        ),
+        ("numpy:sin", "goal", "policy: expected MODULE:NAME of a policy, got no maker of policies: numpy:sin"),
+        ("shutil:rmtree", "goal", "policy: expected MODULE:NAME of a policy, got no maker of policies: shutil:rmtree"),
         ("{}:Odd", "goal", "policies_of_a_user:Odd.action_type: expected one of 'continuous', .* got 'flight'"),
         ("{}:Still", "goal", "action_type: expected 'continuous' for policy 'policies_of_a_user:Still', got 'goal'"),
     ],

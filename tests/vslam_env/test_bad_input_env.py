@@ -1,3 +1,4 @@
+import os
 from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -80,6 +81,10 @@ CASES: dict[str, tuple[Callable[[], Any], str]] = {
     "function without an argument": (
         lambda: small_env(world=lambda: CLOSET),
         "world: expected a function of one argument, a random generator, got <function .*too many positional",
+    ),
+    "function of Python's own": (
+        _reset(world=os.system),
+        "world: expected a function of rng that returns a World, got <built-in function system>",
     ),
     "class as a function": (
         lambda: small_env(world=World),

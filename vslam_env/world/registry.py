@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend.errors import bad_argument
+from slam_backend.errors import bad_argument, is_built_in
 from vslam_env.world.fig5 import fig5
 from vslam_env.world.floorplan import existing, load_floorplan, load_walls_json
 from vslam_env.world.hall import hall
@@ -74,6 +74,8 @@ def check_source(world: object) -> None:
 
 def _check_maker(maker: Callable[..., Any]) -> None:
     """Refuse a function that cannot be called with a random generator alone."""
+    if is_built_in(maker):
+        raise bad_argument("world", "a function of rng that returns a World", maker, "Write one in Python.")
     try:
         taken = signature(maker)
     except (TypeError, ValueError):  # some built-in functions do not tell
