@@ -77,10 +77,10 @@ def check_kind(name: str, value: Any, *kinds: type) -> None:
 def check_keys(name: str, value: Any, keys: Iterable[str]) -> None:
     """Refuse what is no dict, or lacks a key."""
     if not isinstance(value, Mapping):
-        refuse(name, "a dict", f"a {type(value).__name__}")
+        refuse(name, "a dict from get_state", f"a {type(value).__name__}")
     for key in keys:
         if key not in value:
-            refuse(name, f"a dict with {key!r}", "no such key")
+            refuse(name, "a dict from get_state", f"no {key!r}")
 
 
 def check_length(name: str, value: Any, length: int | None = None) -> None:

@@ -192,8 +192,8 @@ def test_robots_may_be_numbered_by_numpy() -> None:
 @pytest.mark.parametrize(
     ("state", "message"),
     [
-        ({}, r"state: expected a dict from TeamSlam\.get_state, got no 'step'\. Pass it unchanged\."),
-        (None, r"state: expected a dict from TeamSlam\.get_state, got no 'step'"),
+        ({}, r"state: expected a dict from get_state, got no 'step'\. Pass it unchanged\."),
+        (None, "state: expected a dict from get_state, got a NoneType"),
         (SimulatedTeam(num_robots=2).build().get_state(), r"state: expected one of 3 robots, got 2\. Build a team of"),
     ],
 )
