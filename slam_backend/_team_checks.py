@@ -51,6 +51,7 @@ from slam_backend.state_checks import (
 )
 from slam_backend.watching import Side, Watch
 
+BY_ROBOTS = ("doubts", "trials")  # parts of the schedule with an entry for each pair of robots
 KEYS = ("step", "epoch", "rng", "events", "groups", "numbers", "alignment", "merging", "schedule", "records")
 BRANCH = ("robots", "live", "filter", "known", "number", "epoch", "report", "watches", "split_from", "split_counts")
 KINDS = ("attempt", "merge", "undo")
@@ -362,7 +363,7 @@ class TeamCheck:
             check_kind(f"{name}.bent", event.bent, Alignment)
 
     def _check_schedule(self, name: str, schedule: Any) -> None:
-        check_keys(name, schedule, ("options", "alignment", "straightening", "records", "bars", "doubts"))
+        check_keys(name, schedule, ("options", "alignment", "straightening", "records", "bars", *BY_ROBOTS))
         check_options(f"{name}['options']", schedule["options"], AttemptOptions)
         check_options(f"{name}['alignment']", schedule["alignment"], AlignmentOptions)
         pending = schedule["straightening"]
@@ -389,13 +390,18 @@ class TeamCheck:
             check_length(f"{name}['bars']", bar, 2)
             self._check_pair(f"{name}['bars']", bar[0])
             check_whole(f"{name}['bars']", bar[1])
-        check_kind(f"{name}['doubts']", schedule["doubts"], dict)
-        for robots, doubt in schedule["doubts"].items():
-            check_kind(f"{name}['doubts']", robots, tuple)
-            check_length(f"{name}['doubts']", robots, 2)
-            check_wholes(f"{name}['doubts']", robots, 0, self._count - 1)
+        for part in BY_ROBOTS:
+            where = f"{name}[{part!r}]"
+            check_kind(where, schedule[part], dict)
+            for robots in schedule[part]:
+                check_kind(where, robots, tuple)
+                check_length(where, robots, 2)
+                check_wholes(where, robots, 0, self._count - 1)
+        for doubt in schedule["doubts"].values():
             if not (isinstance(doubt, float) and doubt >= 0.0):
                 refuse(f"{name}['doubts']", "a float at least 0", doubt)
+        for motion in schedule["trials"].values():
+            check_floats(f"{name}['trials']", motion, (3,))
 
     def _check_pair(self, name: str, pair: Any) -> None:
         """Refuse what are no two groups of robots."""
