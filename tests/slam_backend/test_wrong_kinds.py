@@ -95,7 +95,7 @@ def test_what_is_known_goes_through() -> None:
 
 
 @pytest.mark.parametrize("call", CALLS)
-@pytest.mark.parametrize("wrong", WRONG, ids=repr)
+@pytest.mark.parametrize("wrong", WRONG, ids=lambda wrong: type(wrong).__name__)
 def test_wrong_kinds_are_named(call: str, wrong: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """`None`, a number, a text, a list and an object in the place of something else: the line names the argument."""
     monkeypatch.chdir(tmp_path)
