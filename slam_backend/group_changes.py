@@ -107,8 +107,8 @@ class MergePlan(NamedTuple):
         _kernels.add_share(joint._frame, motion[None], covariance[None])
         x, y, theta = motion.tolist()
         alignment = Alignment(True, "", x, y, theta, covariance, self.alignment.inliers, self.alignment.ratio)
-        sides = self.maps[0], renamed_map(self.maps[1], dict(renamed.tolist()))
-        bent = any(moved_share(old, joint.map("mixture"), options) > merging.max_moved for old in sides)
+        sides, straight = (self.maps[0], renamed_map(self.maps[1], dict(renamed.tolist()))), joint.map("mixture")
+        bent = any(moved_share(old, straight, options) > merging.max_moved for old in sides)
         plan = self._replace(alignment=alignment, joint=(joint, renamed))
         return plan, math.inf if bent else _in_bounds(covariance)
 

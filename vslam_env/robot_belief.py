@@ -54,7 +54,7 @@ class BeliefConfig:
     filter: FilterOptions = field(default_factory=cautious_filter)
     alignment: AlignmentOptions = field(default_factory=AlignmentOptions)
     attempts: AttemptOptions = field(default_factory=AttemptOptions)
-    merging: MergeOptions = field(default_factory=lambda: MergeOptions(least_sure=4.0))
+    merging: MergeOptions = field(default_factory=lambda: MergeOptions(least_sure=5.0))
     confirm_after: int = 2
 
     def __post_init__(self) -> None:
