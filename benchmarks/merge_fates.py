@@ -15,6 +15,7 @@ from slam_backend.errors import FloatArray
 from slam_backend.geometry import between
 from slam_backend.reports import MergeEvent
 from slam_backend.team import TeamSlam
+from slam_backend.watching import moved_share
 from training.episode import is_false_merge
 from vslam_env.errors_of_maps import FALSE, ClaimLedger
 
@@ -39,6 +40,11 @@ class MergeFate:
         later_m, later_deg: Of one group's frame in the other's as the team has it `WINDOW` steps later, or at the end
             of the run if that is earlier; NaN if undone by then.
         end_m, end_deg: The same at the end; NaN if undone.
+        moved: Largest share of a side's landmarks that was seen out of place while the merge was watched; beyond
+            `MergeOptions.max_moved` it is undone. NaN if it was not watched.
+        doubt: Of the attempt that led to it, see `MergeEvent`; NaN if it was forced.
+        undone_m, undone_deg: How far off the merge was, as the team had it, just before it was undone; NaN if it was
+            not.
     """
 
     seed: int
@@ -58,11 +64,22 @@ class MergeFate:
     later_deg: float
     end_m: float
     end_deg: float
+    moved: float = float("nan")
+    doubt: float = float("nan")
+    undone_m: float = float("nan")
+    undone_deg: float = float("nan")
 
     @property
     def is_false(self) -> bool:
         """Whether its motion was plainly wrong."""
         return is_false_merge(self.error_m, self.error_deg)
+
+    @property
+    def is_rightly_undone(self) -> bool | None:
+        """Whether it was off, when made or when undone, by what counts as false; None if it was not undone."""
+        if self.undone_after is None:
+            return None
+        return self.is_false or is_false_merge(self.undone_m, self.undone_deg)
 
     @property
     def counts(self) -> bool:
@@ -87,7 +104,26 @@ class Delay:
     merged_after: int | None
 
 
-Fates = tuple[list[MergeFate], list[Delay]]
+@dataclass(slots=True)
+class RunEnd:
+    """How a run ended.
+
+    Attributes:
+        seed: Of it.
+        world: Family of worlds, or floor plan.
+        groups: The robots that share a map at the end.
+        last_merge: The step of the last merge that is in force; None without one.
+        ate_m: RMS error of each robot's path after the best SE(2) fit, mean over the robots; NaN where not asked.
+    """
+
+    seed: int
+    world: str
+    groups: tuple[tuple[int, ...], ...]
+    last_merge: int | None
+    ate_m: float = float("nan")
+
+
+Fates = tuple[list[MergeFate], list[Delay], RunEnd]
 
 
 class Follower:
@@ -101,21 +137,46 @@ class Follower:
     Attributes:
         wrong_pairs: By number of the event the share of the pairs joined that are truly two landmarks.
         later: How far off each merge is [m, degrees], as the team has it at most `WINDOW` steps later.
+        last: How far off each merge is [m, degrees], as the team had it last.
+        moved: Largest share of a side's landmarks that was seen out of place while the merge was watched.
     """
 
     def __init__(self, team: TeamSlam, ledger: ClaimLedger, starts: FloatArray) -> None:
         self._team, self._ledger, self._starts = team, ledger, starts
         self.wrong_pairs: dict[int, float] = {}
         self.later: dict[int, tuple[float, float]] = {}
+        self.last: dict[int, tuple[float, float]] = {}
+        self.moved: dict[int, float] = {}
+
+    @property
+    def groups(self) -> tuple[tuple[int, ...], ...]:
+        """Of the team, as it is now."""
+        return self._team.groups
 
     def note(self, step: int) -> None:
         """Look at the merges there are after a step."""
+        if step % self._team._merging.watch_every == 0:
+            self._weigh()
         for i, event in enumerate(self._team.events):
             if event.kind == "merge" and step - event.step <= WINDOW:
                 if i not in self.wrong_pairs:
                     self.wrong_pairs[i] = self._share_of_wrong_pairs(event)
                 if undone_in(self._team.events, event) is None:
                     self.later[i] = self.off_now(event)
+            if event.kind == "merge" and undone_in(self._team.events, event) is None:
+                self.last[i] = self.off_now(event)
+
+    def _weigh(self) -> None:
+        """Note which shares of the maps of watched merges are out of place."""
+        numbers = {id(event.alignment): i for i, event in enumerate(self._team.events) if event.kind == "merge"}
+        for group in self._team._groups:
+            if not group.trunk.watches:
+                continue
+            joint = group.trunk.filter.map("mixture")
+            for watch in group.trunk.watches:
+                i = numbers[id(watch.alignment)]
+                share = max(moved_share(old, joint, self._team._alignment) for old in watch.before)
+                self.moved[i] = max(share, self.moved.get(i, 0.0))
 
     def off_now(self, merge: MergeEvent) -> tuple[float, float]:
         """Return by how much [m, degrees] one group's frame is off in the other's as their joint filter has it now."""
@@ -130,7 +191,8 @@ class Follower:
         sides = next(watch.sides for watch in watches if watch.alignment is merge.alignment)
         claims = []
         for side, joined, rows in zip(sides, self._team.merged_maps(merge), merge.alignment.inliers.T, strict=True):
-            claims.append(self._ledger._claims[side.trunk["number"]][joined.ids[rows]])
+            book = self._ledger._books[self._ledger._row_of[side.trunk["number"]]]
+            claims.append(book[joined.ids[rows]])
         return float(np.mean((claims[0] != claims[1]) | (claims[0] == FALSE))) if len(claims[0]) else float("nan")
 
 
@@ -164,14 +226,22 @@ def fates(
                     follower.wrong_pairs[i], None if undone is None else undone - event.step, steps - event.step,
                     *(nothing if soon else follower.later[i]),
                     *(nothing if undone is not None else follower.off_now(event)),
+                    follower.moved.get(i, float("nan")), doubt_of(events[:i], event),
+                    *(nothing if undone is None else follower.last[i]),
                 )
             )  # fmt: skip
-    return found, delays(events, seed)
+    kept = [e.step for e in events if e.kind == "merge" and undone_in(events, e) is None]
+    return found, delays(events, seed), RunEnd(seed, world, follower.groups, max(kept, default=None))
 
 
 def undone_in(events: Sequence[MergeEvent], merge: MergeEvent) -> int | None:
     """Return the step in which a merge was undone; None: it was not."""
     return next((e.step for e in events if e.kind == "undo" and e.alignment is merge.alignment), None)
+
+
+def doubt_of(before: Sequence[MergeEvent], merge: MergeEvent) -> float:
+    """Return the doubt of the attempt that led to a merge; NaN if it was forced."""
+    return next((event.doubt for event in before if event.alignment is merge.alignment), float("nan"))
 
 
 def off_if_bent(starts: FloatArray, before: Sequence[MergeEvent], merge: MergeEvent) -> tuple[float, float]:
@@ -199,17 +269,22 @@ def delays(events: Sequence[MergeEvent], seed: int) -> list[Delay]:
     return found
 
 
-def summarise(merges: list[MergeFate], late: list[Delay], runs: int, steps: int) -> dict[str, Any]:
+def summarise(merges: list[MergeFate], late: list[Delay], ends: list[RunEnd], steps: int) -> dict[str, Any]:
     """Return the figures of all runs together."""
+    whole = [end.last_merge for end in ends if len(end.groups) == 1 and end.last_merge is not None]
     false = [merge for merge in merges if merge.is_false]
     right = [merge for merge in merges if not merge.is_false]
     after = [merge.undone_after for merge in false if merge.undone_after is not None]
     return {
-        "runs": runs,
+        "runs": len(ends),
+        "runs_in_one_group": sum(len(end.groups) == 1 for end in ends),
+        "last_merge_of_these_median": float(np.median(whole)) if whole else float("nan"),
+        "ate_m_mean": mean(end.ate_m for end in ends),
         "steps": steps,
         "merges": len(merges),
         "right_merges": len(right),
         "right_merges_undone": sum(merge.undone_after is not None for merge in right),
+        "wrongly_undone": sum(merge.is_rightly_undone is False for merge in merges),
         "false_merges": len(false),
         "false_merges_undone": len(after),
         "false_merges_in_force": sum(merge.counts for merge in false),
@@ -223,9 +298,18 @@ def summarise(merges: list[MergeFate], late: list[Delay], runs: int, steps: int)
         "largest_error_m": max((merge.error_m for merge in merges), default=float("nan")),
         "false_had_they_been_bent": sum(is_false_merge(merge.bent_m, merge.bent_deg) for merge in merges),
         "rms_error_had_they_been_bent_m": rms(merge.bent_m for merge in merges),
+        "largest_share_moved_in_right_merges": max(
+            (m.moved for m in right if np.isfinite(m.moved)), default=float("nan")
+        ),
         "refused_once_straight": len(late),
         "never_merged_after_that": sum(delay.merged_after is None for delay in late),
     }
+
+
+def mean(values: Iterable[float]) -> float:
+    """Return the mean of those that are not NaN; NaN if all are."""
+    known = [value for value in values if np.isfinite(value)]
+    return float(np.mean(known)) if known else float("nan")
 
 
 def rms(values: Iterable[float]) -> float:

@@ -4,6 +4,8 @@
     python benchmarks/merge_soak.py --minutes 10 --forced
     python benchmarks/merge_soak.py --minutes 10 --kind environment
     python benchmarks/merge_soak.py --minutes 10 --kind both
+    python benchmarks/merge_soak.py --minutes 60 --world FOLDER_OF_PLANS --seeds 3
+    python benchmarks/merge_soak.py --minutes 60 --world maze --world loops --seeds 10
 
 Runs are stereo runs through offices of aisles, 100 m per robot, with look-alikes in classes of one to three, false
 points and wrong descriptors; or episodes of the environment in all its families of worlds, up to all landmarks with a
@@ -12,6 +14,8 @@ it counts if it is in force 200 steps later or at the end. How far off the team 
 are the same landmarks, is told beside it, see `merge_fates`. With `--forced` robots do not merge by themselves: once
 two maps are large enough they are merged by that wrong motion which fits them best, and the question is how many of
 these the team undoes, and when; `--shift 0.6` takes the true motion shifted by so many metres instead.
+With `--world` the runs are those of `vslam run --world WORLD --seed SEED`: all worlds that are named, a folder standing
+for the floor plans in it, with `--seeds` seeds each, from `--first-seed` on; `--minutes` ends them early.
 """
 
 import os
@@ -20,6 +24,7 @@ os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
 
 import json
 import time
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import count
 from pathlib import Path
@@ -27,7 +32,7 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
-from merge_fates import Delay, Fates, Follower, MergeFate, fates, summarise
+from merge_fates import Delay, Fates, Follower, MergeFate, RunEnd, fates, summarise
 from rich.console import Console
 
 from agents.registry import make_policy
@@ -39,7 +44,9 @@ from slam_backend.geometry import between, rotation
 from slam_backend.landmark_map import LandmarkMap
 from slam_backend.merge_options import MergeOptions
 from slam_backend.team import TeamSlam
-from training.episode import is_false_merge
+from training.episode import Progress, is_false_merge, run_episode
+from training.episode_scores import score_episode
+from training.run_config import RunConfig
 from training.run_folder import plain
 from training.stereo_runs import STEP, RunSpec, simulate_run
 from vslam_env import ExplorationEnv, preset_config
@@ -52,6 +59,7 @@ RADIOS: tuple[dict[str, Any], ...] = ({}, {"comm_range": 8.0}, {"comm_line_of_si
 LOSES, FINDS = 0.02, 0.05  # probability per step that a link is lost, and found again
 ENOUGH = 20  # landmarks of either map before a merge is forced
 HYPOTHESES, COINCIDENCE = 2000, 0.25  # [-, m]: how a forced merge is found
+Runs = tuple[Fates, int]  # what became of a run, and its steps
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,7 +71,7 @@ class Setting:
         shift: How [m]; None: by the motion that fits best.
         rejuvenate_every: Of the filters; None: their default.
         straighten: Maps before a merge.
-        sure: Of the motion a merge has to be, see `MergeOptions`.
+        sure, least_sure: Of the motion a merge has to be, see `MergeOptions`; None: as it is by default.
     """
 
     forced: bool = False
@@ -71,11 +79,13 @@ class Setting:
     rejuvenate_every: int | None = None
     straighten: bool = True
     sure: float = MergeOptions().sure
+    least_sure: float | None = None
 
     @property
     def merging(self) -> dict[str, Any]:
         """Options of merges."""
-        return {"straighten": self.straighten, "sure": self.sure}
+        told = {"straighten": self.straighten, "sure": self.sure}
+        return told if self.least_sure is None else told | {"least_sure": self.least_sure}
 
     @property
     def filter(self) -> dict[str, Any]:
@@ -119,6 +129,56 @@ def play_environment(seed: int, cycles: int, setting: Setting) -> Fates:
         follower.note(env.episode.tick - 1)
     alike = f"{env.config.landmarks.repeated:.0%} with a twin"
     return fates(env.events, env.true_start_poses, seed, env.config.world, alike, env.episode.tick, follower)
+
+
+def play_world(world: str, seed: int, setting: Setting) -> Fates:
+    """Play the episode of `vslam run` in one world and return what became of its merges."""
+    run = RunConfig(world=world, seed=seed)
+    belief = {"merging": setting.merging, "filter": setting.filter}
+    env = ExplorationEnv(run.environment().replace(belief=belief))
+    follower: Follower | None = None
+
+    def note(progress: Progress) -> None:
+        nonlocal follower
+        if follower is None:
+            follower = Follower(env.episode.belief._team, env.episode.ledger, env.true_start_poses)
+        else:
+            follower.note(env.episode.tick - 1)
+
+    record = run_episode(env, run.make_policies(env), seed, note)
+    assert follower is not None
+    name = Path(world).stem
+    found, late, end = fates(env.events, env.true_start_poses, seed, name, "", env.episode.tick, follower)
+    return found, late, replace(end, ate_m=score_episode(record)["team"]["ate_aligned_m"])
+
+
+def named_worlds(worlds: Sequence[str]) -> list[str]:
+    """Return families and floor plans, those of a folder by their names."""
+    found = []
+    for world in worlds:
+        folder = Path(world)
+        found += sorted(map(str, folder.glob("*.png"))) if folder.is_dir() else [world]
+    return found
+
+
+def play_random(minutes: float, first_seed: int, cycles: int | None, kind: str, setting: Setting) -> Iterator[Runs]:
+    """Play random runs until so many minutes are over."""
+    begin = time.monotonic()
+    for seed in count(first_seed):
+        if time.monotonic() - begin > 60.0 * minutes:
+            break
+        aisles = kind == "aisles" or (kind == "both" and seed % 2 == 0)
+        length = (400 if aisles else 1500) if cycles is None else cycles
+        yield (play_aisles if aisles else play_environment)(seed, length, setting), length
+
+
+def play_named(minutes: float, first_seed: int, worlds: Sequence[str], seeds: int, setting: Setting) -> Iterator[Runs]:
+    """Play so many seeds in each of some worlds, or until so many minutes are over."""
+    begin = time.monotonic()
+    for world in named_worlds(worlds):
+        for seed in range(first_seed, first_seed + seeds):
+            if time.monotonic() - begin < 60.0 * minutes:
+                yield play_world(world, seed, setting), RunConfig().num_steps
 
 
 def play_aisles(seed: int, cycles: int, setting: Setting) -> Fates:
@@ -219,6 +279,25 @@ def coinciding(points_a: FloatArray, points_b: FloatArray, motion: FloatArray) -
     return np.column_stack([rows, nearest])[mutual]
 
 
+def told(merge: MergeFate) -> str:
+    """Return a line about a merge."""
+    if merge.undone_after is None:
+        fate = (
+            f"in force, {merge.later_m:.2f} m {merge.later_deg:.1f} deg off later, {merge.end_m:.2f} m "
+            f"{merge.end_deg:.1f} deg at the end"
+        )
+    else:
+        fate = (
+            f"undone after {merge.undone_after} steps, {'rightly' if merge.is_rightly_undone else 'WRONGLY'}, "
+            f"{merge.undone_m:.2f} m {merge.undone_deg:.1f} deg off then"
+        )
+    return (
+        f"seed {merge.seed} {merge.world} ({merge.alike}): {merge.robots_a} + {merge.robots_b} at "
+        f"{merge.step}, {merge.error_m:.2f} m {merge.error_deg:.1f} deg off"
+        f"{', FALSE' if merge.is_false else ''}, doubt {merge.doubt:.2f}, {merge.moved:.0%} moved, {fate}"
+    )
+
+
 def main(
     minutes: Annotated[float, typer.Option(help="How long; the last run is played to its end.")] = 10.0,
     first_seed: Annotated[int, typer.Option(help="Of the first run.")] = 100,
@@ -231,6 +310,11 @@ def main(
     ] = None,
     straighten: Annotated[bool, typer.Option(help="Straighten maps before they merge.")] = True,
     sure: Annotated[float, typer.Option(help="Deviations a merge has to be sure by; 0: none.")] = MergeOptions().sure,
+    least_sure: Annotated[
+        float | None, typer.Option(help="As MergeOptions has it; 0: no trials.", show_default="the default")
+    ] = None,
+    world: Annotated[list[str] | None, typer.Option(help="A family, a floor plan or a folder of these.")] = None,
+    seeds: Annotated[int, typer.Option(help="Of each world that is named.")] = 3,
     json_file: Annotated[Path | None, typer.Option("--json", help="Write all figures to this file.")] = None,
 ) -> None:
     """Run the soak and print it."""
@@ -242,40 +326,40 @@ def main(
     if cycles is not None:
         check_int("cycles", cycles, 2, "Give a number of steps.")
     check_int("first_seed", first_seed, 0, "Seeds are not negative.")
+    check_int("seeds", seeds, 1, "Play at least one seed.")
+    if world and (forced or cycles is not None):
+        raise bad_argument("world", "no --forced and no --cycles with it", world, "Leave them out.")
     if json_file is not None:
         check_writable(json_file, "json")
-    setting = Setting(forced=forced, shift=shift, rejuvenate_every=rejuvenate_every, straighten=straighten, sure=sure)
+    setting = Setting(
+        forced=forced, shift=shift, rejuvenate_every=rejuvenate_every, straighten=straighten, sure=sure,
+        least_sure=least_sure,
+    )  # fmt: skip
     console = Console(highlight=False, soft_wrap=True)
     merges: list[MergeFate] = []
     late: list[Delay] = []
-    begin, played, steps = time.monotonic(), 0, 0
-    for seed in count(first_seed):
-        if time.monotonic() - begin > 60.0 * minutes:
-            break
-        aisles = kind == "aisles" or (kind == "both" and seed % 2 == 0)
-        length = (400 if aisles else 1500) if cycles is None else cycles
-        found, delayed = (play_aisles if aisles else play_environment)(seed, length, setting)
-        merges, late, played, steps = merges + found, late + delayed, played + 1, steps + length
+    ends: list[RunEnd] = []
+    steps = 0
+    if world:
+        runs = play_named(minutes, first_seed, world, seeds, setting)
+    else:
+        runs = play_random(minutes, first_seed, cycles, kind, setting)
+    for (found, delayed, end), length in runs:
+        merges, late, ends, steps = merges + found, late + delayed, [*ends, end], steps + length
         for merge in found:
-            fate = (
-                f"in force, {merge.later_m:.2f} m {merge.later_deg:.1f} deg off later, {merge.end_m:.2f} m "
-                f"{merge.end_deg:.1f} deg at the end"
-                if merge.undone_after is None
-                else f"undone after {merge.undone_after} steps"
-            )
-            console.print(
-                f"seed {merge.seed} {merge.world} ({merge.alike}): {merge.robots_a} + {merge.robots_b} at "
-                f"{merge.step}, {merge.error_m:.2f} m {merge.error_deg:.1f} deg off"
-                f"{', FALSE' if merge.is_false else ''}, {fate}"
-            )
-    summary = summarise(merges, late, played, steps)
+            console.print(told(merge))
+        if len(end.groups) > 1:
+            console.print(f"seed {end.seed} {end.world}: groups {end.groups} at the end")
+    summary = summarise(merges, late, ends, steps)
     for name, value in summary.items():
         console.print(f"{name:30s} {value}")
     record = {
-        "setting": asdict(setting) | {"kind": kind, "minutes": minutes, "first_seed": first_seed},
+        "setting": asdict(setting)
+        | {"kind": kind, "minutes": minutes, "first_seed": first_seed, "worlds": world or []},
         "summary": summary,
         "merges": [asdict(merge) for merge in merges],
         "delays": [asdict(delay) for delay in late],
+        "ends": [asdict(end) for end in ends],
     }
     if json_file is not None:
         write_file(json_file, json.dumps(plain(record), indent=1), "json")

@@ -44,8 +44,8 @@ def table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
 def fates_table(soaks: Sequence[dict[str, Any]]) -> str:
     """Return what became of the merges of each soak."""
     head = (
-        "soak", "runs", "merges", "false", "in force 200 steps later", "off by as much at the end", "right ones undone",
-        "false ones undone, after", "RMS, then 200 steps later [m]", "put off",
+        "soak", "runs", "in one group", "merges", "false", "in force 200 steps later", "off by as much at the end",
+        "right ones undone", "false ones undone, after", "RMS, then 200 steps later [m]", "put off",
     )  # fmt: skip
     rows = []
     for soak in soaks:
@@ -53,7 +53,8 @@ def fates_table(soaks: Sequence[dict[str, Any]]) -> str:
         undone = f"{seen['false_merges_undone']} of {seen['false_merges']}"
         rows.append(
             (
-                soak["name"], seen["runs"], seen["merges"], seen["false_merges"], seen["false_merges_in_force"],
+                soak["name"], seen["runs"], seen.get("runs_in_one_group", "-"), seen["merges"],
+                seen["false_merges"], seen["false_merges_in_force"],
                 seen["false_at_the_end"],
                 f"{seen['right_merges_undone']} of {seen['right_merges']}",
                 undone if after is None else f"{undone}, {after:.0f} steps",

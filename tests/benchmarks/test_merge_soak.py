@@ -1,0 +1,49 @@
+"""The soak of merges runs, and says what became of each merge."""
+
+import importlib.util
+import math
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+FOLDER = Path(__file__).parents[2] / "benchmarks"
+
+
+@pytest.fixture(scope="module")
+def soak() -> Any:
+    """The script as a module."""
+    sys.path.insert(0, str(FOLDER))  # it imports one beside it
+    spec = importlib.util.spec_from_file_location("merge_soak", FOLDER / "merge_soak.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["merge_soak"] = module
+    spec.loader.exec_module(module)
+    yield module
+    sys.path.remove(str(FOLDER))
+
+
+def test_a_folder_stands_for_its_floor_plans(soak: Any, tmp_path: Path) -> None:
+    """Families keep their names; the plans of a folder come in the order of theirs."""
+    for name in ("b.png", "a.png", "notes.txt"):
+        (tmp_path / name).touch()
+    assert soak.named_worlds(["maze", str(tmp_path)]) == ["maze", str(tmp_path / "a.png"), str(tmp_path / "b.png")]
+
+
+def test_a_forced_merge_is_followed_to_its_undo(soak: Any) -> None:
+    """Merged by the wrong motion that fits best, two robots are counted as falsely merged, and as rightly parted."""
+    merges, late, end = soak.play_aisles(9000, 120, soak.Setting(forced=True))
+    (merge,) = merges
+    assert merge.is_false
+    assert merge.wrong_pairs > 0.9
+    assert math.isnan(merge.doubt)
+    assert merge.undone_after is not None
+    assert merge.is_rightly_undone
+    assert "rightly" in soak.told(merge)
+    assert (end.seed, end.world, end.last_merge, late) == (9000, "aisles", None, [])
+    assert len(end.groups) > 1
+    summary = soak.summarise(merges, late, [end], 120)
+    assert (summary["false_merges"], summary["false_merges_undone"], summary["wrongly_undone"]) == (1, 1, 0)
+    assert summary["runs_in_one_group"] == 0
