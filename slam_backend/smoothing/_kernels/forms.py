@@ -12,7 +12,6 @@ from slam_backend._jit import device, in_place, inlined, room
 from slam_backend.errors import BoolArray, FloatArray, IntArray
 
 FREE = -1  # column of a pose that is given, not sought
-FLAT = 1e-6  # where cofactors keep less of an information, its eigenvalues are in a ratio of a million
 MIN_DEPTH = 0.05  # [m]; a landmark predicted nearer than this to the camera plane is linearised where it was measured
 
 
@@ -30,34 +29,17 @@ def _spun(c: float, s: float, a: FloatArray, out: FloatArray) -> None:
 
 @inlined
 def _inverse(a: FloatArray, out: FloatArray) -> float:
-    """Write the inverse of a symmetric matrix (6); return its determinant, or 0 unless it is positive definite.
-
-    By cofactors, or by L D L^T where these cancel (`lane_math.inverted_by_parts`).
-    """
+    """Write the inverse of a symmetric matrix (6); return its determinant."""
     p = a[3] * a[5] - a[4] * a[4]
     q = a[2] * a[4] - a[1] * a[5]
     r = a[1] * a[4] - a[2] * a[3]
     det: float = a[0] * p + a[1] * q + a[2] * r
-    if det > 0.0 and det >= FLAT * a[0] * a[3] * a[5]:
-        out[0], out[1], out[2] = p / det, q / det, r / det
-        out[3] = (a[0] * a[5] - a[2] * a[2]) / det
-        out[4] = (a[1] * a[2] - a[0] * a[4]) / det
-        out[5] = (a[0] * a[3] - a[1] * a[1]) / det
+    if det <= 0.0:
         return det
-    if not a[0] > 0.0:
-        return 0.0
-    m10, m20 = a[1] / a[0], a[2] / a[0]
-    d1, n = a[3] - m10 * a[1], a[4] - m10 * a[2]
-    if not d1 > 0.0:
-        return 0.0
-    m21 = n / d1
-    d2 = a[5] - m20 * a[2] - m21 * n
-    if not d2 > 0.0:
-        return 0.0
-    k = m10 * m21 - m20
-    det = a[0] * d1 * d2
-    out[0], out[1], out[2] = 1.0 / a[0] + m10 * m10 / d1 + k * k / d2, -m10 / d1 - k * m21 / d2, k / d2
-    out[3], out[4], out[5] = 1.0 / d1 + m21 * m21 / d2, -m21 / d2, 1.0 / d2
+    out[0], out[1], out[2] = p / det, q / det, r / det
+    out[3] = (a[0] * a[5] - a[2] * a[2]) / det
+    out[4] = (a[1] * a[2] - a[0] * a[4]) / det
+    out[5] = (a[0] * a[3] - a[1] * a[1]) / det
     return det
 
 

@@ -2,11 +2,10 @@
 
 import math
 
-from slam_backend._jit import lanes, lanes_inlined, room
-from slam_backend._kernels.lane_math import cofactors_cancel, inverted, inverted_by_parts, log_of, sine_cosine
+from slam_backend._jit import lanes, room
+from slam_backend._kernels.lane_math import log_of, sine_cosine
 from slam_backend.errors import FloatArray, IntArray
 from slam_backend.smoothing._kernels.equations import WEAK
-from slam_backend.smoothing._kernels.forms import FLAT
 
 LANES = 52  # as in the filter, which takes over tiles as they are
 
@@ -39,41 +38,6 @@ def to_lanes(poses: FloatArray, rows: FloatArray) -> None:
                 row[PX + i], row[PY + i], row[HEADING + i] = pose[0, 0], pose[1, 0], pose[2, 0]
             for i in range(LANES):
                 row[SIN + i], row[COS + i] = sine_cosine(row[HEADING + i])
-
-
-@lanes
-def _any_flat(work: FloatArray, h: float) -> bool:
-    """Tell whether the information of a landmark is flat in any lane."""
-    count = 0
-    for i in range(LANES):
-        a, b, d, e, f = work[A00 + i], work[A01 + i], work[A02 + i], work[A11 + i], work[A12 + i]
-        count += 1 if cofactors_cancel(a, b, d, e, f, h, FLAT) else 0
-    return count > 0
-
-
-@lanes_inlined
-def _solve(work: FloatArray, h: float, x: float, y: float, z: float, tile: FloatArray, flat: bool) -> None:
-    """Write the landmark (x, y, z moved) that its information asks for; `flat` (a constant): cofactors cancel.
-
-    The row ENERGY becomes what that adds to the log-likelihood, but for the determinant, which becomes row A00.
-    """
-    for i in range(LANES):
-        a, b, d = work[A00 + i], work[A01 + i], work[A02 + i]
-        e, f = work[A11 + i], work[A12 + i]
-        s00, s01, s02, s11, s12, s22, det = (
-            inverted_by_parts(a, b, d, e, f, h) if flat else inverted(a, b, d, e, f, h)
-        )  # fmt: skip
-        b0, b1, b2 = work[B0 + i], work[B1 + i], work[B2 + i]
-        m0 = s00 * b0 + s01 * b1 + s02 * b2
-        m1 = s01 * b0 + s11 * b1 + s12 * b2
-        m2 = s02 * b0 + s12 * b1 + s22 * b2
-        tile[i] = x - m0
-        tile[LANES + i] = y - m1
-        tile[2 * LANES + i] = z - m2
-        tile[3 * LANES + i], tile[4 * LANES + i], tile[5 * LANES + i] = s00, s01, s02
-        tile[6 * LANES + i], tile[7 * LANES + i], tile[8 * LANES + i] = s11, s12, s22
-        work[ENERGY + i] = 0.5 * (b0 * m0 + b1 * m1 + b2 * m2) - work[ENERGY + i]
-        work[A00 + i] = det
 
 
 @lanes
@@ -133,10 +97,25 @@ def replay(
                     work[A11 + i] += s * s * n0 + 2.0 * c * s * n1 + c * c * n3
                     work[A12 + i] += s * n2 + c * n4
                 h += n5
-            if _any_flat(work, h):
-                _solve(work, h, x, y, z, tile, True)
-            else:
-                _solve(work, h, x, y, z, tile, False)
+            for i in range(LANES):
+                a, b, d = work[A00 + i], work[A01 + i], work[A02 + i]
+                e, f = work[A11 + i], work[A12 + i]
+                p, q1, r = e * h - f * f, d * f - b * h, b * f - d * e
+                det = a * p + b * q1 + d * r
+                inverse = 1.0 / det
+                s00, s01, s02 = p * inverse, q1 * inverse, r * inverse
+                s11, s12, s22 = (a * h - d * d) * inverse, (b * d - a * f) * inverse, (a * e - b * b) * inverse
+                b0, b1, b2 = work[B0 + i], work[B1 + i], work[B2 + i]
+                m0 = s00 * b0 + s01 * b1 + s02 * b2
+                m1 = s01 * b0 + s11 * b1 + s12 * b2
+                m2 = s02 * b0 + s12 * b1 + s22 * b2
+                tile[i] = x - m0
+                tile[LANES + i] = y - m1
+                tile[2 * LANES + i] = z - m2
+                tile[3 * LANES + i], tile[4 * LANES + i], tile[5 * LANES + i] = s00, s01, s02
+                tile[6 * LANES + i], tile[7 * LANES + i], tile[8 * LANES + i] = s11, s12, s22
+                work[ENERGY + i] = 0.5 * (b0 * m0 + b1 * m1 + b2 * m2) - work[ENERGY + i]
+                work[A00 + i] = det
             for i in range(LANES):
                 det = work[A00 + i]
                 log_det = log_of(det) if det > 0.0 else math.nan

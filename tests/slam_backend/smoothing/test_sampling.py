@@ -8,7 +8,6 @@ from slam_backend.errors import FloatArray
 from slam_backend.motion import OdometryModel
 from slam_backend.run_log import RobotLog
 from slam_backend.smoothing._kernels import LANES, normalise, weigh_deviations
-from slam_backend.smoothing._kernels import replay as replay_kernel
 from slam_backend.smoothing.extending import extended
 from slam_backend.smoothing.graph import PathGraph
 from slam_backend.smoothing.sampling import Draws, draw_paths, drawn_spreads, lane_rows, replay, weigh_odometry
@@ -57,28 +56,6 @@ def test_paths_of_a_run_that_saw_nothing_can_be_chosen_from():
     assert draws.landmarks.shape == (0, 9, 40)
     assert taken.tiles.shape == (0, 2, 9, LANES)
     assert taken.poses.shape == (2, 3, 60)
-
-
-@pytest.mark.parametrize("flatness", [1e3, 1e6, 1e8, 1e10])
-def test_replayed_landmarks_stay_positive_definite(flatness: float):
-    """A landmark seen from two sides under noise that is much greater along the ray keeps a definite covariance."""
-    rng = np.random.default_rng(8)
-    for _ in range(20):
-        centres, infos = np.empty((2, 3)), np.empty((2, 6))
-        for centre, info in zip(centres, infos, strict=True):
-            centre[:] = ray = rng.normal(size=3) * [1.0, 1.0, 0.3]
-            ray /= np.linalg.norm(ray)
-            info[:] = 1e4 * (np.eye(3) - (1.0 - 1.0 / flatness) * np.outer(ray, ray))[np.triu_indices(3)]
-        rows = lane_rows(np.append(rng.normal(size=(1, 2, LANES)), rng.normal(0.0, 0.01, (1, 1, LANES)), axis=1))
-        tiles, weights = np.empty((1, 1, 9, LANES)), np.empty(LANES)
-        numbers = np.zeros(2, np.int64), np.array([0, 2])
-        replay_kernel(
-            rows.reshape(-1), 1, 1, np.zeros((1, 3)), *numbers, centres, infos, np.zeros((2, 3)), tiles.reshape(-1),
-            weights,
-        )  # fmt: skip
-        eigenvalues = np.linalg.eigvalsh(full(tiles[0, 0, 3:].T))
-        assert eigenvalues.min() > 0.3e-4
-        assert np.isfinite(weights).all()
 
 
 def test_where_all_is_linear_the_weights_are_constant():
