@@ -12,6 +12,11 @@ from slam_backend.landmark_map import LandmarkMap
 MOST_PAIRS = 10_000  # candidates by geometry alone
 
 
+def too_many(map_a: LandmarkMap, map_b: LandmarkMap, options: AlignmentOptions) -> bool:
+    """Tell whether two maps have more pairs than are tried without appearance."""
+    return not options.appearance and len(map_a) * len(map_b) > MOST_PAIRS
+
+
 def candidates(map_a: LandmarkMap, map_b: LandmarkMap, options: AlignmentOptions) -> tuple[IntArray, BoolArray]:
     """Return the candidates (k, 2), and which of them stand out (k,): these are one-to-one."""
     if map_a.descriptors.shape[1] != map_b.descriptors.shape[1]:
@@ -21,6 +26,11 @@ def candidates(map_a: LandmarkMap, map_b: LandmarkMap, options: AlignmentOptions
             map_b.descriptors.shape[1],
             "Describe the landmarks of both maps with the same front end.",
         )
+    if too_many(map_a, map_b, options):
+        raise bad_argument(
+            "map_b", f"at most {MOST_PAIRS} pairs of landmarks without appearance", len(map_a) * len(map_b),
+            "Give smaller maps, or tell landmarks apart.",
+        )  # fmt: skip
     if options.appearance:
         clear = mutual_nearest(map_a.descriptors, map_b.descriptors, options.descriptor_gate)
         for one, other, here, there in ((map_a, map_b, 0, 1), (map_b, map_a, 1, 0)):
@@ -31,11 +41,6 @@ def candidates(map_a: LandmarkMap, map_b: LandmarkMap, options: AlignmentOptions
         if options.look_alikes:
             alike = look_alikes(map_a.descriptors, map_b.descriptors, options.descriptor_gate, options.look_alikes)
     else:
-        if len(map_a) * len(map_b) > MOST_PAIRS:
-            raise bad_argument(
-                "map_b", f"at most {MOST_PAIRS} pairs of landmarks without appearance", len(map_a) * len(map_b),
-                "Give smaller maps, or tell landmarks apart.",
-            )  # fmt: skip
         clear, alike = np.empty((0, 2), np.int64), np.argwhere(np.ones((len(map_a), len(map_b)), np.bool_))
     names = np.concatenate([clear, alike]) @ np.array([max(len(map_b), 1), 1])
     unique, first = np.unique(names, return_index=True)

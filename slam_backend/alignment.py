@@ -6,7 +6,7 @@ import numpy as np
 
 from slam_backend import _alignment_kernels as kernels
 from slam_backend import _proposals as proposals
-from slam_backend._candidates import MOST_PAIRS, candidates, match_table
+from slam_backend._candidates import candidates, match_table, too_many
 from slam_backend._evidence import (
     by_chance,
     covariance_of,
@@ -91,7 +91,7 @@ def align_maps(
         ValueError: If the method is unknown, the maps' descriptors differ in size or `rng` is no generator.
     """
     options, rng = _checked(map_a, map_b, method, rng, options)
-    if not options.appearance and len(map_a) * len(map_b) > MOST_PAIRS:
+    if too_many(map_a, map_b, options):
         return Alignment.refused("too many candidates")
     matches, stands_out = candidates(map_a, map_b, options)
     if len(matches) < options.min_inliers:

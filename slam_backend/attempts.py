@@ -6,8 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from slam_backend._candidates import too_many
 from slam_backend.alignment import RIVAL_ANGLE, RIVAL_DISTANCE, Alignment, AlignmentOptions, candidate_matches
-from slam_backend.errors import FloatArray, bad_argument, check_int, known_names
+from slam_backend.errors import MOST, FloatArray, bad_argument, check_int, known_names
 from slam_backend.geometry import wrap_angle
 from slam_backend.landmark_map import LandmarkMap
 
@@ -38,7 +39,7 @@ class AttemptOptions:
 
     def __post_init__(self) -> None:
         for name in ("every", "new_candidates", "longest_wait"):
-            check_int(f"attempts.{name}", getattr(self, name), 1, "Give a number of at least 1.")
+            check_int(f"attempts.{name}", getattr(self, name), 1, "Give a number of at least 1.", MOST)
         if not isinstance(self.enabled, bool):
             raise bad_argument("attempts.enabled", "True or False", self.enabled, "Give a bool.")
 
@@ -112,6 +113,8 @@ class AttemptSchedule:
         for pair, (map_a, map_b) in maps.items():
             if not len(map_a) or not len(map_b):
                 continue  # before its first landmark a map does not know how long descriptors are
+            if too_many(map_a, map_b, self._alignment):
+                continue
             rows = candidate_matches(map_a, map_b, self._alignment)
             if len(rows) < self._alignment.min_inliers:
                 continue

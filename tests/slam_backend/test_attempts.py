@@ -261,3 +261,12 @@ def test_trials_of_two_frames_are_compared() -> None:
         assert known.change(FIRST, turned) == pytest.approx(2.0)
         assert known.change(FIRST, turned) == 0.0
         assert known.change(((1,), (3,)), turned) == np.inf
+
+
+def test_maps_with_too_many_pairs_for_geometry_alone_do_not_try() -> None:
+    """Without appearance, a pair of maps with more than 10,000 pairs of landmarks is passed over; others still try."""
+    plan = AttemptSchedule(AttemptOptions(), AlignmentOptions(min_inliers=4, appearance=False))
+    means = np.column_stack([np.arange(101.0), np.zeros((101, 2))])
+    huge = LandmarkMap(means, np.tile(0.01 * np.eye(3), (101, 1, 1)), np.ones((101, 4)) / 2.0)
+    assert plan.choose({FIRST: (huge, huge)}, 24) is None
+    assert plan.choose({FIRST: (huge, huge), SECOND: pair_of([0, 1, 2, 3])}, 24) == SECOND
