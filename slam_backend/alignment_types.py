@@ -6,7 +6,16 @@ from typing import Literal, Self
 
 import numpy as np
 
-from slam_backend.errors import FloatArray, IntArray, bad_argument, check_array, check_float, check_int, known_names
+from slam_backend.errors import (
+    MOST,
+    FloatArray,
+    IntArray,
+    bad_argument,
+    check_array,
+    check_float,
+    check_int,
+    known_names,
+)
 from slam_backend.read_only import as_read_only
 
 Reason = Literal[
@@ -39,7 +48,6 @@ RIVAL_DISTANCE = 0.5  # [m]; beyond these two an alignment counts as another one
 RIVAL_ANGLE = math.radians(5.0)
 LARGEST = 1e9  # of gates and distances; their squares are far from infinite
 MOST_LOOK_ALIKES = 10_000  # as many pairs as geometry alone may make
-MOST_COUNTED = 1 << 62  # of inliers and samples
 FEWEST_INLIERS = 3  # two matches fit any motion between them: only a third is evidence
 
 
@@ -98,10 +106,8 @@ class AlignmentOptions:
         probability = self.success_probability
         check_float("options.success_probability", probability, "Use e.g. 0.999.", above=0.0, at_most=1.0 - 1e-12)
         check_int("options.look_alikes", self.look_alikes, 0, "Use 0 to demand that all stand out.", MOST_LOOK_ALIKES)
-        check_int(
-            "options.min_inliers", self.min_inliers, FEWEST_INLIERS, "Two fit any motion: demand more.", MOST_COUNTED
-        )
-        check_int("options.max_samples", self.max_samples, 1, "Allow at least one sample.", MOST_COUNTED)
+        check_int("options.min_inliers", self.min_inliers, FEWEST_INLIERS, "Two fit any motion: demand more.", MOST)
+        check_int("options.max_samples", self.max_samples, 1, "Allow at least one sample.", MOST)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

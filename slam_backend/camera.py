@@ -8,6 +8,9 @@ from slam_backend.errors import FloatArray, bad_argument, check_array, check_flo
 
 FARTHEST_POINT = 1e4  # [m]; no camera measures so far; at a million times this, covariances overflow
 FLATTEST = 1e4  # depth over breadth of a stereo point's covariance; flatter ones lose their digits
+LEAST, LARGEST = 1e-12, 1e6  # pixels and metres of a camera; squares of what is made of them keep their digits
+WIDEST = 1 << 20  # px
+FARTHEST_MOUNT = 1e3  # [m]
 # Columns: the camera's X (right), Y (down), Z (ahead) axes in the robot's x (ahead), y (left), z (up).
 ROBOT_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
@@ -39,10 +42,12 @@ class StereoCamera:
 
     def __post_init__(self) -> None:
         for name in ("focal_px", "baseline", "max_range", "sigma_px", "sigma_disparity_px"):
-            check_float(f"camera.{name}", getattr(self, name), "Give a positive number.", above=0.0)
+            value = getattr(self, name)
+            check_float(f"camera.{name}", value, "Give a positive number.", at_least=LEAST, at_most=LARGEST)
         for name in ("width", "height"):
-            check_int(f"camera.{name}", getattr(self, name), 1, "Give a number of pixels.")
-        mount = check_array("camera.mount", self.mount, (3,), "Give (x, y, z) of the left camera on the robot.")
+            check_int(f"camera.{name}", getattr(self, name), 1, "Give a number of pixels.", WIDEST)
+        cure = "Give (x, y, z) of the left camera on the robot."
+        mount = check_array("camera.mount", self.mount, (3,), cure, within=FARTHEST_MOUNT)
         object.__setattr__(self, "mount", tuple(float(m) for m in mount))
 
     @property

@@ -18,6 +18,7 @@ Int32Array = NDArray[np.int32]
 BoolArray = NDArray[np.bool_]
 
 WRITTEN_IN_PYTHON = 1 << 9  # Py_TPFLAGS_HEAPTYPE of a class
+MOST = 10**9  # of steps and the like: kernels hold such numbers, and nobody waits for more
 NUMBERS = "biuf"  # kinds of dtypes that are real numbers
 
 

@@ -17,7 +17,7 @@ from math import exp, floor, log
 from typing import NamedTuple
 
 from slam_backend.camera import StereoCamera
-from slam_backend.errors import bad_argument, check_float, check_int, known_names
+from slam_backend.errors import MOST, bad_argument, check_float, check_int, known_names
 
 
 @known_names
@@ -64,7 +64,7 @@ class ExistenceModel:
         check_float("existence.range_share", self.range_share, "Use 1 for the whole range.", above=0.0, at_most=1.0)
         check_float("existence.nearest", self.nearest, "Use 0 for all points ahead.", at_least=0.0)
         if self.frame_limit is not None:
-            check_int("existence.frame_limit", self.frame_limit, 1, "Use None if the sensor reports all it sees.")
+            check_int("existence.frame_limit", self.frame_limit, 1, "Use None if the sensor reports all it sees.", MOST)
 
     @property
     def log_odds_prior(self) -> float:

@@ -4,9 +4,10 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from slam_backend.camera import StereoCamera
-from slam_backend.errors import bad_argument, check_choice, check_float, check_int, known_names
+from slam_backend.errors import MOST, bad_argument, check_choice, check_float, check_int, known_names
 from slam_backend.existence import ExistenceModel
-from slam_backend.motion import OdometryModel
+from slam_backend.measurements import LARGEST_DESCRIPTOR
+from slam_backend.motion import LARGEST_SIGMA, OdometryModel
 from slam_backend.resampling import RESAMPLING
 from slam_backend.smoothing.options import SmoothingOptions
 
@@ -85,13 +86,18 @@ class FilterOptions:
         check_choice("proposal", self.proposal, PROPOSALS)
         check_choice("resampling", self.resampling, tuple(RESAMPLING))
         check_float("resample_threshold", self.resample_threshold, "Give a share of M.", at_least=0.0, at_most=1.0)
-        for name in ("position_gate", "descriptor_gate", "descriptor_sigma", "new_landmark_density"):
+        for name in ("position_gate", "new_landmark_density"):
             check_float(name, getattr(self, name), "Give a positive number.", above=0.0)
+        for name in ("descriptor_gate", "descriptor_sigma"):
+            value = getattr(self, name)
+            check_float(name, value, "Give a positive number.", at_least=1e-9, at_most=2.0 * LARGEST_DESCRIPTOR)
         check_float("dead_zone", self.dead_zone, "It starts where the gate ends.", at_least=self.position_gate)
-        for name in ("dead_radius", "recovery_position", "recovery_heading"):
-            check_float(name, getattr(self, name), "Use 0 to switch it off.", at_least=0.0)
+        check_float("dead_radius", self.dead_radius, "Use 0 to switch it off.", at_least=0.0)
+        for name in ("recovery_position", "recovery_heading"):
+            check_float(name, getattr(self, name), "Use 0 to switch it off.", at_least=0.0, at_most=LARGEST_SIGMA)
         if self.landmark_noise is not None:
-            check_float("landmark_noise", self.landmark_noise, "Use 0 for landmarks that stand still.", at_least=0.0)
+            cure = "Use 0 for landmarks that stand still."
+            check_float("landmark_noise", self.landmark_noise, cure, at_least=0.0, at_most=LARGEST_SIGMA)
         check_float("ambiguity", self.ambiguity, "Use 0 to hold nothing back.", at_least=0.0)
         existence: object = self.existence
         if not isinstance(existence, ExistenceModel | None):
@@ -100,7 +106,7 @@ class FilterOptions:
         if self.existence is not None:
             self.existence.view(self.camera)  # raises if nothing is left of the view
         if self.rejuvenate_every is not None:
-            check_int("rejuvenate_every", self.rejuvenate_every, 1, "Give a number of steps, or None for never.")
+            check_int("rejuvenate_every", self.rejuvenate_every, 1, "Give a number of steps, or None for never.", MOST)
         if not isinstance(self.smoothing, SmoothingOptions):
             raise bad_argument("smoothing", "SmoothingOptions", self.smoothing, "Build them: SmoothingOptions().")
         if not isinstance(self.one_to_one, bool):

@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
-from slam_backend.errors import bad_argument, check_choice, check_float, check_int, known_names
+from slam_backend.errors import MOST, bad_argument, check_choice, check_float, check_int, known_names
 from slam_backend.filter_options import MOST_PARTICLES
 
 METHODS = ("particles", "mixture")
@@ -57,9 +57,9 @@ class MergeOptions:
         check_float("merging.sure", self.sure, "Use 5, or 0 to merge however uncertain it is.", at_least=0.0)
         cure = "Use 5, or 0 to merge in the end however uncertain it is."
         check_float("merging.least_sure", self.least_sure, cure, at_least=0.0)
-        check_int("merging.watch_steps", self.watch_steps, 0, "Use 0 to make merges final.")
-        check_int("merging.watch_every", self.watch_every, 1, "Weigh the evidence at every step or less often.")
-        check_int("merging.barred_steps", self.barred_steps, 0, "Use 0 to let them try at once.")
+        check_int("merging.watch_steps", self.watch_steps, 0, "Use 0 to make merges final.", MOST)
+        check_int("merging.watch_every", self.watch_every, 1, "Weigh the evidence at every step or less often.", MOST)
+        check_int("merging.barred_steps", self.barred_steps, 0, "Use 0 to let them try at once.", MOST)
         check_float("merging.max_moved", self.max_moved, "Give a share.", at_least=0.0, at_most=1.0)
 
     @property

@@ -9,6 +9,8 @@ from slam_backend._jit import in_place
 from slam_backend.errors import FloatArray, check_float, known_names
 from slam_backend.geometry import compose
 
+LARGEST_SIGMA = 1e3  # [m, rad], or of either per metre or radian; beyond it nothing at all is known
+
 
 @known_names
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -35,7 +37,8 @@ class OdometryModel:
 
     def __post_init__(self) -> None:
         for name in ("sigma_along", "sigma_across", "sigma_heading", "sigma_turn", "floor_position", "floor_heading"):
-            check_float(f"motion.{name}", getattr(self, name), "Give a standard deviation.", at_least=0.0)
+            cure = "Give a standard deviation."
+            check_float(f"motion.{name}", getattr(self, name), cure, at_least=0.0, at_most=LARGEST_SIGMA)
 
     @property
     def is_exact(self) -> bool:

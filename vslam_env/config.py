@@ -14,6 +14,7 @@ from vslam_env import _config_values as nested
 from vslam_env.robot_belief import BeliefConfig
 from vslam_env.sensors import LandmarkSensorConfig, ScanConfig, StereoSensorConfig
 from vslam_env.world import SPLITS, LandmarkConfig, OdometryNoise
+from vslam_env.world.spec import LARGEST_EXTENT
 
 FORMAT = 1  # of TOML files; raised when what a field means changes
 ACTION_TYPES = ("continuous", "discrete", "goal")
@@ -129,9 +130,9 @@ class EnvConfig:
         if self.comm_range is not None:
             check_float("comm_range", self.comm_range, "Give metres, or None for any distance.", at_least=0.0)
         check_float("comm_loss", self.comm_loss, "Give a probability.", at_least=0.0, at_most=1.0)
-        check_float("robot_radius", self.robot_radius, "Give metres.", above=0.0)
+        check_float("robot_radius", self.robot_radius, "Give metres.", above=0.0, at_most=LARGEST_EXTENT)
         check_float("min_start_distance", self.min_start_distance, "Give metres.", at_least=0.0)
-        check_float("map_error_cutoff", self.map_error_cutoff, "Give metres.", above=0.0)
+        check_float("map_error_cutoff", self.map_error_cutoff, "Give metres.", at_least=1e-6, at_most=1e6)
         for name, kind in PARTS.items():
             if not isinstance(getattr(self, name), kind):
                 raise bad_argument(name, f"a {kind.__name__}", getattr(self, name), f"Build one: {kind.__name__}(...).")

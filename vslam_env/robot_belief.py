@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from slam_backend.alignment import AlignmentOptions
 from slam_backend.attempts import AttemptOptions
 from slam_backend.camera import StereoCamera
-from slam_backend.errors import BoolArray, FloatArray, IntArray, check_int
+from slam_backend.errors import MOST, BoolArray, FloatArray, IntArray, check_int
 from slam_backend.filter_options import FilterOptions
 from slam_backend.landmark_map import LandmarkMap, TeamOutlines
 from slam_backend.merge_options import MergeOptions
@@ -58,7 +58,7 @@ class BeliefConfig:
     confirm_after: int = 2
 
     def __post_init__(self) -> None:
-        check_int("belief.confirm_after", self.confirm_after, 1, "Use 1 to count all landmarks.")
+        check_int("belief.confirm_after", self.confirm_after, 1, "Use 1 to count all landmarks.", MOST)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

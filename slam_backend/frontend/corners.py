@@ -11,9 +11,10 @@ import cv2
 import numpy as np
 
 from slam_backend._jit import jit
-from slam_backend.errors import Float32Array, FloatArray, IntArray, check_float, check_int, known_names
+from slam_backend.errors import MOST, Float32Array, FloatArray, IntArray, check_float, check_int, known_names
 from slam_backend.frontend.images import Image, check_image
 
+LARGEST_WINDOW = 1000  # [px]
 SENSITIVITY = 0.04  # k of det - k trace^2
 
 
@@ -43,11 +44,14 @@ class CornerOptions:
     cell: int = 32
 
     def __post_init__(self) -> None:
-        for name in ("most", "block", "spacing", "cell"):
-            check_int(f"corners.{name}", getattr(self, name), 1, "Use at least 1.")
-        check_int("corners.border", self.border, self.spacing, "Leave room for the search around a corner.")
+        for name in ("block", "spacing"):
+            check_int(f"corners.{name}", getattr(self, name), 1, "Use at least 1.", LARGEST_WINDOW)
+        for name in ("most", "cell"):
+            check_int(f"corners.{name}", getattr(self, name), 1, "Use at least 1.", MOST)
+        check_int("corners.border", self.border, self.spacing, "Leave room for the search around a corner.", MOST)
         for name in ("relative", "absolute"):
-            check_float(f"corners.{name}", getattr(self, name), "Give a least response.", above=0.0)
+            value = getattr(self, name)
+            check_float(f"corners.{name}", value, "Give a least response.", at_least=1e-30, at_most=1e30)
 
 
 class Corners(NamedTuple):

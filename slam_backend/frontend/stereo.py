@@ -16,6 +16,7 @@ import numpy as np
 
 from slam_backend.camera import StereoCamera
 from slam_backend.errors import (
+    MOST,
     BoolArray,
     Float32Array,
     FloatArray,
@@ -76,19 +77,21 @@ class FrontEndOptions:
             raise bad_argument(
                 "front_end.corners", "CornerOptions", self.corners, "Build them with CornerOptions(...)."
             )
-        for name in ("scale", "row_tolerance", "row_difference", "back_difference", "nearest"):
+        for name in ("row_tolerance", "row_difference", "back_difference"):
             check_float(f"front_end.{name}", getattr(self, name), "Give a positive number.", above=0.0)
+        check_float("front_end.scale", self.scale, "Give pixels.", at_least=0.1, at_most=100.0)
+        check_float("front_end.nearest", self.nearest, "Filters take no point nearer than 5 cm.", at_least=0.06)
         if self.window is not None:
-            check_float("front_end.window", self.window, "Give metres, or None.", above=0.0)
+            check_float("front_end.window", self.window, "Give metres, or None.", at_least=1e-6, at_most=1e6)
         half = check_int("front_end.patch_half", self.patch_half, 1, "5 is a good one.")
         if 2 * half + 1 > LARGEST_PATCH:
             expected = f"an int <= {LARGEST_PATCH // 2}"
             raise bad_argument("front_end.patch_half", expected, half, "Large patches cover several depths.")
-        check_int("front_end.iterations", self.iterations, 1, "8 are enough.")
+        check_int("front_end.iterations", self.iterations, 1, "8 are enough.", 1000)
         cure = "Give a correlation."
         check_float("front_end.least_correlation", self.least_correlation, cure, at_least=0.0, at_most=1.0)
         if self.max_measurements is not None:
-            check_int("front_end.max_measurements", self.max_measurements, 1, "Use None to keep all.")
+            check_int("front_end.max_measurements", self.max_measurements, 1, "Use None to keep all.", MOST)
 
 
 class StereoMatches(NamedTuple):

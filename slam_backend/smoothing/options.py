@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from slam_backend.errors import check_float, check_int, known_names
+from slam_backend.errors import MOST, check_float, check_int, known_names
 
 
 @known_names
@@ -56,17 +56,17 @@ class SmoothingOptions:
     tolerance: float = 0.1
 
     def __post_init__(self) -> None:
-        check_int("max_keys", self.max_keys, 2, "Two poses are the least that can be smoothed.")
-        check_int("further_keys", self.further_keys, 0, "Use 0 to let all robots share those of one.")
-        check_int("fresh_keys", self.fresh_keys, 1, "The newest pose is always fresh.")
-        check_int("more_draws", self.more_draws, 1, "Use 1 to draw no more than M.")
+        check_int("max_keys", self.max_keys, 2, "Two poses are the least that can be smoothed.", MOST)
+        check_int("further_keys", self.further_keys, 0, "Use 0 to let all robots share those of one.", MOST)
+        check_int("fresh_keys", self.fresh_keys, 1, "The newest pose is always fresh.", MOST)
+        check_int("more_draws", self.more_draws, 1, "Use 1 to draw no more than M.", MOST)
         if self.slice_steps is not None:
-            check_int("slice_steps", self.slice_steps, 1, "Use 90, or None for all at once.")
+            check_int("slice_steps", self.slice_steps, 1, "Use 90, or None for all at once.", MOST)
         check_float("rigid_within", self.rigid_within, "Use 0.01, or 0 for a key at each step.", at_least=0.0)
-        check_int("max_iterations", self.max_iterations, 1, "Ten are enough as a rule.")
+        check_int("max_iterations", self.max_iterations, 1, "Ten are enough as a rule.", MOST)
         check_float("effort", self.effort, "Use 1.5; more is dearer.", above=0.0)
-        check_int("free_sightings", self.free_sightings, 0, "Use 0 to count them all.")
-        check_int("closure_after", self.closure_after, 0, "Use 0 to look for no closures.")
+        check_int("free_sightings", self.free_sightings, 0, "Use 0 to count them all.", MOST)
+        check_int("closure_after", self.closure_after, 0, "Use 0 to look for no closures.", MOST)
         check_float("kernel", self.kernel, "Use 0 for plain squares.", at_least=0.0)
         check_float("noise_scale", self.noise_scale, "Use 1 for the noise as it is.", above=0.0)
         check_float("tolerance", self.tolerance, "Use 0.1.", above=0.0)

@@ -75,10 +75,10 @@ def test_what_the_camera_sees() -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"focal_px": 0.0}, r"camera.focal_px: expected a finite number > 0, got 0.0"),
-        ({"baseline": -0.1}, r"camera.baseline: expected a finite number > 0, got -0.1"),
-        ({"max_range": np.nan}, r"camera.max_range: expected a finite number > 0, got nan"),
-        ({"sigma_px": "a lot"}, r"camera.sigma_px: expected a finite number > 0, got"),
+        ({"focal_px": 0.0}, r"camera.focal_px: expected a finite number .*, got 0.0"),
+        ({"baseline": -0.1}, r"camera.baseline: expected a finite number .*, got -0.1"),
+        ({"max_range": np.nan}, r"camera.max_range: expected a finite number .*, got nan"),
+        ({"sigma_px": "a lot"}, r"camera.sigma_px: expected a finite number .*, got"),
         ({"width": 0}, r"camera.width: expected an int >= 1, got 0"),
         ({"height": 2.5}, r"camera.height: expected an int >= 1, got 2.5"),
         ({"mount": (0.0, 0.0)}, r"camera.mount: expected an array of shape \(3,\), got shape \(2,\)"),

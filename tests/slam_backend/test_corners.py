@@ -65,7 +65,7 @@ def test_the_order_is_that_of_ranks_within_cells() -> None:
     [
         ({"most": 0}, "corners.most: expected an int >= 1, got 0"),
         ({"border": 2}, "corners.border: expected an int >= 4, got 2"),
-        ({"relative": 0.0}, "corners.relative: expected a finite number > 0, got 0.0"),
+        ({"relative": 0.0}, "corners.relative: expected a finite number .*, got 0.0"),
     ],
 )
 def test_impossible_options_are_refused(change: dict[str, Any], message: str) -> None:

@@ -81,5 +81,5 @@ def test_the_same_stream_gives_the_same_draws() -> None:
 @pytest.mark.parametrize("name", ["sigma_along", "sigma_across", "sigma_heading", "sigma_turn", "floor_heading"])
 def test_negative_noise_is_refused(name: str) -> None:
     """A standard deviation is not negative."""
-    with pytest.raises(ValueError, match=rf"motion.{name}: expected a finite number >= 0, got -0.1. Give"):
+    with pytest.raises(ValueError, match=rf"motion.{name}: expected a finite number >= 0 and <= .*, got -0.1. Give"):
         OdometryModel(**{name: -0.1})

@@ -155,7 +155,7 @@ def test_there_is_no_measuring_without_a_calibration() -> None:
         ({"descriptor": "surf"}, "front_end.descriptor: expected one of 'usurf', 'sift', 'orb'"),
         ({"corners": 100}, "front_end.corners: expected CornerOptions"),
         ({"patch_half": 16}, "front_end.patch_half: expected an int <= 15, got 16"),
-        ({"window": 0.0}, "front_end.window: expected a finite number > 0"),
+        ({"window": 0.0}, "front_end.window: expected a finite number >= 1e-06"),
         ({"least_correlation": 1.5}, "front_end.least_correlation: .* <= 1"),
         ({"max_measurements": 0}, "front_end.max_measurements: expected an int >= 1"),
     ],

@@ -126,13 +126,54 @@ def test_a_file_changes_what_it_names(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "camera", [{"sigma_px": 1e-9}, {"sigma_disparity_px": 70.0}, {"baseline": 1e-6}, {"sigma_disparity_px": 1e9}]
+    "camera", [{"sigma_px": 1e-9}, {"sigma_disparity_px": 70.0}, {"baseline": 1e-6}, {"sigma_disparity_px": 1e5}]
 )
 @pytest.mark.parametrize("sensor", ["landmark", "stereo"])
 def test_noise_under_which_filters_can_use_no_point_is_refused(camera: dict[str, float], sensor: str) -> None:
     """A filter whose camera makes covariances too flat for the points of the sensor is refused by name, at once."""
     with pytest.raises(ValueError, match=r"^belief\.filter\.camera: expected noise under which points .* m away"):
         preset_config("standard", sensor).replace(belief={"filter": {"camera": camera}})
+
+
+BEYOND = [
+    ({"robot_radius": 1e300}, "robot_radius"),
+    ({"map_error_cutoff": 1e300}, "map_error_cutoff"),
+    ({"landmarks": {"min_height": -1e12}}, "landmarks.min_height"),
+    ({"landmarks": {"max_height": 1e12}}, "landmarks.max_height"),
+    ({"odometry": {"sigma_distance": 1e300}}, "odometry.sigma_distance"),
+    ({"odometry": {"bias_heading_per_metre": 1.7e308}}, "odometry.bias_heading_per_metre"),
+    ({"landmark_sensor": {"max_measurements": 2**63}}, "sensor.max_measurements"),
+    ({"landmark_sensor": {"false_points": 1e300}}, "sensor.false_points"),
+    ({"scan": {"half_fov": 5e-324}}, "scan.half_fov"),
+    ({"scan": {"max_range": 1e300}}, "scan.max_range"),
+    ({"belief": {"confirm_after": 2**63}}, "belief.confirm_after"),
+    ({"belief": {"filter": {"camera": {"focal_px": 1e-300}}}}, "camera.focal_px"),
+    ({"belief": {"filter": {"camera": {"mount": [1e300, 0.0, 0.0]}}}}, "camera.mount"),
+    ({"belief": {"filter": {"camera": {"sigma_px": 1e300}}}}, "camera.sigma_px"),
+    ({"belief": {"filter": {"motion": {"sigma_along": 1e300}}}}, "motion.sigma_along"),
+    ({"belief": {"filter": {"motion": {"floor_heading": 1e300}}}}, "motion.floor_heading"),
+    ({"belief": {"filter": {"descriptor_gate": 1e300}}}, "descriptor_gate"),
+    ({"belief": {"filter": {"descriptor_sigma": 1e300}}}, "descriptor_sigma"),
+    ({"belief": {"filter": {"landmark_noise": 1e300}}}, "landmark_noise"),
+    ({"belief": {"filter": {"smoothing": {"max_keys": 10**30}}}}, "max_keys"),
+    ({"stereo": {"camera": {"width": 8}}}, "stereo.camera"),
+    ({"stereo": {"camera": {"width": 10**6, "height": 10**6}}}, "stereo.camera"),
+    ({"stereo": {"textures": {"ceiling": 1e300}}}, "textures.ceiling"),
+    ({"stereo": {"textures": {"polygons": 1e300}}}, "textures.polygons"),
+    ({"stereo": {"imaging": {"blur_px": 1e300}}}, "imaging.blur_px"),
+    ({"stereo": {"imaging": {"parts": 2**63}}}, "imaging.parts"),
+    ({"stereo": {"front_end": {"corners": {"block": 2**63}}}}, "corners.block"),
+    ({"stereo": {"front_end": {"nearest": 0.01}}}, "front_end.nearest"),
+    ({"stereo": {"working_distance": 1e-300}}, "stereo.working_distance"),
+    ({"stereo": {"tolerance": 1e300}}, "stereo.tolerance"),
+]
+
+
+@pytest.mark.parametrize(("changes", "name"), BEYOND, ids=[name for _, name in BEYOND])
+def test_numbers_beyond_what_filters_and_sensors_take_are_refused(changes: dict[str, Any], name: str) -> None:
+    """They are refused by name when the configuration is made, not at a reset or in a step."""
+    with pytest.raises(ValueError, match=rf"^{re.escape(name)}: expected .*, got "):
+        EnvConfig().replace(**changes)
 
 
 def test_none_against_a_standard_value_is_written(tmp_path: Path) -> None:

@@ -13,6 +13,8 @@ from vslam_env.world.sight_kernels import detect
 from vslam_env.world.spec import Landmarks
 from vslam_env.world.visibility import marks_of, view_limits, visible_landmarks
 
+MOST_POINTS = 10_000  # of a frame; time ends before
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LandmarkSensorConfig:
@@ -37,12 +39,15 @@ class LandmarkSensorConfig:
     def __post_init__(self) -> None:
         if not isinstance(self.camera, StereoCamera):
             raise bad_argument("sensor.camera", "a StereoCamera", self.camera, "Build one with StereoCamera(...).")
-        check_int("sensor.max_measurements", self.max_measurements, 1, "Report at least one point a frame.")
+        check_int(
+            "sensor.max_measurements", self.max_measurements, 1, "Report at least one point a frame.", MOST_POINTS
+        )
         check_float(
             "sensor.detection_probability", self.detection_probability, "Give a share.", at_least=0.0, at_most=1.0
         )
-        check_float("sensor.false_points", self.false_points, "Give points per frame.", at_least=0.0)
-        check_float("sensor.descriptor_noise", self.descriptor_noise, "Give an L2 length.", at_least=0.0)
+        cure = "Give points per frame."
+        check_float("sensor.false_points", self.false_points, cure, at_least=0.0, at_most=MOST_POINTS)
+        check_float("sensor.descriptor_noise", self.descriptor_noise, "Give an L2 length.", at_least=0.0, at_most=1e6)
         check_float("sensor.max_incidence", self.max_incidence, "Give radians.", above=0.0, at_most=np.pi / 2)
 
     @property

@@ -29,9 +29,9 @@ class ScanConfig:
 
     def __post_init__(self) -> None:
         check_int("scan.num_rays", self.num_rays, 2, "Use at least two rays; 32 are a good start.", MOST_RAYS)
-        check_float("scan.half_fov", self.half_fov, "Give radians.", above=0.0, at_most=np.pi)
-        check_float("scan.max_range", self.max_range, "Give metres.", above=0.0)
-        check_float("scan.sigma", self.sigma, "Give a share of the distance.", at_least=0.0)
+        check_float("scan.half_fov", self.half_fov, "Give radians.", at_least=1e-3, at_most=np.pi)
+        check_float("scan.max_range", self.max_range, "Give metres.", at_least=1e-3, at_most=1e6)
+        check_float("scan.sigma", self.sigma, "Give a share of the distance.", at_least=0.0, at_most=1e6)
 
     @property
     def ray_angles(self) -> FloatArray:

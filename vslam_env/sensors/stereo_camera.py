@@ -36,8 +36,8 @@ class ImagingConfig:
 
     def __post_init__(self) -> None:
         for name in ("noise", "gain_sigma", "eye_gain_sigma", "blur_px"):
-            check_float(f"imaging.{name}", getattr(self, name), "Use 0 for none.", at_least=0.0)
-        check_int("imaging.parts", self.parts, 1, "2 are enough.")
+            check_float(f"imaging.{name}", getattr(self, name), "Use 0 for none.", at_least=0.0, at_most=100.0)
+        check_int("imaging.parts", self.parts, 1, "2 are enough.", 1000)
 
 
 class Traced(NamedTuple):

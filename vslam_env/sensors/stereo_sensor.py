@@ -9,7 +9,7 @@ import numpy as np
 from slam_backend.camera import StereoCamera
 from slam_backend.errors import BoolArray, FloatArray, IntArray, bad_argument, check_float
 from slam_backend.frontend import CornerOptions, FrontEndOptions, StereoFrame, StereoFrontEnd
-from slam_backend.frontend.images import Image
+from slam_backend.frontend.images import LARGEST, SMALLEST, Image
 from slam_backend.measurements import Measurements
 from vslam_env.sensors.stereo_camera import ImagingConfig, StereoEye
 from vslam_env.sensors.stereo_textures import TextureConfig, WallTextures, draw_textures
@@ -18,6 +18,7 @@ from vslam_env.world.freespace import FreeSpace
 from vslam_env.world.spec import Landmarks, World
 from vslam_env.world.visibility import view_limits, visible_landmarks
 
+FINEST = 2e3  # [px/m]; walls are looked at as a whole
 SPURIOUS_PX = 1.0  # a point whose disparity is farther off than this is none of what its ray meets
 
 
@@ -59,8 +60,15 @@ class StereoSensorConfig:
                 cure = f"Build one: {kind.__name__}(...)."
                 raise bad_argument(f"stereo.{name}", f"a {kind.__name__}", getattr(self, name), cure)
         check_float("stereo.max_incidence", self.max_incidence, "Give radians.", above=0.0, at_most=np.pi / 2)
-        for name in ("working_distance", "tolerance"):
-            check_float(f"stereo.{name}", getattr(self, name), "Give metres.", above=0.0)
+        check_float("stereo.working_distance", self.working_distance, "Give metres.", at_least=0.1, at_most=1e3)
+        check_float("stereo.tolerance", self.tolerance, "Give metres.", above=0.0, at_most=1e3)
+        width, height = self.camera.width, self.camera.height
+        if min(width, height) < SMALLEST or width * height > LARGEST:
+            expected = f"images of at least {SMALLEST} rows and columns and at most {LARGEST} pixels"
+            raise bad_argument("stereo.camera", expected, f"a size of {width} x {height}", "Render other images.")
+        if (resolution := self.camera.focal_px / self.working_distance) > FINEST:
+            expected, cure = f"a view of walls in at most {FINEST:g} px/m", "Lower focal_px, or look from farther."
+            raise bad_argument("stereo.working_distance", expected, f"a view in {resolution:g} px/m", cure)
 
     @property
     def farthest(self) -> float:

@@ -12,6 +12,7 @@ from slam_backend.frontend.images import Image
 
 STYLES = ("distinct", "bricks", "posters_alike", "bricks_alike")
 LEVELS = (20.0, 235.0)  # darkest and brightest paint
+HIGHEST = 100.0  # [m]; faces are painted texel by texel
 BRICK = (0.24, 0.12)  # width and height of a brick [m]
 POSTER = 0.6  # side of a poster [m]
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".pgm")
@@ -44,11 +45,12 @@ class TextureConfig:
     def __post_init__(self) -> None:
         check_choice("textures.style", self.style, STYLES)
         check_float("textures.texel", self.texel, "Give metres; 0.01 is a good one.", at_least=0.002, at_most=0.1)
-        check_float("textures.floor", self.floor, "Give metres.")
-        least = self.floor + 0.1
-        check_float("textures.ceiling", self.ceiling, "Give metres, above the floor.", at_least=least)
+        check_float("textures.floor", self.floor, "Give metres.", at_least=-HIGHEST, at_most=HIGHEST)
+        cure = "Give metres, above the floor."
+        check_float("textures.ceiling", self.ceiling, cure, at_least=self.floor + 0.1, at_most=self.floor + HIGHEST)
         for name in ("polygons", "posters"):
-            check_float(f"textures.{name}", getattr(self, name), "Give a number per square metre.", at_least=0.0)
+            cure = "Give a number per square metre."
+            check_float(f"textures.{name}", getattr(self, name), cure, at_least=0.0, at_most=1e4)
         if self.images is not None and not isinstance(self.images, str):
             raise bad_argument("textures.images", "a folder as a string, or None", self.images, "Give a path.")
 

@@ -9,6 +9,7 @@ from slam_backend.errors import FloatArray, bad_argument, check_float, check_int
 from vslam_env.world.freespace import FreeSpace
 from vslam_env.world.spec import Landmarks, World
 
+HIGHEST = 1e3  # [m] above or below the robots; nothing there is in view
 CORNER = 0.05  # [m] landmarks keep this far from the ends of their wall
 LOOK = 0.12  # [m] a face looks into the free space if the point this far in front of it lies there
 
@@ -38,8 +39,10 @@ class LandmarkConfig:
 
     def __post_init__(self) -> None:
         check_float("landmarks.density", self.density, "Give landmarks per metre of wall face.", above=0.0, at_most=1e4)
-        check_float("landmarks.min_height", self.min_height, "Give metres.")
-        check_float("landmarks.max_height", self.max_height, "Give metres, above min_height.", at_least=self.min_height)
+        cure = "Give metres."
+        check_float("landmarks.min_height", self.min_height, cure, at_least=-HIGHEST, at_most=HIGHEST)
+        cure = "Give metres, above min_height."
+        check_float("landmarks.max_height", self.max_height, cure, at_least=self.min_height, at_most=HIGHEST)
         check_float("landmarks.min_spacing", self.min_spacing, "Give metres.", at_least=0.0)
         check_int("landmarks.descriptor_size", self.descriptor_size, 2, "Use 64 for u-SURF.", 10_000)
         cure = "Unrelated unit vectors differ by 1.41."
@@ -109,8 +112,8 @@ def _draw_offsets(length: float, config: LandmarkConfig, rng: np.random.Generato
     if room <= 0.0:
         return np.empty(0)
     count = int(config.density * length + rng.random())
-    if config.min_spacing > 0.0:
-        count = min(count, int(room / config.min_spacing) + 1)
+    if (count - 1) * config.min_spacing > room:
+        count = int(room / config.min_spacing) + 1
     slack = room - (count - 1) * config.min_spacing
     return CORNER + np.sort(rng.uniform(0.0, slack, count)) + config.min_spacing * np.arange(count)
 

@@ -8,6 +8,8 @@ import numpy as np
 from slam_backend._jit import in_place
 from slam_backend.errors import FloatArray, check_float
 
+LARGEST_SIGMA = 100.0  # per metre; filters take no motion of 10 km in a tick
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OdometryNoise:
@@ -27,7 +29,8 @@ class OdometryNoise:
 
     def __post_init__(self) -> None:
         for name in self.__slots__:
-            check_float(f"odometry.{name}", getattr(self, name), "Give a standard deviation.", at_least=0.0)
+            cure = "Give a standard deviation."
+            check_float(f"odometry.{name}", getattr(self, name), cure, at_least=0.0, at_most=LARGEST_SIGMA)
 
 
 def draw_bias(noise: OdometryNoise, num_robots: int, rng: np.random.Generator) -> FloatArray:
