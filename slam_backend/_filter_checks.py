@@ -109,6 +109,7 @@ def check_consistency(name: str, state: Any) -> None:
     """Refuse what are not the running sums of a consistency test."""
     check_keys(name, state, (*SUMS, *LISTS))
     check_whole(f"{name}['frames']", state["frames"])
+    check_whole(f"{name}['begun']", state["begun"], 0, state["frames"])
     check_whole(f"{name}['quiet']", state["quiet"], 0, RENEWED)
     check_whole(f"{name}['matched']", state["matched"])
     check_number(f"{name}['nis']", state["nis"], 0.0)

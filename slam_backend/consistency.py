@@ -50,7 +50,7 @@ SHARE = 0.47  # the sum of 1 / (n ln^2 n) over n = 2, 3, ... is 2.11
 WEIGHTS = tuple(SHARE / len(BETS) / SIGN_OF.count(sign) for sign in SIGN_OF for _ in BETS)
 THRESHOLD = len(SIGNS) / FALSE_ALARMS
 HIGHEST = 1e6 * THRESHOLD  # of the evidence: what is certain need not grow
-SUMS, LISTS = ("frames", "quiet", "nis", "matched"), ("counts", "evidence", "since")
+SUMS, LISTS = ("frames", "begun", "quiet", "nis", "matched"), ("counts", "evidence", "since")
 CURES = {
     "nis": "measurements lie farther from where the filter expects them than it allows for: it is too sure of itself. "
     "Assume more odometry noise, or more measurement noise, or set rejuvenate_every, or use more particles",
@@ -116,10 +116,11 @@ class Consistency:
 class ConsistencyTest:
     """The running sums of one filter."""
 
-    __slots__ = ("_counts", "_evidence", "_frames", "_matched", "_nis", "_quiet", "_since")
+    __slots__ = ("_begun", "_counts", "_evidence", "_frames", "_matched", "_nis", "_quiet", "_since")
 
     def __init__(self) -> None:
         self._frames = 0
+        self._begun = 0  # frames before the evidence began
         self._quiet = 0  # frames without a yes that the evidence does not hold yet
         self._nis, self._matched = 0.0, 0  # sum of the frames' means, and number of frames with matches
         self._counts = [0] * len(SIGN_OF)
@@ -136,7 +137,7 @@ class ConsistencyTest:
             used: Measurements, without those that the caller rejected.
             rejected: How many of these neither matched nor began a landmark.
         """
-        if self._frames % RENEWED == 0:
+        if (self._frames - self._begun) % RENEWED == 0:
             self._renew()
         self._frames += 1
         if nis == nis:  # not NaN
@@ -150,7 +151,7 @@ class ConsistencyTest:
 
     def _renew(self) -> None:
         """Let a filter that fails from here on be found, too."""
-        n = 2 + self._frames // RENEWED
+        n = 2 + (self._frames - self._begun) // RENEWED
         begun = 1.0 / (n * math.log(n) ** 2)
         self._multiply(FACTORS[0], self._quiet)
         self._evidence = [old + begun * weight for old, weight in zip(self._evidence, WEIGHTS, strict=True)]
@@ -192,8 +193,11 @@ class ConsistencyTest:
 
     @classmethod
     def joined(cls, a: Self, b: Self) -> Self:
-        """Return the test of a filter that two were merged to: it begins afresh, and remembers what was warned of."""
+        """Return the test of the joint filter after a merge: shares and warnings of both, and evidence that begins."""
         joint = cls()
+        joint._frames = joint._begun = a._frames + b._frames
+        joint._nis, joint._matched = a._nis + b._nis, a._matched + b._matched
+        joint._counts = [one + other for one, other in zip(a._counts, b._counts, strict=True)]
         for sign, both in enumerate(zip(a._since, b._since, strict=True)):
             joint._since[sign] = min((since for since in both if since >= 0), default=-1)
         return joint

@@ -4,6 +4,7 @@ import math
 from functools import wraps
 from inspect import isbuiltin, signature
 from numbers import Real
+from pathlib import PurePath
 from typing import Any, TypeVar
 
 import numpy as np
@@ -28,7 +29,7 @@ def bad_argument(name: str, expected: str, got: object, cure: str) -> ValueError
     Args:
         name: The argument as the caller wrote it, e.g. `"num_particles"`.
         expected: What is accepted, e.g. `"an int >= 1"`.
-        got: What came; its `repr` is shown, shortened to 80 characters.
+        got: What came; its `repr` is shown, shortened to 80 characters, or a whole path.
         cure: What to do about it, a full sentence.
 
     Returns:
@@ -37,6 +38,8 @@ def bad_argument(name: str, expected: str, got: object, cure: str) -> ValueError
     >>> print(bad_argument("num_particles", "an int >= 1", 0, "Use at least one particle."))
     num_particles: expected an int >= 1, got 0. Use at least one particle.
     """
+    if isinstance(got, PurePath):
+        return ValueError(f"{name}: expected {expected}, got {str(got)!r}. {cure}")
     described = isinstance(got, str) and got.startswith(("shape ", "an array ", "a ", "'", "no ", "NaN"))
     text = str(got) if described else _shown(got)
     if len(text) > 80:

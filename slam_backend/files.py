@@ -126,7 +126,7 @@ def refusing(path: AnyPath, name: str) -> Iterator[None]:
         yield
     except OSError as error:
         cure = f"The system says: {error.strerror or error}."
-        raise bad_argument(name, "a file that can be written", str(path), cure) from error
+        raise bad_argument(name, "a file that can be written", Path(path), cure) from error
 
 
 def _write(path: AnyPath, data: bytes) -> None:

@@ -198,4 +198,4 @@ def _next_free(parent: Path, stem: str) -> Path:
 def _no_folder(folder: Path, error: OSError, cure: str) -> ValueError:
     """Return the error that says why a folder cannot be made or written."""
     text = f"The system says: {error.strerror}. Choose another folder, or {cure}."
-    return bad_argument("out", "a folder that can be written", str(folder), text)
+    return bad_argument("out", "a folder that can be written", Path(folder), text)

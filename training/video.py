@@ -84,7 +84,7 @@ class VideoWriter:
 
     def __init__(self, path: Path, size: tuple[int, int], fps: int = FPS) -> None:
         if path.suffix != ".mp4" or not path.parent.is_dir():
-            raise bad_argument("path", "a file name ending in .mp4 in a folder that exists", str(path), "Change it.")
+            raise bad_argument("path", "a file name ending in .mp4 in a folder that exists", Path(path), "Change it.")
         for name, length in zip(("size[0]", "size[1]"), size, strict=True):
             if check_int(name, length, 2, "Give the picture's size in pixels.") % 2:
                 raise bad_argument(name, "an even number", length, "Add one pixel.")

@@ -63,7 +63,7 @@ def preview(
     from training.worlds_survey import contact_sheet
 
     if out.suffix.lower() != ".png":
-        raise bad_argument("out", "a name that ends in .png", str(out), "Pictures are written as PNG.")
+        raise bad_argument("out", "a name that ends in .png", out, "Pictures are written as PNG.")
     check_writable(out, "out")
     with compilation_shown(Console(stderr=True)):
         picture = contact_sheet(world, first_seed, seeds, robots)
@@ -122,7 +122,7 @@ def import_world(
         traced = load_floorplan(plan, 0.045 if metres_per_pixel is None else metres_per_pixel, tolerance_px)
     FreeSpace(traced)  # what no robot fits in is refused
     if out.suffix.lower() != ".json":
-        raise bad_argument("out", "a name that ends in .json", str(out), "Worlds are known by the ends of their names.")
+        raise bad_argument("out", "a name that ends in .json", out, "Worlds are known by the ends of their names.")
     save_walls_json(traced, out)
     x_min, y_min, x_max, y_max = traced.bounds
     size = f"{x_max - x_min:.1f} x {y_max - y_min:.1f} m"

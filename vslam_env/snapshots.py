@@ -121,7 +121,7 @@ def save_state(state: Mapping[str, Any], path: str | Path) -> None:
     with refusing(path, "path"):
         is_other = path.exists() and not path.is_file()
     if is_other:
-        raise bad_argument("path", "a file that can be written", str(path), "There is something else, no file.")
+        raise bad_argument("path", "a file that can be written", Path(path), "There is something else, no file.")
     write_file(path, MAGIC + f"{state['version']}\n{_fingerprint(body)}\n".encode() + body)
 
 
@@ -135,10 +135,10 @@ def load_state(path: str | Path) -> EnvState:
     try:
         content = read_file(path)
     except OSError as error:
-        raise bad_argument("path", "the file of a state", str(path), f"The system says: {error}.") from error
+        raise bad_argument("path", "the file of a state", Path(path), f"The system says: {error}.") from error
     head, _, body = content.partition(b"\n")
     if not head.startswith(MAGIC):
-        raise bad_argument("path", "the file of a state", str(path), "Write one with save_state.")
+        raise bad_argument("path", "the file of a state", Path(path), "Write one with save_state.")
     _check_version(str(path), head[len(MAGIC) :].decode(errors="replace"))  # before anything of it is read
     mark, _, body = body.partition(b"\n")
     if mark.decode(errors="replace") != _fingerprint(body):
@@ -147,7 +147,7 @@ def load_state(path: str | Path) -> EnvState:
         state = decoded(body, ENV_KINDS)
     except ValueError as error:
         cure = f"Save it again; reading says: {error}."
-        raise bad_argument("path", "the file of a state that can be read here", str(path), cure) from error
+        raise bad_argument("path", "the file of a state that can be read here", Path(path), cure) from error
     return dict(_checked(str(path), state))
 
 

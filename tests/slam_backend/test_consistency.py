@@ -123,10 +123,12 @@ def test_diagnostics_tell_of_each_robot_and_a_merge_remembers_warnings() -> None
     assert [row["warnings"] for row in team.diagnostics] == [float(len(one.warnings)) for one in before]
     assert all(one.warnings for one in before)
     joint = ConsistencyTest.joined(*(group.trunk.filter._consistency for group in team._groups)).report()
-    assert joint.frames == 0
+    assert joint.frames == sum(each.frames for each in before)
+    assert joint.nis_share == pytest.approx(sum(each.nis_share * each.frames for each in before) / joint.frames)
     assert {one.sign for one in joint.warnings} == {one.sign for each in before for one in each.warnings}
     simulation = SimulatedTeam(2, 1)
     merged = merged_team(simulation)
+    frames = merged.consistency(0).frames
     simulation.run(merged, 3)
     assert merged.consistency(0) == merged.consistency(1)
-    assert merged.consistency(0).frames == 3
+    assert merged.consistency(0).frames == frames + 3

@@ -37,7 +37,12 @@ def _files_up_to(size: int) -> Iterator[None]:
     ("options", "size", "file", "kept"),
     [
         (("--no-video",), 1_000, "environment.toml", {"config.toml"}),
-        (("--no-video",), 10_000, "map.png", {"config.toml", "environment.toml", "metrics.json"}),
+        (
+            ("--no-video",),
+            10_000,
+            "map.png",
+            {"config.toml", "environment.toml", "metrics.json", "map_0.csv", "map_0.npz"},
+        ),
         ((), 4_000, "video.mp4", {"config.toml", "environment.toml"}),
     ],
 )

@@ -119,7 +119,7 @@ def _numbers(part: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str,
     """Yield path and value of each number of a configuration, those included that are None unless asked for."""
     for field in dataclasses.fields(part):
         value, here = getattr(part, field.name), (*path, field.name)
-        if field.name in ("num_robots", "max_cycles", "adaptive", "existence", "images", "world_split"):
+        if field.name in ("num_robots", "max_cycles", "existence", "images", "world_split"):
             continue
         if dataclasses.is_dataclass(value):
             yield from _numbers(value, here)

@@ -156,7 +156,7 @@ def load_photographs(folder: str | Path, rows: int) -> list[Image]:
             size = max(1, image.shape[1] * rows // image.shape[0]), rows
             photographs.append(np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8))
     if not photographs:
-        raise bad_argument("textures.images", "a folder with images", str(folder), "Give PNG or JPEG files.")
+        raise bad_argument("textures.images", "a folder with images", Path(folder), "Give PNG or JPEG files.")
     return photographs
 
 

@@ -138,7 +138,7 @@ def read_image(path: Path, flags: int) -> Any:
     """
     image = cv2.imread(str(path), flags)
     if image is None:
-        raise bad_argument("world", "an image that OpenCV can read", str(path), "Save the plan as PNG.")
+        raise bad_argument("world", "an image that OpenCV can read", Path(path), "Save the plan as PNG.")
     return image
 
 
@@ -155,9 +155,9 @@ def existing(path: str | Path) -> Path:
         is_there = path.is_file()
     except OSError as error:  # e.g. a name too long for the system
         cure = f"Check the path: {error.strerror}."
-        raise bad_argument("world", "a file", str(path), cure) from error
+        raise bad_argument("world", "a file", Path(path), cure) from error
     if not is_there:
-        raise bad_argument("world", "a file", str(path), "Check the path: there is no such file.")
+        raise bad_argument("world", "a file", Path(path), "Check the path: there is no such file.")
     return path
 
 

@@ -122,14 +122,14 @@ def _files(world: str | Path) -> list[Path]:
     try:
         is_folder = path.is_dir()
     except OSError as error:  # e.g. a name too long for the system
-        raise bad_argument("world", "a file", str(path), f"Check the path: {error.strerror}.") from error
+        raise bad_argument("world", "a file", Path(path), f"Check the path: {error.strerror}.") from error
     if is_folder and world != "":  # the path of no characters would be the current folder
         files = sorted(p for p in path.iterdir() if p.suffix.lower() in FILE_SUFFIXES)
         maps = {file.stem for file in files if file.suffix.lower() in MAP_SUFFIXES}
         files = [file for file in files if file.stem not in maps or file.suffix.lower() not in IMAGE_SUFFIXES]
         if not files:
             cure = "Put .png, .jpg, .pgm, .yaml or .json files there."
-            raise bad_argument("world", "a folder with floor plans", str(path), cure)
+            raise bad_argument("world", "a folder with floor plans", Path(path), cure)
         return files
     if path.suffix.lower() not in FILE_SUFFIXES:
         names = ", ".join(repr(name) for name in WORLD_FAMILIES)
