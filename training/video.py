@@ -145,4 +145,4 @@ class VideoWriter:
     def _unwritten(self) -> ValueError:
         """Return the error of a video that its encoder could not write."""
         text = "The encoder stopped: make room on the disk, or go without a video."
-        return bad_argument("path", "a file that can be written", str(self._path), text)
+        return bad_argument("path", "a file that can be written", Path(self._path), text)

@@ -191,7 +191,7 @@ class EnvConfig:
         try:
             values = tomllib.loads(Path(path).read_text(encoding="utf-8"))
         except (OSError, TypeError, ValueError) as error:  # of the path, of the encoding and of the syntax
-            raise bad_argument("config", "a readable TOML file", Path(path), f"The reader says: {error}.") from error
+            raise bad_argument("config", "a readable TOML file", str(path), f"The reader says: {error}.") from error
         return cls._of_file(values)
 
     @classmethod
