@@ -78,21 +78,21 @@ def environment() -> dict[str, str]:
 
 def all_digests() -> dict[str, str]:
     """Compute all digests; those of replays are left out where the data are not there."""
-    found = {f"episode: {name}": play(name) for name in EPISODES}
+    found = {f"{name}: {part}": digest for name in EPISODES for part, digest in play(name).items()}
     found["align and fuse"] = align_and_fuse()
     for name, arguments in commands().items():
         found[name] = run_command(arguments)
     return found
 
 
-def play(name: str) -> str:
-    """Play an episode; return a digest of all that is returned, of its events, maps and states."""
-    digest = hashlib.sha256()
+def play(name: str) -> dict[str, str]:
+    """Play an episode; return digests of what the environment returns, of its events and maps, and of its snapshots."""
+    returned, learned, snapshots = hashlib.sha256(), hashlib.sha256(), hashlib.sha256()
     options, changes = EPISODES[name]
     env = vslam_v0.parallel_env(config=vslam_v0.parallel_env(**options).config.replace(**changes))
     observations, infos = env.reset(seed=11)
     rng = np.random.default_rng(5)
-    add_ordered(digest, [observations, infos, env.state()])
+    add_ordered(returned, [observations, infos, env.state()])
     for step in range(STEREO_STEPS if "stereo" in name else STEPS):
         if not env.agents:
             break
@@ -100,19 +100,20 @@ def play(name: str) -> str:
             merge_falsely(env)
         actions = {agent: draw(env, agent, rng, turning=name == FALSE_MERGE) for agent in env.agents}
         observations, rewards, terminations, truncations, infos = env.step(actions)
-        add_ordered(digest, [observations, rewards, terminations, truncations, infos])
+        add_ordered(returned, [observations, rewards, terminations, truncations, infos])
         if step % 50 == 49:
             state = env.get_state()
-            add_unordered(digest, state)
+            add_unordered(snapshots, state)
             env.set_state(state)
-    add_ordered(digest, env.state())
+    add_ordered(returned, env.state())
     for event in env.events:
-        add_unordered(digest, [event.step, event.robots_a, event.robots_b, numbers_of(event.alignment)])
+        add_unordered(learned, [event.step, event.robots_a, event.robots_b, numbers_of(event.alignment)])
     for agent in env.possible_agents:
         found = env.belief(agent).map
-        add_ordered(digest, [found.means, found.covariances, found.descriptors, found.ids])
+        add_ordered(learned, [found.means, found.covariances, found.descriptors, found.ids])
     env.close()
-    return digest.hexdigest()[:24]
+    parts = {"returned": returned, "events and maps": learned, "snapshots": snapshots}
+    return {part: digest.hexdigest()[:24] for part, digest in parts.items()}
 
 
 def draw(env: Any, agent: str, rng: np.random.Generator, turning: bool) -> Any:
