@@ -47,7 +47,7 @@ class BarrierLog:
         truth: (T, 3) float64 [m, m, rad].
         odometry: (T, 3) float64 [m, m, rad].
         frames: T entries, None where nothing was seen.
-        identities: Of the landmarks seen, likewise.
+        identities: Names of the landmarks seen, one row each.
     """
 
     landmarks: FloatArray
@@ -128,9 +128,9 @@ def simulate(
     """Return the logs of some robots in one hall.
 
     Args:
-        seed: Of the hall and all noise.
+        seed: Seed of the hall and all noise.
         robots: How many.
-        duration: Of the logs [s].
+        duration: Length of the logs [s].
         odometry_scale: Factor on the noise of the odometry that filters assume [-].
         num_walls: How many.
         view: Half the field of view [rad].

@@ -42,7 +42,7 @@ class MergeFate:
         end_m, end_deg: The same at the end; NaN if undone.
         moved: Largest share of a side's landmarks that was seen out of place while the merge was watched; beyond
             `MergeOptions.max_moved` it is undone. NaN if it was not watched.
-        doubt: Of the attempt that led to it, see `MergeEvent`; NaN if it was forced.
+        doubt: Doubt of the attempt that led to it, see `MergeEvent`; NaN if it was forced.
         undone_m, undone_deg: How far off the merge was, as the team had it, just before it was undone; NaN if it was
             not.
     """
@@ -109,7 +109,7 @@ class RunEnd:
     """How a run ended.
 
     Attributes:
-        seed: Of it.
+        seed: Its seed.
         world: Family of worlds, or floor plan.
         groups: The robots that share a map at the end.
         last_merge: The step of the last merge that is in force; None without one.

@@ -65,8 +65,8 @@ def check_filter(name: str, state: Any, known: Sequence[FilterOptions] = ()) -> 
     """Refuse what is no state from which `FastSlam` can go on.
 
     Args:
-        name: Of the part.
-        state: What came.
+        name: Name of the part.
+        state: The value to check.
         known: Options that were checked before.
 
     Raises:

@@ -156,7 +156,7 @@ def contradictions(a: Landmarks, b: Landmarks, motion: FloatArray, extra: float)
     It is the Birge ratio of each: the median over the particles that hold it on both sides of chi^2 / 3, at least 1.
 
     Args:
-        a: Of one filter, in M particles.
+        a: Values of one filter, in M particles.
         b: The same landmarks of the other.
         motion: (M, 3) by which each particle moves those of b.
         extra: Added to all variances of either side before [m^2].

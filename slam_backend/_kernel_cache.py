@@ -20,7 +20,7 @@ class KernelCache(FunctionCache):
 
     Args:
         cache: The cache that numba made; it has not read its files yet.
-        stamp: What the kernel is compiled from; entries of another stamp are stale.
+        stamp: Digest of what the kernel is compiled from; entries of another stamp are stale.
     """
 
     def __init__(self, cache: FunctionCache, stamp: Any) -> None:

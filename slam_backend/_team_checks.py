@@ -63,11 +63,11 @@ class TeamCheck:
     Args:
         num_robots: K.
         kept: Readings by step that the team holds already: the same ones are not looked at again.
-        known: Options of its filters, likewise.
+        known: Options of its filters that were checked before.
 
     Attributes:
         descriptor_sizes: Lengths of the descriptors in it.
-        options: Of all its filters.
+        options: Options of all its filters.
     """
 
     def __init__(self, num_robots: int, kept: Mapping[int, StepInput], known: Sequence[FilterOptions] = ()) -> None:

@@ -70,7 +70,7 @@ def take_turns(
         told: (2, n) int64, written: what becomes of their measurements, see `Findings`.
 
     Returns:
-        What all of it came to; slots of landmarks that turned out not to exist, to be released when nobody asks for
+        What all of it came to; slots of landmarks that turned out not to exist, to be released when nothing asks for
         their ids; and the number of measurements that were used.
     """
     maps, journal = slam._maps, slam._journal

@@ -24,7 +24,7 @@ def read_arrays(path: Path, names: Iterable[str] | None = None) -> dict[str, NDA
     """Return arrays of an archive by name.
 
     Args:
-        path: Of a file that `numpy.savez` or `numpy.savez_compressed` wrote.
+        path: File that `numpy.savez` or `numpy.savez_compressed` wrote.
         names: Which; None: all. Those that are not there are left out.
 
     Raises:

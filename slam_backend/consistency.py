@@ -91,7 +91,7 @@ class Consistency:
         nis_share: Share of the frames beyond the 95 % bound [-].
         ess_share: Share of the frames with an effective sample size below a tenth of the particles [-].
         rejected_share: Share of the frames of which most measurements were rejected [-].
-        warnings: One for each sign of which there is enough evidence, in the order of `SIGNS`.
+        warnings: One for each sign with enough evidence, in the order of `SIGNS`.
     """
 
     frames: int

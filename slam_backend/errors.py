@@ -19,7 +19,7 @@ Int32Array = NDArray[np.int32]
 BoolArray = NDArray[np.bool_]
 
 WRITTEN_IN_PYTHON = 1 << 9  # Py_TPFLAGS_HEAPTYPE of a class
-MOST = 10**9  # of steps and the like: kernels hold such numbers, and nobody waits for more
+MOST = 10**9  # of steps and the like: kernels hold such numbers, and no run takes more
 NUMBERS = "biuf"  # kinds of dtypes that are real numbers
 
 
@@ -60,9 +60,9 @@ def check_kind(name: str, value: Any, kind: type[T], cure: str = "") -> T:
 
     Args:
         name: The argument as the caller wrote it.
-        value: What came.
+        value: The value to check.
         kind: The class.
-        cure: What to do about another, a full sentence; empty: to build one.
+        cure: Advice for another, a full sentence; empty: to build one.
 
     Raises:
         ValueError: As `bad_argument` words it.

@@ -47,7 +47,7 @@ class MergePlan(NamedTuple):
         maps: Of their joint filters as they are, with mixture covariances.
         alignment: Motion from b's map frame to a's; `inliers` are rows of the maps.
         pairing: Of the joint filters' particles, if that is drawn already.
-        joint: What `merge_filters` made of it, if that is done already.
+        joint: Filter that `merge_filters` made of it, if that is done already.
     """
 
     groups: tuple[Group, Group]

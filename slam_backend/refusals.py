@@ -63,7 +63,7 @@ def refusals_of(events: Iterable[MergeEvent], robot: int) -> dict[str, float]:
 
 
 def _of_pair(events: list[MergeEvent]) -> PairAttempts:
-    """Return the attempts of one pair, of which there is at least one."""
+    """Return the attempts of one pair, at least one."""
     refused = [event for event in events if not event.alignment.success]
     counts = Counter(event.alignment.reason for event in refused)
     last = refused[-1] if refused else None

@@ -116,8 +116,8 @@ class MergeEvent:
         alignment: `map` of group a from `map` of group b, as found; refused attempts carry the reason.
         bent: Of an attempt: the alignment of the maps as the filters had bent them, where these were straightened then
             and `alignment` is that of the straight ones; else None.
-        doubt: Of an attempt whose maps align: how uncertain the motion between them is, as the particles of the merge
-            have it, over what a merge has to be sure of; beyond 1 it may wait. NaN if that was not asked.
+        doubt: For an attempt whose maps align, the uncertainty of the motion between them over the particles of the
+            merge, relative to what a merge has to be sure of; beyond 1 it may wait. NaN if that was not asked.
     """
 
     step: int

@@ -147,12 +147,12 @@ def check_floats(
     """Refuse what is no array of floats of a shape, all within bounds; NaN is not.
 
     Args:
-        name: Of the part.
-        value: What came.
+        name: Name of the part.
+        value: The value to check.
         shape: None for a free axis.
         low, high: The bounds.
         columns: Only so many entries of the last axis mean something; None: all.
-        dtype: Of the array.
+        dtype: Type of the array.
     """
     check_kept(name, value, dtype, shape)
     if value.size:
@@ -188,8 +188,8 @@ def check_options(name: str, options: Any, kind: type, known: Iterable[Any] = ()
     """Refuse what are no options of a type, or such that its constructor refuses.
 
     Args:
-        name: Of the part.
-        options: What came.
+        name: Name of the part.
+        options: The value to check.
         kind: A frozen dataclass.
         known: Options that need not be looked at again.
     """

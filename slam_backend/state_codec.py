@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 ALIGNMENT = 64  # bytes; where arrays begin
 MOST_BYTES = 1 << 30  # of a file: a state has some megabytes
 MOST_TABLE = 1 << 26  # bytes of a table: Python takes up to twenty times as many to hold it
-LARGEST_INT = 1 << 63  # ints from here on are written as hexadecimal digits, of which there may be any number
+LARGEST_INT = 1 << 63  # ints from here on are written as hexadecimal digits, as many as it takes
 DTYPES = {
     np.dtype(kind).newbyteorder("<").str: np.dtype(kind)
     for kind in ("?", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f2", "f4", "f8")
@@ -213,7 +213,7 @@ class _Reader:
     """Builds the parts of a tree, row by row.
 
     Args:
-        body: What `encoded` returned, or what somebody made of it.
+        body: Bytes that `encoded` returned, or what somebody made of it.
         kinds: Which objects may stand in it.
     """
 

@@ -51,4 +51,4 @@ BACKEND_KINDS = Kinds(
     # A mixture's covariances are symmetric but for rounding: the constructor would change them.
     {LandmarkMap: Kind("LandmarkMap", _parts_of_map, LandmarkMap._trusted)},
 ).with_others(SEEDS)
-"""All classes of this package of which there may be objects in the states of `FastSlam` and `TeamSlam`."""
+"""All classes of this package whose objects may stand in the states of `FastSlam` and `TeamSlam`."""

@@ -26,7 +26,7 @@ def pair_rows(
     `apart` says whether the two share no map at the end; `last_step` counts the steps of the filters.
 
     Args:
-        pairs: What came of the attempts; None: robots that stay alone have no rows.
+        pairs: Outcome of the attempts; None: robots that stay alone have no rows.
         groups: Robots that share a map at the end.
         names: Number of each robot; None: its index.
     """

@@ -12,7 +12,7 @@ Estimator = Annotated[str | None, typer.Option(help="fastslam2 or fastslam1.", s
 Duration = Annotated[float | None, typer.Option(help="Seconds to replay.", show_default="all")]
 RejuvenateEvery = Annotated[
     int | None,
-    typer.Option(help="Steps after which particles are drawn anew from smoothed paths; 0: never.", show_default="100"),
+    typer.Option(help="Steps after which particles are redrawn from smoothed paths; 0: never.", show_default="100"),
 ]
 EnvRejuvenateEvery = Annotated[
     int | None, typer.Option(help="Ticks after which particles are drawn anew; 0: never.", show_default="100")

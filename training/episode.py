@@ -69,7 +69,7 @@ class EpisodeRecord:
         coverage: (T + 1,) float64 [-].
         merges: In order.
         attempts: How often two maps were compared.
-        pairs: What came of these attempts, by pairs of groups.
+        pairs: Outcome of these attempts, by pairs of groups.
         groups: The robots that share a map at the end.
         infos: Per robot its last info.
         own_maps: Per robot its map just before its first merge, own start frame; the last map if it never merged.

@@ -121,12 +121,12 @@ class Training:
         """Go on from what `kept_of` read.
 
         Raises:
-            ValueError: If a part of it is none that `save` wrote; train anew, or read another.
+            ValueError: If a part of it is none that `save` wrote; train again, or read another.
         """
         try:
             self._go_on_from(kept)
         except Exception as error:  # whatever torch says of parts that are none of this model's
-            cure = f"Copy the checkpoint again, or train anew. It says: {error}."
+            cure = f"Copy the checkpoint again, or train again. It says: {error}."
             raise bad_argument("resume", "the parts that a training saved", "'others'", cure) from error
 
     def _go_on_from(self, kept: Mapping[str, Any]) -> None:

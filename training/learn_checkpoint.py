@@ -63,7 +63,7 @@ def read_checkpoint(file: Path) -> dict[str, Any]:
     except (ValueError, KeyError, TypeError) as error:
         raise bad_argument("resume", expected, "a broken file", f"{str(file)!r} is none: train anew.") from error
     if version != FORMAT:
-        raise bad_argument("resume", f"one of format {FORMAT}", f"a checkpoint of format {version}", "Train anew.")
+        raise bad_argument("resume", f"one of format {FORMAT}", f"a checkpoint of format {version}", "Train again.")
     if len(packed) != size or hashlib.sha256(packed).hexdigest() != digest:
         cure = f"{str(file)!r} was cut off or changed: copy it again, or train anew."
         raise bad_argument("resume", f"{expected}, {size} bytes", f"a broken file of {len(packed)}", cure)
@@ -76,7 +76,7 @@ def read_checkpoint(file: Path) -> dict[str, Any]:
         if not isinstance(content, dict) or not all(isinstance(name, str) for name in content):
             raise ValueError("it holds no parts by name")
     except ValueError as error:
-        cure = f"{str(file)!r} was made by something else: train anew. Reading says: {error}."
+        cure = f"{str(file)!r} was made by something else: train again. Reading says: {error}."
         raise bad_argument("resume", expected, "a broken file", cure) from error
     return content
 

@@ -54,8 +54,8 @@ class ImagesConfig(PlainConfig):
     Attributes:
         path: Folder of the drive.
         left: Images of the left eye, as `StereoFiles` has it; None: the folder is laid out as KITTI's.
-        right: Images of the right eye, likewise.
-        calibration: Of the rig, likewise.
+        right: Images of the right eye, as `left`.
+        calibration: Calibration of the rig, as above.
         times: File of the seconds of the frames, or None for that of the folder.
         truth: File of the true poses, or None for that of the folder.
         duration: Seconds to replay [s], or None for all.

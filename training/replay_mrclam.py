@@ -147,7 +147,7 @@ class Replay:
         groups: Robots, counted from 0, that share a map at the end.
         merges: In order.
         attempts: How often two maps were compared.
-        pairs: What came of these attempts, by pairs of groups; None: each robot stays by itself.
+        pairs: Outcome of these attempts, by pairs of groups; None: each robot stays by itself.
         rejuvenations: What came of drawing particles anew, all filters together, see `RejuvenationCount.to_mapping`.
         consistency: Per robot whether its filter at the end errs as little as it claims.
         seconds: What the filters took to live through the log [s].

@@ -36,7 +36,7 @@ class PairsConfig(PlainConfig):
         path: Folder of the images.
         left: Images of the left eye, as `StereoFiles` has it; so are the next three.
         right: Images of the right eye.
-        calibration: Of the rig.
+        calibration: Calibration of the rig.
         truth: File of the two true poses; None: `poses_dev.txt`, if it is there.
         seed: Of RANSAC's samples.
         descriptor: "usurf", "sift" or "orb".

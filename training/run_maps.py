@@ -26,7 +26,7 @@ def write_maps(folder: "RunFolder", maps: "Mapping[str, LandmarkMap]") -> str:
     """Write each map as `map_<group>.npz` and `map_<group>.csv`, and return a line that says so.
 
     Args:
-        folder: Of the run.
+        folder: Folder of the run.
         maps: By the name of the group, each in the start frame of the group's first robot.
     """
     for name, landmarks in maps.items():

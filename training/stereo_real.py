@@ -50,7 +50,7 @@ class RealPart:
 
     Attributes:
         key: Under which the bench keeps it.
-        name: Of the part, for people.
+        name: Name of the part, for people.
         measure: Returns rows, or one row.
     """
 
@@ -92,8 +92,8 @@ def measure_parts(
     """Measure parts one after the other, and add each to a result; one that fails is noted, and the others go on.
 
     Args:
-        parts: Of `find_parts`.
-        result: Of the bench; changed. `failed` holds what was wrong, by the names of the parts.
+        parts: Parts that `find_parts` returned.
+        result: Result of the bench; changed. `failed` holds what was wrong, by the names of the parts.
         on_part: Called with the name of each part.
         interrupted: Asked before each part.
     """
@@ -285,7 +285,7 @@ def planar_scores(folder: Path) -> list[dict[str, Any]]:
     """Return matching scores on planar pairs with known homographies.
 
     Args:
-        folder: Of pairs `NAMEA`, `NAMEB` with `NAME_model.txt`.
+        folder: Folder with pairs `NAMEA`, `NAMEB` with `NAME_model.txt`.
     """
     return [row for model in sorted(folder.glob(f"*{MODEL}")) for row in planar_rows(model)]
 

@@ -62,7 +62,7 @@ class EpisodeCheck:
     """Checks the parts of the state of one episode.
 
     Args:
-        config: Of the environment.
+        config: Configuration of the environment.
         own: Its running episode: what it shares with the state is not looked at again. None: it has none.
     """
 

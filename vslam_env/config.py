@@ -210,7 +210,7 @@ class EnvConfig:
         """Build a configuration from what a TOML file says, or raise if it is of another format."""
         found = values.pop("format", FORMAT)
         if type(found) is not int or found != FORMAT:
-            cure = "Use the release that wrote it, or set the values anew."
+            cure = "Use the release that wrote it, or set the values again."
             raise bad_argument("config", f"one of format {FORMAT}", f"a configuration of format {found!r}", cure)
         return cls.from_dict(nested.with_none(values))
 

@@ -49,9 +49,9 @@ def check_state(state: Any, config: EnvConfig, objects: Mapping[str, str]) -> Ma
     """Return a state if an environment of `config` can go on from it.
 
     Args:
-        state: What came.
-        config: Of the environment.
-        objects: What of it are objects of the caller's.
+        state: The value to check.
+        config: Configuration of the environment.
+        objects: Names of its parts that are objects of the caller's.
 
     Raises:
         ValueError: If it is no state, one of another version, or one of another configuration.
@@ -78,7 +78,7 @@ def check_parts(state: Mapping[str, Any], config: EnvConfig, own: Episode | None
 
     Args:
         state: Nothing of it is taken over yet.
-        config: Of the environment.
+        config: Configuration of the environment.
         own: The environment's running episode; None: there is none.
 
     Raises:

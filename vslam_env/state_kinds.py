@@ -87,4 +87,4 @@ def _setting_of(
 ENV_KINDS = Kinds((*CONFIGURATIONS, *RECORDS), {Setting: Kind("Setting", _parts_of_setting, _setting_of)}).with_others(
     BACKEND_KINDS
 )
-"""All classes of which there may be objects in the state of an environment."""
+"""All classes whose objects may stand in the state of an environment."""

@@ -27,7 +27,7 @@ def inverted(
 def cofactors_cancel(a: float, b: float, c: float, d: float, e: float, f: float, least: float) -> bool:
     """Tell whether the determinant by cofactors is less than this share of the product of the diagonal.
 
-    The matrix is as of `inverted`, and positive definite. It is then so flat, and so turned, that its digits are lost.
+    The matrix is that of `inverted`, positive definite, and so flat and so turned that its digits are lost.
     """
     det = a * (d * f - e * e) + b * (c * e - b * f) + c * (b * e - c * d)
     return det < least * a * d * f

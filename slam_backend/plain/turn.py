@@ -45,7 +45,7 @@ def is_held(b: int, possible: Sequence[tuple[float, int]], chosen: Sequence[int]
     Args:
         b: The measurement.
         possible: The landmarks of the particle that have its name.
-        chosen: What became of the measurements before it.
+        chosen: Outcome of the measurements before it.
         names: The caller's names of all measurements of the frame.
     """
     return bool(possible) or any(chosen[a] == NEW - a and names[a] == names[b] for a in range(b))

@@ -140,8 +140,8 @@ class Rectified:
 
     Args:
         pair: Its calibration.
-        width: Of the images [px].
-        height: Of the images [px].
+        width: Width of the images [px].
+        height: Height of the images [px].
 
     Attributes:
         pair: The calibration.

@@ -83,7 +83,7 @@ def load_stereo_images(folder: str | Path, files: StereoFiles, duration: float |
     """Read a drive of stereo images, raw or rectified.
 
     Args:
-        folder: Of the drive.
+        folder: Folder of the drive.
         files: Names within it. `truth` has rows of a 3 x 4 matrix, as KITTI's poses.
         duration: Keep this many seconds [s]. None: all.
 

@@ -44,7 +44,7 @@ def sorted_note(words: list[str]) -> tuple[str, ...]:
     """Return one line about all files that were sorted; no line if there are none.
 
     Args:
-        words: What `time_order` said of each file.
+        words: Remarks that `time_order` said of each file.
     """
     told = [word for word in words if word]
     return (f"Sorted by time: {', '.join(told)}.",) if told else ()

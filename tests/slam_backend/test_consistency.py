@@ -73,7 +73,7 @@ def test_false_alarms_on_a_matched_model() -> None:
     "changes", [{"assumed": 1 / 3, "rejuvenate_every": None}, {"bias": np.array([0.0, 0.0, 0.015])}]
 )
 def test_mismatched_odometry_is_found(changes: dict[str, Any]) -> None:
-    """Odometry three times as bad as assumed, or with a biased turn, is told of in 250 steps, with what to try."""
+    """Odometry three times as bad as assumed, or with a biased turn, is reported within 250 steps, with what to try."""
     told = [life(seed, **changes).consistency for seed in range(3)]
     assert all("nis" in [warning.sign for warning in one.warnings] for one in told)
     assert "Assume more odometry noise" in told[0].warnings[0].text

@@ -54,7 +54,7 @@ def test_what_is_wrong_is_named_with_line_and_column(text: str, message: str, tm
 
 
 def test_files_that_are_no_text_are_refused(tmp_path: Path) -> None:
-    """A missing file and one that is not UTF-8 are told apart; so is a delimiter that is none."""
+    """A missing file and one that is not UTF-8 are distinguished; so is a delimiter that is none."""
     with pytest.raises(ValueError, match=r"path: expected a CSV file, got no such file\. Check '.*none\.csv'"):
         read_csv(tmp_path / "none.csv", ("time",))
     (tmp_path / "log.csv").write_bytes(b"time\n\xff\xfe\n")

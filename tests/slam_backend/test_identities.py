@@ -67,7 +67,7 @@ def check_unique(slam: FastSlam) -> None:
 
 
 def build(num_robots: int, seed: int, **options: object) -> TeamSlam:
-    """Return a team that merges only where it is told to."""
+    """Return a team that merges only where it is asked to."""
     motion = OdometryModel(floor_position=0.02, floor_heading=0.02)
     return TeamSlam(num_robots, attempts=NEVER, seed=seed, num_particles=7, motion=motion, **options)
 

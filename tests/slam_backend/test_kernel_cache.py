@@ -1,4 +1,4 @@
-"""A damaged cache of kernels is no fault: what cannot be used is compiled again and kept anew."""
+"""A damaged cache of kernels is no fault: what cannot be used is compiled and kept again."""
 
 import importlib.util
 import os

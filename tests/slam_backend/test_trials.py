@@ -77,7 +77,7 @@ def test_a_refused_trial_leaves_no_trace() -> None:
 
 
 def test_a_pair_merges_by_the_motion_of_its_trial_when_two_agree() -> None:
-    """The first trial waits; a later one is taken as it is: where the joint filter lets b start is what is told."""
+    """The first trial waits; a later one is taken as it is: where the joint filter lets b start is what is reported."""
     simulation = SimulatedTeam(num_robots=2, seed=112)
     merging = MergeOptions(sure=NEVER_SURE, least_sure=1.0)
     team = simulation.build(attempts=AttemptOptions(every=20), num_particles=8, merging=merging)

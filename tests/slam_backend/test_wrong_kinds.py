@@ -106,7 +106,7 @@ def test_wrong_kinds_are_named(call: str, wrong: Any, tmp_path: Path, monkeypatc
 
 
 def test_built_in_callables_are_known() -> None:
-    """What Python or an extension brings is told from what is written in Python."""
+    """What Python or an extension brings is distinguished from what is written in Python."""
 
     class Mine:
         """A class."""

@@ -101,7 +101,7 @@ def test_finished_trials_stay(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT])
 def test_what_a_library_cannot_write_is_one_line(number: int, refusal: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """An error of the system about room, from wherever it comes, is told; any other keeps its traceback."""
+    """An error of the system about room, from wherever it comes, is reported; any other keeps its traceback."""
 
     def app(raised: OSError) -> Callable[[str], None]:
         def fail(prog_name: str) -> None:

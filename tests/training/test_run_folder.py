@@ -136,7 +136,7 @@ def test_a_folder_of_another_format_is_refused(tmp_path: Path) -> None:
 
 
 def test_kept_trials_that_are_none_are_refused(tmp_path: Path) -> None:
-    """A line that is cut off is dropped; one that is no trial is told, and the file stays as it is."""
+    """A line that is cut off is dropped; one that is no trial is reported, and the file stays as it is."""
     folder = RunFolder.create(tmp_path / "run", "run", {}, 1)
     file = folder.path / "trials.jsonl"
     file.write_text('{"seed": 1, "figure": 2}\n{"seed": 2, "fig')

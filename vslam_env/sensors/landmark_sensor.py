@@ -102,7 +102,7 @@ class LandmarkSensor:
 
     Attributes:
         config: As given.
-        robot_radius: Likewise.
+        robot_radius: Radius of the robots [m].
     """
 
     def __init__(

@@ -167,7 +167,7 @@ class StereoSensor:
         corners: TextureCorners,
         robot_radius: float,
     ) -> "StereoSensor":
-        """Return the sensor of a world whose textures and corners are known; arguments as of `StereoSensor`."""
+        """Return the sensor of a world whose textures and corners are known; arguments of `StereoSensor`."""
         self = cls.__new__(cls)
         self._settle(config, walls, textures, corners, robot_radius)
         return self

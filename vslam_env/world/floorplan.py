@@ -99,7 +99,7 @@ def load_walls_json(path: str | Path) -> World:
         got = sorted(content) if isinstance(content, dict) else content
         raise bad_argument("world", f"an object with the key 'walls' in {path}", got, cure)
     if (found := content.get("format", FORMAT)) != FORMAT or type(found) is not int:
-        cure = "Use the release that wrote it, or write the walls anew."
+        cure = "Use the release that wrote it, or write the walls again."
         raise bad_argument("world", f"one of format {FORMAT} in {path}", f"a world of format {found!r}", cure)
     unknown = sorted(set(content) - {"format", "walls", "start_poses", "name"})
     if unknown:
