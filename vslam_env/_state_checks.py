@@ -18,7 +18,6 @@ from slam_backend.state_checks import (
     FLOAT32,
     FLOAT64,
     INT8,
-    INT32,
     MOST,
     UINT8,
     check_each,
@@ -64,11 +63,16 @@ class EpisodeCheck:
     Args:
         config: Configuration of the environment.
         own: Its running episode: what it shares with the state is not looked at again. None: it has none.
+
+    Attributes:
+        setting: After `check`, the setting to go on in. One that comes from elsewhere is built again from its parts, so
+            that nothing within its sensors has to be believed.
     """
 
     def __init__(self, config: EnvConfig, own: Episode | None) -> None:
         self._config, self._own, self._count = config, own, config.num_robots
         self._tick = 0
+        self.setting: Setting | None = None if own is None else own.setting
 
     def check(self, name: str, state: Any) -> None:
         """Refuse what is no state of an episode.
@@ -79,8 +83,14 @@ class EpisodeCheck:
         own, count = self._own, self._count
         check_keys(name, state, EPISODE)
         setting = state["setting"]
-        if own is None or setting is not own.setting:
+        if own is not None and setting is own.given_setting:
+            setting = own.setting
+        elif own is None or setting is not own.setting:
             self._check_setting(f"{name}['setting']", setting)
+            try:
+                self.setting = setting = Setting.of_parts(*setting.parts())
+            except Exception as error:  # whatever constructors say of parts that do not fit together
+                refuse(f"{name}['setting']", "parts that fit together", f"'{error}'")
         check_whole(f"{name}['tick']", state["tick"])
         self._tick = tick = state["tick"]
         check_keys(f"{name}['simulator']", state["simulator"], ("poses", "bumped"))
@@ -156,14 +166,6 @@ class EpisodeCheck:
             refuse(f"{name}.scan", "one of the environment's configuration", "another")
         check_kind(f"{name}.coverage", coverage, CoverageMeter)
         check_floats(f"{name}.coverage.cells", coverage.cells, (None, 2), -1e9, 1e9)
-        bounds = coverage.bounds
-        check_indices(f"{name}.coverage.bounds", bounds, (count + 1,), 0, MOST)
-        check_kept(f"{name}.coverage.laid", coverage.laid, INT32, (2, int(bounds[-1])))
-        if bounds[0] != 0 or (np.diff(bounds) < 0).any():
-            refuse(f"{name}.coverage.bounds", "parts in order", "others")
-        if coverage.laid.size:
-            check_indices(f"{name}.coverage.laid", coverage.laid[0], (None,), 0, GRID_SIZE**2 - 1, dtype=INT32)
-            check_indices(f"{name}.coverage.laid", coverage.laid[1], (None,), 0, len(coverage.cells) - 1, dtype=INT32)
         check_kept(f"{name}.countable", setting.countable, BOOL, (len(landmarks),))
         if not setting.countable.any():
             refuse(f"{name}.countable", "some landmark that counts", "none")

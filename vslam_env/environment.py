@@ -226,14 +226,14 @@ class ExplorationEnv(EnvKnowledge):
         """
         with refusing("state"):
             state = check_state(state, self.config, self._objects)
-            root = check_parts(state, self.config, self._episode)
+            root, setting = check_parts(state, self.config, self._episode)
         self._root, self.agents = root, []
-        if state["episode"] is None:
+        if setting is None:
             self._episode = None
             return
         if self._episode is None:
-            self._episode = Episode(self.config, state["episode"]["setting"], self._tap)
-        self._episode.set_state(state["episode"])
+            self._episode = Episode(self.config, setting, self._tap)
+        self._episode.set_state(state["episode"], setting)
         self._drivers = Drivers(self.config)
         self._drivers.set_state(state["drivers"])
         self._standing, self._cycle, self.agents = state["standing"], state["cycle"], list(state["agents"])

@@ -45,6 +45,8 @@ class Episode:
 
     Attributes:
         setting: What was drawn at the reset; of these:
+        given_setting: The setting in the last state that was set, from which `setting` was built again if it came from
+            elsewhere; None: no state was set.
         world: Walls and landmarks.
         true_starts: (K, 3) float64 [m, m, rad], world frame.
         belief_seed: From which the team's beliefs draw.
@@ -63,6 +65,7 @@ class Episode:
         self._tap = Tap() if tap is None else tap
         self._all_hear_all = config.always_in_contact
         self._streams = {name: np.random.default_rng(0) for name in setting.stream_states}
+        self.given_setting: Setting | None = None
         self._settle(setting)
         self.body = Body(
             radius=config.robot_radius, ray_angles=config.scan.ray_angles, scan_range=config.scan.max_range
@@ -157,10 +160,11 @@ class Episode:
             "paths": (tuple(self.true_path), tuple(self.estimated_path), tuple(self.merge_ticks)),
         }
 
-    def set_state(self, state: Mapping[str, Any]) -> None:
-        """Go on exactly as the episode that gave `state`, which was checked, be it of another seed and world."""
-        if state["setting"] is not self.setting:
-            self._settle(state["setting"])
+    def set_state(self, state: Mapping[str, Any], setting: Setting) -> None:
+        """Go on exactly as the episode that gave `state`, which was checked, in its setting."""
+        self.given_setting = state["setting"]
+        if setting is not self.setting:
+            self._settle(setting)
         self._simulator.set_state(state["simulator"])
         for name, stream in state["streams"].items():
             self._streams[name].bit_generator.state = stream

@@ -1,7 +1,7 @@
 """`Setting`: all of an episode that is drawn at its reset and never changes afterwards."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -10,7 +10,9 @@ from slam_backend.read_only import as_read_only
 from vslam_env.config import EnvConfig
 from vslam_env.coverage import CoverageMeter
 from vslam_env.errors_of_maps import ClaimLedger
-from vslam_env.sensors import LandmarkSensor, Scan, StereoSensor
+from vslam_env.sensors import LandmarkSensor, Scan, ScanConfig, StereoSensor, StereoSensorConfig
+from vslam_env.sensors.stereo_textures import check_textures
+from vslam_env.sensors.stereo_truth import TextureCorners
 from vslam_env.world import (
     FreeSpace,
     World,
@@ -47,6 +49,51 @@ class Setting:
     scan: Scan
     coverage: CoverageMeter
     countable: np.ndarray
+
+    def parts(self) -> tuple[Any, ...]:
+        """Return what the setting is made of; what follows from that is left out."""
+        sensor = self.sensor
+        painted = None
+        if isinstance(sensor, StereoSensor):
+            painted = sensor.textures, sensor.corners.faces, sensor.corners.offsets
+        return (
+            self.world, self.true_starts, self.bias, self.belief_seed, self.stream_states, sensor.config,
+            sensor.robot_radius, painted, self.scan.config, self.coverage.cells, self.countable,
+        )  # fmt: skip
+
+    @classmethod
+    def of_parts(
+        cls, world: World, true_starts: FloatArray, bias: FloatArray, belief_seed: np.random.SeedSequence,
+        stream_states: dict[str, Any], sensor: Any, robot_radius: float, painted: Any, scan: ScanConfig,
+        cells: FloatArray, countable: np.ndarray,
+    ) -> Self:  # fmt: skip
+        """Return the setting that is made of these parts; its sensors are built again.
+
+        Raises:
+            ValueError: If the parts do not fit together.
+        """
+        landmarks = world.landmarks
+        if landmarks is None:
+            raise ValueError("a world without landmarks")
+        eyes: LandmarkSensor | StereoSensor
+        if isinstance(sensor, StereoSensorConfig):
+            textures, faces, offsets = painted
+            check_textures(textures, world.walls)
+            corners = TextureCorners.found(world.walls, landmarks, faces, offsets, sensor.tolerance)
+            eyes = StereoSensor.of_textures(sensor, world.walls, textures, corners, robot_radius)
+        else:
+            eyes = LandmarkSensor(sensor, world.walls, landmarks, robot_radius)
+        return cls(
+            world=world,
+            true_starts=true_starts,
+            bias=bias,
+            belief_seed=belief_seed,
+            stream_states=stream_states,
+            sensor=eyes,
+            scan=Scan(scan, world.walls, robot_radius),
+            coverage=CoverageMeter(cells, true_starts),
+            countable=countable,
+        )
 
     def new_ledger(self, cutoff: float) -> ClaimLedger:
         """Return empty books for this world's landmarks; `cutoff` is c of the map error [m]."""

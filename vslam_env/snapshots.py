@@ -19,6 +19,7 @@ from vslam_env._state_checks import EpisodeCheck, check_drivers, check_standing
 from vslam_env.config import EnvConfig
 from vslam_env.episode import Episode
 from vslam_env.reward import RewardTerm, is_named
+from vslam_env.setting import Setting
 from vslam_env.state_kinds import ENV_KINDS
 from vslam_env.world import WorldSource
 
@@ -73,8 +74,10 @@ def check_state(state: Any, config: EnvConfig, objects: Mapping[str, str]) -> Ma
     return found
 
 
-def check_parts(state: Mapping[str, Any], config: EnvConfig, own: Episode | None) -> np.random.SeedSequence | None:
-    """Return the root of all seeds of a state that `check_state` passed, if each of its parts is whole.
+def check_parts(
+    state: Mapping[str, Any], config: EnvConfig, own: Episode | None
+) -> tuple[np.random.SeedSequence | None, Setting | None]:
+    """Return the root of all seeds of a state that `check_state` passed, and its setting, if each part is whole.
 
     Args:
         state: Nothing of it is taken over yet.
@@ -95,11 +98,12 @@ def check_parts(state: Mapping[str, Any], config: EnvConfig, own: Episode | None
     if state["episode"] is None:
         if state["agents"]:
             refuse("state['episode']", "a running episode", "none")
-        return root
-    EpisodeCheck(config, own).check("state['episode']", state["episode"])
+        return root, None
+    episode = EpisodeCheck(config, own)
+    episode.check("state['episode']", state["episode"])
     check_standing("state['standing']", state["standing"], config.num_robots)
     check_drivers("state['drivers']", state["drivers"], config.num_robots)
-    return root
+    return root, episode.setting
 
 
 def save_state(state: Mapping[str, Any], path: str | Path) -> None:

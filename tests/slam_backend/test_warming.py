@@ -17,6 +17,7 @@ from slam_backend.warming import warm_up
 VARIED_USE = """
 import sys
 import numpy as np
+from numba.core.dispatcher import Dispatcher
 from slam_backend import FastSlam, Measurements, TeamSlam
 from slam_backend.existence import ExistenceModel
 from slam_backend.attempts import AttemptOptions
@@ -29,7 +30,7 @@ from simulated_team import SimulatedTeam
 
 def versions():
     modules = [module for name, module in list(sys.modules.items()) if name.startswith("slam_backend")]
-    kernels = {id(v): v for module in modules for v in vars(module).values() if hasattr(v, "signatures")}
+    kernels = {id(v): v for module in modules for v in vars(module).values() if isinstance(v, Dispatcher)}
     return {(kernel.py_func.__qualname__, str(s)) for kernel in kernels.values() for s in kernel.signatures}
 
 warm_up()

