@@ -1,7 +1,6 @@
 """Two groups become one, a merge is doubted, and taken back."""
 
 import math
-from functools import partial
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -18,7 +17,6 @@ from slam_backend.groups import Group
 from slam_backend.landmark_map import LandmarkMap
 from slam_backend.merge_options import MergeOptions
 from slam_backend.merging import merge_filters, motion_covariance, paired
-from slam_backend.mixture_merging import merge_mixtures
 from slam_backend.records import Records
 from slam_backend.reports import MergeUndone, Renaming
 from slam_backend.smoothing.graph import mean_pose, scattered
@@ -152,14 +150,13 @@ def merge_groups(
         records: Of the team.
         rng: For pairing and draws.
         epoch: Of the joint filter.
-        known: As of `merge_filters`; mixtures are always merged so.
+        known: As of `merge_filters`.
     """
     (group_a, group_b), alignment, pairs = plan.groups, plan.alignment, plan.pairs
     a, b = group_a.trunk, group_b.trunk
-    combine = merge_mixtures
-    if merging.method == "particles":
-        combine = partial(merge_filters, known=known, pairing=plan.pairing)
-    joint, renamed = plan.joint or combine(a.filter, b.filter, alignment, pairs, rng, merging.merged_particles)
+    joint, renamed = plan.joint or merge_filters(
+        a.filter, b.filter, alignment, pairs, rng, merging.merged_particles, known, plan.pairing
+    )
     robots, live = a.robots + b.robots, a.live + b.live
     joint.reorder(np.argsort(robots))
     number = records.new_number()

@@ -2,12 +2,9 @@
 
 import math
 from dataclasses import dataclass
-from typing import Literal
 
-from slam_backend.errors import MOST, bad_argument, check_choice, check_float, check_int, known_names
+from slam_backend.errors import MOST, bad_argument, check_float, check_int, known_names
 from slam_backend.filter_options import MOST_PARTICLES
-
-METHODS = ("particles", "mixture")
 
 
 @known_names
@@ -16,9 +13,6 @@ class MergeOptions:
     """How filters are merged, and when a merge is undone.
 
     Attributes:
-        method: `"particles"`: each new particle pairs one of either group, whose maps are aligned by themselves; the
-            correlation of maps and paths survives. `"mixture"`: both maps' mixture covariances are fused into one map
-            that all particles share (Sec. 3.2, see `docs/errata.md`).
         merged_particles: Of the joint filter; None: as many as the larger of the two.
         straighten: Before a merge both sides' particles are drawn anew from the posterior of whole paths
             (`FastSlam.rejuvenate`; over some steps, where smoothers work in slices), and their maps have to align once
@@ -37,7 +31,6 @@ class MergeOptions:
             each other [-].
     """
 
-    method: Literal["particles", "mixture"] = "particles"
     merged_particles: int | None = None
     straighten: bool = True
     sure: float = 5.0
@@ -48,7 +41,6 @@ class MergeOptions:
     max_moved: float = 0.2
 
     def __post_init__(self) -> None:
-        check_choice("merging.method", self.method, METHODS)
         if self.merged_particles is not None:
             cure = "Use None for the larger of the two."
             check_int("merging.merged_particles", self.merged_particles, 1, cure, MOST_PARTICLES)

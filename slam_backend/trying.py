@@ -139,7 +139,7 @@ def _concluded(
             found = Alignment.refused("too uncertain", found.ratio, "paths", doubt)
         elif change > 1.0:
             found = Alignment.refused("too uncertain", found.ratio, "repeat", change)
-        if not found.success or merging.method != "particles":  # nothing was drawn for a merge
+        if not found.success:  # nothing was drawn for a merge
             rng.bit_generator.state = before
             plan = plan._replace(pairing=None, joint=None)
     schedule.record(_key(pair), step, found.success, straightened=bent is not None)
@@ -158,7 +158,7 @@ def _on_trial(
         trial of this pair found another one, 1 = just too much, 0 without a trial.
     """
     doubt = merging.sure * doubt_about(plan)
-    if doubt <= 1.0 or not (merging.least_sure and merging.straighten and merging.method == "particles"):
+    if doubt <= 1.0 or not (merging.least_sure and merging.straighten):
         return plan, doubt, 0.0
     trial = plan.on_trial(merging, alignment, rng)
     if trial is None:

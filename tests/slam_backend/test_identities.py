@@ -72,17 +72,15 @@ def build(num_robots: int, seed: int, **options: object) -> TeamSlam:
     return TeamSlam(num_robots, attempts=NEVER, seed=seed, num_particles=7, motion=motion, **options)
 
 
-@pytest.mark.parametrize("method", ["particles", "mixture"])
 @pytest.mark.parametrize("existence", [None, ExistenceModel()])
 @given(seed=st.integers(0, 10_000), data=st.data())
 @settings(max_examples=12)
 def test_a_name_is_held_once_after_every_merge_undo_and_return(
-    method: str, existence: ExistenceModel | None, seed: int, data: st.DataObject
+    existence: ExistenceModel | None, seed: int, data: st.DataObject
 ) -> None:
     """Robots lose and find each other, merge with right or wrong pairs, and merges are undone: names stay unique."""
     hall = Hall(3, seed)
-    merging = MergeOptions(method=method)
-    team = build(3, seed, merging=merging, existence=existence, rejuvenate_every=5)
+    team = build(3, seed, existence=existence, rejuvenate_every=5)
     for _ in range(12):
         parted = data.draw(st.sampled_from([None, links(3, (0, 1)), links(3, (1, 2)), links(3)]))
         for _ in range(3):

@@ -157,6 +157,15 @@ def test_a_joint_filter_has_uniform_weights_and_as_many_particles_as_the_larger(
         assert joint.particles(robot)[1].shape == (11,)
 
 
+@pytest.mark.parametrize("wanted", [3, 25])
+def test_a_joint_filter_has_as_many_particles_as_said(wanted: int) -> None:
+    """A given number of particles holds, whether it is below or above those of both filters."""
+    joint, _ = merge_filters(*both(particles=(7, 11)), known_alignment(), PAIRS, np.random.default_rng(1), wanted)
+    assert joint.num_particles == joint.options.num_particles == wanted
+    np.testing.assert_allclose(joint.weights, 1 / wanted)
+    assert joint.particles(1)[0].shape == (wanted, 3)
+
+
 def test_a_joint_filter_shares_no_memory_with_the_old_ones() -> None:
     """Neither the merge nor steps of the joint filter change the two filters it was made of."""
     a, b = both()

@@ -196,7 +196,7 @@ def test_a_pair_too_uncertain_to_merge_waits_and_merges_later() -> None:
     assert len(team.groups) == 1
 
 
-@pytest.mark.parametrize("how", [{}, {"merged_particles": 5}, {"method": "mixture"}])
+@pytest.mark.parametrize("how", [{}, {"merged_particles": 5}])
 def test_being_sure_leaves_no_trace(how: dict[str, Any]) -> None:
     """Whether particles agree is only looked at: the merge is bit for bit that of a team which does not ask."""
     states = [driven(112, AT_LAST, merging=MergeOptions(sure=sure, **how))[1].get_state() for sure in (0.0, 1e-6)]

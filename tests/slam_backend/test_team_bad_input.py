@@ -11,6 +11,7 @@ from standing_team import hand_made, standing_team
 
 from slam_backend.alignment import Alignment
 from slam_backend.measurements import Measurements, TeamMeasurements
+from slam_backend.merge_options import MergeOptions
 from slam_backend.team import TeamSlam
 
 GOOD = Measurements(np.array([[0.1, 0.2, 2.0]]), np.eye(1, 13))
@@ -37,12 +38,30 @@ FRAMES = [GOOD] * 3
         ({"camera": "wide"}, r"camera: expected a StereoCamera, got 'wide'\. Build one"),
         ({"alignment": {"min_inliers": 9}}, r"alignment: expected AlignmentOptions or None, got \{'min_inliers': 9\}"),
         ({"attempts": 25}, r"attempts: expected AttemptOptions or None, got 25\. Build one: AttemptOptions"),
+        ({"merging": 200}, r"merging: expected MergeOptions or None, got 200\. Build one: MergeOptions"),
     ],
 )
 def test_a_team_that_cannot_be_built_says_why(arguments: dict[str, Any], message: str) -> None:
     """The error names the argument, what was expected, what came, and the cure."""
     with pytest.raises(ValueError, match=message):
         TeamSlam(**({"num_robots": 3} | arguments))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"merged_particles": 0}, r"merging\.merged_particles: expected an int >= 1, got 0\. Use None for the larger"),
+        ({"merged_particles": 10**9}, r"merging\.merged_particles: expected an int <= 1000000, got 1000000000"),
+        ({"watch_steps": -1}, r"merging\.watch_steps: expected an int >= 0, got -1\. Use 0 to make merges final"),
+        ({"watch_every": 0}, r"merging\.watch_every: expected an int >= 1, got 0"),
+        ({"barred_steps": 1.5}, r"merging\.barred_steps: expected an int >= 0, got 1\.5"),
+        ({"max_moved": 1.2}, r"merging\.max_moved: expected a finite number >= 0 and <= 1, got 1\.2\. Give a share"),
+    ],
+)
+def test_merge_options_that_make_no_sense_are_refused(arguments: dict[str, Any], message: str) -> None:
+    """The error names the option, what was expected, what came, and the cure."""
+    with pytest.raises(ValueError, match=message):
+        MergeOptions(**arguments)
 
 
 def in_one_piece(points: list[np.ndarray], ends: list[int], descriptors: int = 3) -> TeamMeasurements:

@@ -99,8 +99,6 @@ def _moved(config: EnvConfig, rng: np.random.Generator) -> Iterator[tuple[tuple[
     if rng.random() < 0.4:
         yield (*belief, "rejuvenate_every"), int(rng.integers(1, 12))
     if rng.random() < 0.2:
-        yield ("belief", "merging", "method"), "mixture"
-    if rng.random() < 0.2:
         yield ("belief", "alignment", "appearance"), False
     if rng.random() < 0.3:
         yield ("belief", "alignment", "min_inliers"), 3
