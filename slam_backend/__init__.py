@@ -8,7 +8,6 @@ from slam_backend.attempts import AttemptOptions
 from slam_backend.camera import StereoCamera
 from slam_backend.compilation import log_compilation
 from slam_backend.consistency import Consistency
-from slam_backend.duplicates import DuplicateOptions, find_duplicates, fuse_duplicates
 from slam_backend.existence import ExistenceModel
 from slam_backend.filter import FastSlam
 from slam_backend.filter_options import FilterOptions
@@ -29,7 +28,6 @@ __all__ = [
     "AlignmentOptions",
     "AttemptOptions",
     "Consistency",
-    "DuplicateOptions",
     "ExistenceModel",
     "FastSlam",
     "FilterOptions",
@@ -49,8 +47,6 @@ __all__ = [
     "TeamSlam",
     "Trajectory",
     "align_maps",
-    "find_duplicates",
-    "fuse_duplicates",
     "fuse_landmarks",
     "fuse_maps",
     "warm_up",

@@ -11,7 +11,6 @@ import pytest
 
 import slam_backend
 from slam_backend import FastSlam, FilterOptions, LandmarkMap, TeamSlam, Trajectory, fuse_maps
-from slam_backend.duplicates import find_duplicates, fuse_duplicates
 from slam_backend.errors import is_built_in, known_names
 from slam_backend.frontend import CornerOptions, FrontEndOptions
 from slam_backend.fusion import fuse_landmarks
@@ -41,9 +40,6 @@ CALLS: dict[str, Callable[[Any], Any]] = {
     "cov1": lambda wrong: fuse_landmarks(TWO[0], wrong, *TWO[2:]),
     "mean2": lambda wrong: fuse_landmarks(*TWO[:2], wrong, TWO[3]),
     "cov2": lambda wrong: fuse_landmarks(*TWO[:3], wrong),
-    "landmarks": lambda wrong: find_duplicates(wrong),
-    "landmarks, fused": lambda wrong: fuse_duplicates(wrong, np.empty((0, 2))),
-    "options": lambda wrong: find_duplicates(EMPTY, wrong or object()),
     "options, plain": lambda wrong: PlainFastSlam(1, wrong),
     "merge": lambda wrong: TeamSlam(2, num_particles=2).merged_maps(wrong),
     "descriptor_size": lambda wrong: LandmarkMap.empty(-7 if wrong == 3 else wrong),
