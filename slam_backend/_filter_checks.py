@@ -269,8 +269,6 @@ def check_steps(name: str, rows: Any) -> None:
         check_floats(f"{name}.covariances", own, (len(own), 6))
     elif rows.given.any():
         refuse(f"{name}.given", "none without covariances", "some")
-    if rows.descriptor_rows is not None:
-        check_indices(f"{name}.descriptor_rows", rows.descriptor_rows, (n,), -1, MOST)
 
 
 # ---------------------------------------------------------------------- the smoother

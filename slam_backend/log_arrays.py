@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final, NamedTuple, cast
+from typing import Any, Final, NamedTuple
 from weakref import WeakSet
 
 import numpy as np
@@ -27,7 +27,6 @@ class LogStep(NamedTuple):
         points: (n, 3) [m], robot axes, relative to the camera centre.
         covariances: (n, 6) [m^2] of the points, robot axes, upper triangles by rows; None: the camera model.
         ids: (n,) landmarks, -1 = rejected.
-        descriptor_rows: (n,) rows of a table that the caller keeps, -1 = none; None: it keeps none.
     """
 
     step: int
@@ -36,10 +35,9 @@ class LogStep(NamedTuple):
     points: FloatArray
     covariances: FloatArray | None
     ids: IntArray
-    descriptor_rows: IntArray | None
 
 
-COLUMNS = ("steps", "kinds", "motions", "given", "starts", "points", "ids", "covariances", "descriptor_rows")
+COLUMNS = ("steps", "kinds", "motions", "given", "starts", "points", "ids", "covariances")
 
 
 @dataclass(frozen=True, slots=True, weakref_slot=True, eq=False, kw_only=True)
@@ -55,7 +53,6 @@ class LogArrays:
         points: (n, 3) float64 [m], robot axes, relative to the camera centre.
         ids: (n,) int64. Landmarks by the most probable particle of that step, -1 = rejected.
         covariances: (n, 6) float64 [m^2], robot axes, upper triangles by rows; NaN where not given. None: all NaN.
-        descriptor_rows: (n,) int64. Rows of a table that the caller keeps, -1 = none. None: all -1.
     """
 
     steps: IntArray
@@ -66,7 +63,6 @@ class LogArrays:
     points: FloatArray
     ids: IntArray
     covariances: FloatArray | None
-    descriptor_rows: IntArray | None
 
     def __post_init__(self) -> None:
         for name in COLUMNS:
@@ -102,7 +98,6 @@ class LogArrays:
             self.points[at],
             self.covariances[at] if self.covariances is not None and self.given[t] else None,
             self.ids[at],
-            None if self.descriptor_rows is None else self.descriptor_rows[at],
         )
 
     def since(self, step: int) -> "LogArrays":
@@ -118,7 +113,6 @@ class LogArrays:
             points=self.points[first:],
             ids=self.ids[first:],
             covariances=None if self.covariances is None else self.covariances[first:],
-            descriptor_rows=None if self.descriptor_rows is None else self.descriptor_rows[first:],
         )
 
     def renamed(self, old_ids: IntArray, new_ids: IntArray, keep_others: bool) -> "LogArrays":
@@ -156,7 +150,7 @@ def _from_columns(columns: dict[str, Any]) -> LogArrays:
 
 
 def join(parts: Sequence[LogArrays]) -> LogArrays:
-    """Chain at least one part in the order given; columns that only some parts have are filled up."""
+    """Chain at least one part in the order given; covariances are NaN for parts that have none."""
     if len(parts) == 1:
         return parts[0]
     ends = np.cumsum([len(part.ids) for part in parts])
@@ -165,24 +159,9 @@ def join(parts: Sequence[LogArrays]) -> LogArrays:
         name: np.concatenate([getattr(part, name) for part in parts])
         for name in ("steps", "kinds", "motions", "given", "points", "ids")
     }
-    return LogArrays(
-        starts=np.concatenate(starts),
-        covariances=cast(FloatArray | None, _filled_up(parts, "covariances", (6,), np.nan)),
-        descriptor_rows=cast(IntArray | None, _filled_up(parts, "descriptor_rows", (), -1)),
-        **columns,
-    )
-
-
-def _filled_up(
-    parts: Sequence[LogArrays], name: str, shape: tuple[int, ...], filler: float
-) -> NDArray[np.generic] | None:
-    """Chain an optional column, with `filler` where a part lacks it; None if all do."""
-    columns = [getattr(part, name) for part in parts]
-    if all(column is None for column in columns):
-        return None
-    return np.concatenate(
-        [
-            np.full((len(part.ids), *shape), filler) if column is None else column
-            for part, column in zip(parts, columns, strict=True)
-        ]
-    )
+    covariances = None
+    if any(part.covariances is not None for part in parts):
+        covariances = np.concatenate(
+            [np.full((len(part.ids), 6), np.nan) if part.covariances is None else part.covariances for part in parts]
+        )
+    return LogArrays(starts=np.concatenate(starts), covariances=covariances, **columns)

