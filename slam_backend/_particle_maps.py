@@ -119,30 +119,6 @@ class ParticleMaps(MapStore):
         values = blocks.transpose(0, 2, 1, 3).reshape(len(rows), 9, self.padded)[:, :, :m]
         return np.ascontiguousarray(values), self.counts[rows, :m]
 
-    def load(
-        self, values: FloatArray, counts: NDArray[np.integer[Any]], descriptors: NDArray[np.float32], ids: IntArray,
-        identities: IntArray, next_id: int, odds: FloatArray | None = None, last_seen: IntArray | None = None,
-    ) -> None:  # fmt: skip
-        """Replace all landmarks by these; those that no particle holds are left out.
-
-        Args:
-            values: (n, 9, M) float64 [m, m^2], map frame. Means and upper triangles of covariances.
-            counts: (n, M). 0 where the particle lacks it.
-            descriptors: (n, d) float32.
-            ids, identities: (n,) int64. Stable names, and the caller's own, -1 = none.
-            next_id: The name that the next landmark will get.
-            odds: (n, M) float64, log-odds of existence; None: where existence is kept, landmarks get the prior.
-            last_seen: (n,) int64, see `MapStore`; None: never.
-        """
-        keep = (counts > 0).any(axis=1)
-        padded = np.zeros((int(keep.sum()), 9, self.padded))
-        padded[:, :, : self.num_particles] = values[keep]
-        tiles = padded.reshape(len(padded), 9, -1, LANES).transpose(0, 2, 1, 3)
-        odds = None if odds is None else odds[keep]
-        last_seen = None if last_seen is None else last_seen[keep]
-        self.load_names(counts[keep], descriptors[keep], ids[keep], identities[keep], next_id, odds, last_seen)
-        self.blocks[: len(tiles)] = tiles
-
     def load_names(
         self, counts: NDArray[np.integer[Any]], descriptors: NDArray[np.float32], ids: IntArray, identities: IntArray,
         next_id: int, odds: FloatArray | None = None, last_seen: IntArray | None = None,
@@ -150,8 +126,13 @@ class ParticleMaps(MapStore):
         """Replace all landmarks by these but for the values: the first n of `blocks` are then to be written.
 
         Args:
-            counts: (n, M), or (n, 1) where all particles have the same; each landmark is held by a particle.
-            descriptors, ids, identities, next_id, odds, last_seen: As of `load`.
+            counts: (n, M), or (n, 1) where all particles have the same; 0 where a particle lacks the landmark. Each
+                landmark is held by a particle.
+            descriptors: (n, d) float32.
+            ids, identities: (n,) int64. Stable names, and the caller's own, -1 = none.
+            next_id: The name that the next landmark will get.
+            odds: (n, M) float64, log-odds of existence; None: where existence is kept, landmarks get the prior.
+            last_seen: (n,) int64, see `MapStore`; None: never.
         """
         n, m = len(ids), self.num_particles
         self._begin(n, descriptors.shape[1] if n else self.descriptors.shape[1])

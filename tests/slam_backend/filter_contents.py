@@ -4,6 +4,8 @@ from typing import Any
 
 import numpy as np
 
+from slam_backend._kernels import LANES
+from slam_backend._particle_maps import ParticleMaps
 from slam_backend.errors import FloatArray
 from slam_backend.filter import FastSlam
 
@@ -35,6 +37,14 @@ def map_of(slam: FastSlam, particle: int) -> FloatArray:
     held = counts[:, particle] > 0
     columns = (means[held, :, particle], covariances[held, :, particle], counts[held, particle, None])
     return np.concatenate(columns, axis=1)
+
+
+def load_landmarks(maps: ParticleMaps, values: FloatArray, *names: Any) -> None:
+    """Replace all landmarks by these: `values` (n, 9, M) as `dense` gives them, the rest as `load_names` takes it."""
+    maps.load_names(*names)
+    padded = np.zeros((len(values), 9, maps.padded))
+    padded[:, :, : maps.num_particles] = values
+    maps.blocks[: len(values)] = padded.reshape(len(values), 9, -1, LANES).transpose(0, 2, 1, 3)
 
 
 def arrays_of(slam: FastSlam) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from filter_contents import arrays_of, contents, map_of
+from filter_contents import arrays_of, contents, load_landmarks, map_of
 from same_bits import assert_same
 from stereo_world import StereoWorld
 
@@ -179,7 +179,7 @@ def test_a_landmark_is_updated_in_the_particle_that_holds_it_only(proposal: Any,
     holder = np.arange(num_particles) == 4
     counts[row] = 7 * holder
     names = np.where(np.arange(len(slots)) == row, 5, -1)
-    maps.load(values, counts, maps.descriptors[slots], maps.ids[slots], names, maps.next_id)
+    load_landmarks(maps, values, counts, maps.descriptors[slots], maps.ids[slots], names, maps.next_id)
     slam = without_resampling(slam.get_state())
     ids, means, covariances, counts = slam._dense()
     poses = slam.particles()[0]

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from filter_contents import load_landmarks
 from gappy_filter import filter_with_gaps
 
 from slam_backend._joint_landmarks import Landmarks, joint_counts, write_joint
@@ -83,7 +84,9 @@ def test_two_exact_estimates_cannot_be_fused() -> None:
     """Landmarks without any uncertainty are refused, with a cure."""
     maps = ParticleMaps(2)
     exact = np.zeros((1, 9, 2))
-    maps.load(exact, np.ones((1, 2), np.int64), np.eye(1, 4, dtype=np.float32), np.arange(1), np.full(1, -1), 1)
+    load_landmarks(
+        maps, exact, np.ones((1, 2), np.int64), np.eye(1, 4, dtype=np.float32), np.arange(1), np.full(1, -1), 1
+    )
     side, row = Landmarks.of(maps), np.zeros(1, np.int64)
     with pytest.raises(ValueError, match="landmarks in common: expected positive definite covariances, got 'singular"):
         write_joint(side, side, row, row, np.zeros((2, 3)), 0.0, np.ones(1), maps.blocks)

@@ -2,7 +2,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from filter_contents import arrays_of, contents
+from filter_contents import arrays_of, contents, load_landmarks
 from hypothesis import given
 from hypothesis import strategies as st
 from mapped_once import (
@@ -363,7 +363,7 @@ def test_pairs_whose_maps_fit_each_other_survive() -> None:
     values, counts = maps.dense(slots)
     values[1, 0, 35:] += 0.5  # landmark 1 of b is one of the common ones
     values[0, 2, 35:] += 9.0  # landmark 0 is b's alone: it tells which particles survive
-    maps.load(values, counts, maps.descriptors[slots], maps.ids[slots], maps.identities[slots], maps.next_id)
+    load_landmarks(maps, values, counts, maps.descriptors[slots], maps.ids[slots], maps.identities[slots], maps.next_id)
     joint, renamed = merge_filters(a, b, known_alignment(), PAIRS, np.random.default_rng(1))
     ids, means, _, _ = joint._dense()
     row = ids.tolist().index(dict(renamed.tolist())[0])
