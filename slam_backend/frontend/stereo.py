@@ -104,8 +104,6 @@ class StereoMatches(NamedTuple):
         disparity: (n,) float64 [px]. By patches; meaningless where the guard "patch" failed.
         descriptors: (n, d) float32. Of the left corners, at the scale by which they were matched.
         passed: (5, n) bool. Whether a match passed the guard, for each of `GUARDS` and whatever the others said.
-        num_left: Corners in the left image.
-        num_right: Corners in the right image.
     """
 
     corners: FloatArray
@@ -114,8 +112,6 @@ class StereoMatches(NamedTuple):
     disparity: FloatArray
     descriptors: Float32Array
     passed: BoolArray
-    num_left: int
-    num_right: int
 
 
 class StereoFrame(NamedTuple):
@@ -238,8 +234,6 @@ class StereoFrontEnd:
                     (disparity >= self._least) & (disparity <= self._largest),
                 ]
             ),
-            num_left=len(ours.points),
-            num_right=len(theirs.points),
         )
 
     def _check(self, name: str, image: Any) -> Image:
