@@ -67,13 +67,12 @@ def conditions(lines: Sequence[Mapping[str, Any]]) -> dict[str, list[Mapping[str
     return groups
 
 
-def print_tables(console: Console, lines: Sequence[Mapping[str, Any]], goals: Sequence[Mapping[str, Any]]) -> None:
-    """Print up to four tables for each condition, and one of the goals.
+def print_tables(console: Console, lines: Sequence[Mapping[str, Any]]) -> None:
+    """Print up to four tables for each condition.
 
     Args:
         console: Where to.
         lines: Of `summarise`.
-        goals: Of `check_goals`.
     """
     for title, own in conditions(lines).items():
         seeds = max(line["seeds"] for line in own)
@@ -81,11 +80,9 @@ def print_tables(console: Console, lines: Sequence[Mapping[str, Any]], goals: Se
             headings, rows = table_rows(own, columns)
             if rows:
                 console.print(console_table(f"{title}, {seeds} seeds: {part}", headings, rows))
-    if goals:
-        console.print(console_table("Goals", *goal_rows(goals)))
 
 
-def markdown(lines: Sequence[Mapping[str, Any]], goals: Sequence[Mapping[str, Any]]) -> str:
+def markdown(lines: Sequence[Mapping[str, Any]]) -> str:
     """Return the same tables as Markdown."""
     parts = []
     for title, own in conditions(lines).items():
@@ -94,19 +91,7 @@ def markdown(lines: Sequence[Mapping[str, Any]], goals: Sequence[Mapping[str, An
             headings, rows = table_rows(own, columns)
             if rows:
                 parts.append(markdown_table(headings, rows))
-    if goals:
-        parts += ["### Goals\n", markdown_table(*goal_rows(goals))]
     return "\n".join(parts)
-
-
-def goal_rows(goals: Sequence[Mapping[str, Any]]) -> tuple[list[str], list[list[str]]]:
-    """Return headings and rows of text for the goals."""
-    rows = []
-    for goal in goals:
-        range_ = "" if goal["low"] is None else f"{goal['low']:.3f}-{goal['high']:.3f}"
-        met = "yes" if goal["met"] else "no"
-        rows.append([goal["goal"], f"{goal['limit']:g}", f"{goal['reached']:.3f}", range_, str(goal["seeds"]), met])
-    return ["goal", "at most", "reached", "95 %", "seeds", "met"], rows
 
 
 def _cell(

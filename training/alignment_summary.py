@@ -1,4 +1,4 @@
-"""What the trials of `vslam bench alignment` come to, and whether they meet what was set out."""
+"""What the trials of `vslam bench alignment` come to."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -9,9 +9,6 @@ from scipy.stats import chi2
 
 CELL = ("kind", "case", "overlap", "outliers", "method")
 CONFIDENCE = 0.95
-# On the grid all trials succeed, errors are at most so many times what the Cramer-Rao bound allows, in so many ms.
-OVER_BOUND, MEDIAN_MS = 1.1, 5.0
-LEAST_ACCEPTED = 0.95  # of the identifiable
 
 
 def summarise(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
@@ -68,34 +65,3 @@ def _describe(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 def _over_bound(errors: Any, bounds: Sequence[float]) -> float:
     """Return the RMS error over the root of the mean bound."""
     return float(np.sqrt((np.asarray(errors) ** 2).mean() / np.mean(bounds)))
-
-
-def check_goals(lines: Sequence[Mapping[str, Any]], method: str) -> list[dict[str, Any]]:
-    """Return what was set out for a method, beside what the lines say: `goal`, `measured`, `wanted`, `met`."""
-    goals: list[dict[str, Any]] = []
-
-    def add(goal: str, measured: float, low: float | None, high: float | None) -> None:
-        met = (low is None or measured >= low) and (high is None or measured <= high)
-        shown = [f"at least {low:.3g}"] if low is not None else []
-        shown += [f"at most {high:.3g}"] if high is not None else []
-        goals.append({"goal": goal, "measured": measured, "wanted": ", ".join(shown), "met": met})
-
-    own = [line for line in lines if line["method"] == method]
-    grid = [line for line in own if line["kind"] == "grid" and line["overlap"] is not None]
-    if grid:
-        add("grid: share right, worst cell", min(line["right"] for line in grid), 1.0, None)
-        for name in ("translation", "rotation"):
-            values = [np.inf if line[name] is None else line[name] for line in grid]
-            add(f"grid: {name} error over the bound, worst cell", max(values), None, OVER_BOUND)
-        add("grid: median computing time [ms], slowest cell", max(line["median_ms"] for line in grid), None, MEDIAN_MS)
-    for line in own:
-        if line["overlap"] is not None:
-            continue
-        if line["kind"] == "grid" and line["anees"] is not None:
-            add("grid: ANEES of the motion, all cells", line["anees"], line["anees_low"], line["anees_high"])
-        if line["kind"] == "U":
-            add("U: accepted", line["accepted"], None, 0.0)
-        if line["kind"] == "I":
-            add("I: share accepted", line["accepted"], LEAST_ACCEPTED, None)
-            add("I: accepted and false", line["false"], None, 0.0)
-    return goals

@@ -24,17 +24,15 @@ def table_rows(kind: str, lines: Sequence[Mapping[str, Any]]) -> list[list[str]]
     return [_cells(kind, line) for line in lines if line["kind"] == kind]
 
 
-def print_tables(console: Console, lines: Sequence[Mapping[str, Any]], goals: Sequence[Mapping[str, Any]]) -> None:
-    """Print what each kind of trial came to, and the goals."""
+def print_tables(console: Console, lines: Sequence[Mapping[str, Any]]) -> None:
+    """Print what each kind of trial came to."""
     for kind, title in TITLES.items():
         _print(console, title, HEADINGS[kind], table_rows(kind, lines))
-    _print(console, "Goals", ("goal", "measured", "wanted", ""), _goal_rows(goals))
 
 
-def markdown(lines: Sequence[Mapping[str, Any]], goals: Sequence[Mapping[str, Any]]) -> str:
+def markdown(lines: Sequence[Mapping[str, Any]]) -> str:
     """Return the same tables as Markdown."""
     parts = [(title, HEADINGS[kind], table_rows(kind, lines)) for kind, title in TITLES.items()]
-    parts.append(("Goals", ("goal", "measured", "wanted", ""), _goal_rows(goals)))
     return "\n".join(f"**{title}**\n\n{markdown_table(headings, rows)}" for title, headings, rows in parts if rows)
 
 
@@ -60,13 +58,6 @@ def _cells(kind: str, line: Mapping[str, Any]) -> list[str]:
     worst = [_number(line[name], 2) for name in ("worst_m", "worst_deg")]
     accepted = f"{100 * line['accepted']:.1f}"
     return [case, line["method"], accepted, str(line["false"]), *worst, anees, refused, _times(line)[0]]
-
-
-def _goal_rows(goals: Sequence[Mapping[str, Any]]) -> list[list[str]]:
-    """Return the rows of the table of goals."""
-    verdict = {True: "met", False: "missed"}
-    measured = ["-" if goal["measured"] is None else f"{goal['measured']:.3g}" for goal in goals]
-    return [[g["goal"], shown, g["wanted"], verdict[g["met"]]] for g, shown in zip(goals, measured, strict=True)]
 
 
 def _times(line: Mapping[str, Any]) -> list[str]:

@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 from training.command_folder import begin, choose, finish
-from training.command_options import Check, Config, FirstSeed, Json, OutToGoOn, words
+from training.command_options import Config, FirstSeed, Json, OutToGoOn, words
 from training.command_progress import KeptPart, play_kept
 
 
@@ -17,7 +17,6 @@ def bench_alignment(
     hard: Annotated[int | None, typer.Option(help="Trials of each hard set.", show_default="1000")] = None,
     first_seed: FirstSeed = None,
     quick: Annotated[bool, typer.Option("--quick", help="10 trials of each cell, 45 of each hard set.")] = False,
-    check: Check = False,
     out: OutToGoOn = None,
     json: Json = None,
     config: Config = None,
@@ -28,7 +27,7 @@ def bench_alignment(
     just can be. One process, one thread, so that times count. Ctrl-C ends the bench after the trial under way and sums
     up what there is; the same command with --out FOLDER goes on from there.
     """
-    from training.alignment_summary import check_goals, summarise
+    from training.alignment_summary import summarise
     from training.alignment_tables import markdown, print_tables
     from training.alignment_trials import Trial, play
     from training.bench_alignment import COMMAND, QUICK, TRIALS_FILE, AlignmentBenchConfig
@@ -50,9 +49,8 @@ def bench_alignment(
     )  # fmt: skip
     (rows,) = play_kept(console, folder, part, timed=True)
     lines = plain(summarise(rows))
-    goals = plain(check_goals(lines, chosen.methods[0]))
-    print_tables(console, lines, goals)
-    metrics = folder.write_metrics({"summary": lines, "goals": goals, "goals_of": chosen.methods[0]})
-    folder.write_text("tables.md", markdown(lines, goals))
+    print_tables(console, lines)
+    metrics = folder.write_metrics({"summary": lines})
+    folder.write_text("tables.md", markdown(lines))
     draw_alignment(folder.path / "alignment.png", lines)
-    finish(console, folder, metrics, json, check, [goal["met"] for goal in goals])
+    finish(console, folder, metrics, json)

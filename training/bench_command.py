@@ -5,7 +5,7 @@ from typing import Annotated, Any
 import typer
 
 from training.command_folder import begin, choose, finish
-from training.command_options import Check, Config, FirstSeed, Json, OutToGoOn, Processes, numbers, words
+from training.command_options import Config, FirstSeed, Json, OutToGoOn, Processes, numbers, words
 from training.command_progress import KeptPart, play_kept
 
 bench = typer.Typer(help="Measure how good and how fast filters, environments and trainings are.", no_args_is_help=True)
@@ -36,7 +36,6 @@ def bench_accuracy(
         typer.Option(help="Metres by which landmarks may walk.", show_default="0, if rejuvenated 0.005"),
     ] = None,
     processes: Processes = 1,
-    check: Check = False,
     out: OutToGoOn = None,
     json: Json = None,
     config: Config = None,
@@ -47,7 +46,7 @@ def bench_accuracy(
     trial under way and sums up what there is; the same command with --out FOLDER goes on from there.
     """
     from slam_backend.errors import check_int
-    from training.accuracy_summary import check_goals, summarise
+    from training.accuracy_summary import summarise
     from training.accuracy_tables import markdown, print_tables
     from training.accuracy_trials import Trial, play
     from training.bench_accuracy import COMMAND, TRIALS_FILE, AccuracyConfig
@@ -77,10 +76,10 @@ def bench_accuracy(
         file=TRIALS_FILE, kind=Trial, play=play, trials=chosen.trials(), tell=tell, processes=processes
     )  # fmt: skip
     (rows,) = play_kept(console, folder, part)
-    lines, goals = plain(summarise(rows)), plain(check_goals(rows))
-    print_tables(console, lines, goals)
-    metrics = folder.write_metrics({"summary": lines, "goals": goals, "trials": rows})
-    folder.write_text("tables.md", markdown(lines, goals))
+    lines = plain(summarise(rows))
+    print_tables(console, lines)
+    metrics = folder.write_metrics({"summary": lines, "trials": rows})
+    folder.write_text("tables.md", markdown(lines))
     if lines:
         draw_accuracy(folder.path / "accuracy.png", lines)
-    finish(console, folder, metrics, json, check, [goal["met"] for goal in goals])
+    finish(console, folder, metrics, json)

@@ -21,7 +21,7 @@ from training.env_timing import (
 )
 from training.machine_rates import describe_machine
 from training.plain_config import PlainConfig, check_each_once
-from training.timed_bench import goal, run_in_turn
+from training.timed_bench import run_in_turn
 from vslam_env import vslam_v0
 from vslam_env.config import MAX_ROBOTS, EnvConfig
 
@@ -31,8 +31,6 @@ MODES: dict[str, dict[str, Any]] = {
     "flat": {"observation_type": "flat"},
     "goal": {"action_type": "goal", "decision_ticks": 1},
 }
-GOALS = {"env.step": 2000.0, "simulator": 4000.0}  # per second
-GOAL_RESET_MS, GOAL_STATE_MS = 20.0, 2.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -143,22 +141,6 @@ class EnvBenchResult:
     ratio: float | None
     complete: bool
 
-    def goals(self) -> list[dict[str, Any]]:
-        """Return goals with what was measured."""
-        found = []
-        if self.rows:
-            times = self.rows[0].times
-            found.append(goal("env.step, per second", times.per_second, GOALS["env.step"], True))
-            found.append(goal("env.step, per second, by the mean", times.per_second_mean, GOALS["env.step"], True))
-        if self.simulator is not None:
-            found.append(goal("simulator only, per second", self.simulator.per_second, GOALS["simulator"], True))
-        if self.reset is not None:
-            found.append(goal("reset, ms", self.reset.median_us / 1e3, GOAL_RESET_MS))
-        for name in ("get_state", "set_state, same episode"):
-            if name in self.snapshots:
-                found.append(goal(f"{name}, ms", self.snapshots[name].median_us / 1e3, GOAL_STATE_MS))
-        return found
-
     def to_mapping(self) -> dict[str, Any]:
         """Return it as plain values."""
         return {
@@ -170,7 +152,6 @@ class EnvBenchResult:
             "snapshots": {name: asdict(times) for name, times in self.snapshots.items()},
             "peer": None if self.peer is None else asdict(self.peer),
             "ratio_to_peer": self.ratio,
-            "goals": self.goals(),
             "complete": self.complete,
         }
 

@@ -5,7 +5,7 @@ from typing import Annotated, Any
 import typer
 
 from training.command_folder import begin, choose, finish
-from training.command_options import Check, Config, Json, Out, numbers, words
+from training.command_options import Config, Json, Out, numbers, words
 from training.command_progress import trials_shown
 
 COMMAND = "bench env"
@@ -25,7 +25,6 @@ def bench_env(
     peer: Annotated[bool | None, typer.Option(help="Also simple_spread of MPE2.", show_default="peer")] = None,
     quick: Annotated[bool, typer.Option("--quick", help="The base alone, 300 steps.")] = False,
     seed: Annotated[int | None, typer.Option(help="Of the episodes.", show_default="100")] = None,
-    check: Check = False,
     out: Out = None,
     json: Json = None,
     config: Config = None,
@@ -54,4 +53,4 @@ def bench_env(
         result = run_bench(chosen, on_trial, interrupted)
     print_env_result(console, result, chosen.peer)
     metrics = folder.write_metrics(to_plain(result.to_mapping()))
-    finish(console, folder, metrics, json, check, [goal["met"] for goal in result.goals()])
+    finish(console, folder, metrics, json)

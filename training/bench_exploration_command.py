@@ -6,7 +6,6 @@ import typer
 
 from training.command_folder import begin, choose, finish
 from training.command_options import (
-    Check,
     Config,
     EnvRejuvenateEvery,
     FirstSeed,
@@ -56,7 +55,6 @@ def bench_exploration(
     first_seed: FirstSeed = None,
     quick: Annotated[bool, typer.Option("--quick", help="Offices alone, 60 s, 3 seeds.")] = False,
     processes: Processes = 1,
-    check: Check = False,
     out: OutToGoOn = None,
     json: Json = None,
     config: Config = None,
@@ -71,7 +69,7 @@ def bench_exploration(
 
     from slam_backend.errors import check_int
     from training.bench_exploration import COMMAND, TRIALS_FILE, ExplorationBenchConfig, ExplorationTrial
-    from training.exploration_summary import check_goals, compare_oracles, compare_policies, curves, summarise
+    from training.exploration_summary import compare_oracles, compare_policies, curves, summarise
     from training.exploration_tables import markdown, print_tables, to_csv
     from training.exploration_trials import play
     from training.figures_exploration import draw_exploration
@@ -102,19 +100,19 @@ def bench_exploration(
         tell=lambda row: f"{row['world']}, {row['policy']}, seed {row['seed']}: {row['coverage']:.0%} seen",
     )  # fmt: skip
     (rows,) = play_kept(console, folder, part)
-    lines, over_time, goals = plain(summarise(rows)), plain(curves(rows)), plain(check_goals(rows))
+    lines, over_time = plain(summarise(rows)), plain(curves(rows))
     policies_differ, oracles_differ = plain(compare_policies(rows)), plain(compare_oracles(rows))
-    print_tables(console, lines, policies_differ, oracles_differ, goals)
+    print_tables(console, lines, policies_differ, oracles_differ)
     metrics = folder.write_metrics({
-        "summary": lines, "policies_differ": policies_differ, "oracles_differ": oracles_differ, "goals": goals,
+        "summary": lines, "policies_differ": policies_differ, "oracles_differ": oracles_differ,
         "trials": rows,
     })  # fmt: skip
-    folder.write_text("tables.md", markdown(lines, policies_differ, oracles_differ, goals))
+    folder.write_text("tables.md", markdown(lines, policies_differ, oracles_differ))
     folder.write_text("trials.csv", to_csv(rows))
     folder.write_text("curves.csv", to_csv(over_time))
     if over_time:
         draw_exploration(folder.path / "exploration.png", over_time)
-    finish(console, folder, metrics, json, check, [goal["met"] for goal in goals])
+    finish(console, folder, metrics, json)
 
 
 def _first_steps(config: "ExplorationBenchConfig", trial: "ExplorationTrial") -> None:

@@ -5,7 +5,7 @@ from typing import Annotated, Any
 import typer
 
 from training.command_folder import begin, choose, finish
-from training.command_options import Check, Config, Json, Out, Seed, numbers
+from training.command_options import Config, Json, Out, Seed, numbers
 from training.command_progress import trials_shown
 
 COMMAND = "bench filter"
@@ -37,7 +37,6 @@ def bench_filter(
         typer.Option("--compile/--no-compile", help="Also compiling into an empty cache.", show_default="no-compile"),
     ] = None,
     seed: Seed = None,
-    check: Check = False,
     out: Out = None,
     json: Json = None,
     config: Config = None,
@@ -45,7 +44,6 @@ def bench_filter(
     """Time steps of the filter over particles, landmarks, measurements and robots, on one thread."""
     from training.bench_filter import BenchConfig, count_trials, run_bench
     from training.figures_filter import draw_speed
-    from training.filter_goals import goals_of
     from training.filter_tables import print_result
     from training.run_folder import plain as to_plain
 
@@ -66,8 +64,7 @@ def bench_filter(
     console, folder = begin(COMMAND, chosen, out)
     with trials_shown(console, count_trials(chosen)) as (on_trial, interrupted):
         result = run_bench(chosen, on_trial, interrupted)
-    goals = goals_of(result)
-    print_result(console, result, goals)
-    metrics = folder.write_metrics(to_plain(result.to_mapping() | {"goals": [goal.to_mapping() for goal in goals]}))
+    print_result(console, result)
+    metrics = folder.write_metrics(to_plain(result.to_mapping()))
     draw_speed(folder.path / "speed.png", result)
-    finish(console, folder, metrics, json, check, [goal.is_met for goal in goals if goal.is_met is not None])
+    finish(console, folder, metrics, json)

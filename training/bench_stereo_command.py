@@ -45,7 +45,7 @@ def bench_stereo(
     from training.bench_stereo import StereoBenchConfig
     from training.figures_stereo import draw_stereo
     from training.run_folder import plain
-    from training.stereo_tables import FRONT_END_MS, PAIR_MS, markdown
+    from training.stereo_tables import markdown
 
     given = {"steps": steps, "views": views, "descriptors": words(descriptors), "seed": seed}
     fast = QUICK if quick else None
@@ -56,16 +56,6 @@ def bench_stereo(
     result = _run_live(console, chosen, parts)
     tables = markdown(result)
     console.print(Markdown(tables))
-    row = result["speed"][0] if result["speed"] else None
-    if row is not None:
-        least, mean = (
-            [row[part][name] for part in ("front_end", "render")] for name in ("min_ms", "processor_ms")
-        )  # fmt: skip
-        console.print(
-            f"Goals at 320 x 240 with 100 landmarks and 40 walls: front end {FRONT_END_MS:g} ms (least {least[0]:.2f}, "
-            f"processor {mean[0]:.2f}), pair {PAIR_MS:g} ms (least {sum(least):.2f}, processor {sum(mean):.2f}).",
-            highlight=False,
-        )
     folder.write_text("tables.md", tables)
     if result["quality"] and result["retrieval"]:
         draw_stereo(folder.path / "stereo.png", result)

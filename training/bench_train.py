@@ -8,12 +8,10 @@ from slam_backend.errors import bad_argument, check_int
 from training.learn_config import SPLIT_TRAIN, TrainConfig
 from training.machine_rates import describe_machine
 from training.plain_config import PlainConfig
-from training.timed_bench import goal, run_in_turn
-from training.train_timing import ADAPTER_ALONE, Part, Recording, record, time_adapter, time_learner
+from training.timed_bench import run_in_turn
+from training.train_timing import Part, Recording, record, time_adapter, time_learner
 from training.worker_timing import CLOCK, WorkerRow, WorkerTimes, summarise_workers, time_workers
 from vslam_env.config import EnvConfig
-
-GOAL_ADAPTER_US, GOAL_TWO_WORKERS = 5.0, 1.8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,24 +68,12 @@ class TrainBenchResult:
     workers: tuple[WorkerRow, ...]
     complete: bool
 
-    def goals(self) -> list[dict[str, Any]]:
-        """Return goals with what was measured."""
-        found = []
-        for part in self.parts:
-            if part.name == ADAPTER_ALONE:
-                found.append(goal("adapter alone, us per decision", part.median_us, GOAL_ADAPTER_US))
-        for row in self.workers:
-            if row.workers == 2 and row.gain is not None:
-                found.append(goal("two workers over one", row.gain, GOAL_TWO_WORKERS, at_least=True))
-        return found
-
     def to_mapping(self) -> dict[str, Any]:
         """Return it as plain values."""
         return {
             "machine": self.machine,
             "parts": [asdict(part) for part in self.parts],
             "workers": [asdict(row) for row in self.workers],
-            "goals": self.goals(),
             "complete": self.complete,
         }
 

@@ -6,7 +6,7 @@ import typer
 from rich.console import Console
 
 from training.command_folder import begin, choose, finish
-from training.command_options import Check, Config, Json, Out, numbers
+from training.command_options import Config, Json, Out, numbers
 from training.command_progress import trials_shown
 
 if TYPE_CHECKING:  # what computes is imported when the command runs, so that --help answers at once
@@ -30,7 +30,6 @@ def bench_train(
     ] = None,
     steps: Annotated[int | None, typer.Option(help="Timed per number of workers.", show_default="40")] = None,
     seed: Annotated[int | None, typer.Option(help="Of the episodes.", show_default="100")] = None,
-    check: Check = False,
     out: Out = None,
     json: Json = None,
     config: Config = None,
@@ -56,13 +55,13 @@ def bench_train(
         result = run_bench(chosen, on_trial, interrupted)
     _print(console, result)
     metrics = folder.write_metrics(plain(result.to_mapping()))
-    finish(console, folder, metrics, json, check, [goal["met"] for goal in result.goals()])
+    finish(console, folder, metrics, json)
 
 
 def _print(console: Console, result: "TrainBenchResult") -> None:
-    """Print both tables and the goals."""
+    """Print both tables."""
     from training.text_tables import console_table
-    from training.timed_bench import print_caveats, print_goals
+    from training.timed_bench import print_caveats
     from training.train_timing import ADAPTER_ALONE
 
     total = sum(part.median_us for part in result.parts if part.name != ADAPTER_ALONE)
@@ -81,7 +80,6 @@ def _print(console: Console, result: "TrainBenchResult") -> None:
         told = [_told(row) for row in result.workers]
         console.print(console_table("Environments alone, decisions per second", WORKER_HEADINGS, told))
         console.print(TOLD, highlight=False)
-    print_goals(console, result.goals())
     print_caveats(console, result.machine, result.complete)
 
 

@@ -118,7 +118,7 @@ def finish(
     check: bool = False,
     held: Iterable[bool] = (),
 ) -> None:
-    """Write the metrics to `json` too, say where the folder is, and hold the command to its goals if asked to.
+    """Write the metrics to `json` too, say where the folder is, and check the claims if asked to.
 
     Args:
         console: Where to say it.
@@ -126,10 +126,10 @@ def finish(
         metrics: As `RunFolder.write_metrics` returned them.
         json: The option of that name.
         check: Likewise.
-        held: Whether each goal was met.
+        held: Whether each claim holds.
 
     Raises:
-        typer.Exit: With status 1, if `check` and a goal was missed or none was looked at.
+        typer.Exit: With status 1, if `check` and a claim does not hold or none was checked.
     """
     from training.run_folder import to_json
 

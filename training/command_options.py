@@ -22,7 +22,7 @@ Sensor = Annotated[str | None, typer.Option(help="landmark, or stereo: rendered 
 Seed = Annotated[int | None, typer.Option(help="Of all random draws.", show_default="0")]
 FirstSeed = Annotated[int | None, typer.Option(help="The first of them.", show_default="0")]
 Processes = Annotated[int, typer.Option(help="Trials at a time.")]
-Check = Annotated[bool, typer.Option("--check", help="Exit with status 1 unless all goals are met, all claims hold.")]
+Check = Annotated[bool, typer.Option("--check", help="Exit with status 1 unless all claims hold.")]
 Out = Annotated[Path | None, typer.Option(help="New run folder.", show_default="the next free one in runs")]
 OutToGoOn = Annotated[
     Path | None,

@@ -5,14 +5,14 @@ from rich.console import Console
 from training.bench_env import EnvBenchResult, EnvRow
 from training.env_timing import PEER, StepTimes
 from training.text_tables import console_table
-from training.timed_bench import print_caveats, print_goals
+from training.timed_bench import print_caveats
 
 # "Undisturbed": the median over each call's best repeat. "Per s": by the median, then by the mean.
 TIMES = ("median", "mean", "99 %", "least", "undis-\nturbed", "per s", "by mean")
 
 
 def print_env_result(console: Console, result: EnvBenchResult, asked_peer: bool) -> None:
-    """Print rows, the budget of a step, what else was measured, and the goals."""
+    """Print rows, the budget of a step, and what else was measured."""
     if result.rows:
         rows = [(_told(row), *_times(row.times)) for row in result.rows]
         console.print(console_table("env.step [us]: robots, particles, world, walls, mode", ("", *TIMES), rows))
@@ -36,7 +36,6 @@ def print_env_result(console: Console, result: EnvBenchResult, asked_peer: bool)
         console.print(f"A step of the first row takes {told}.", highlight=False)
     if asked_peer and result.peer is None and result.complete:
         console.print(f"{PEER} is not installed: no peer was timed (pip install {PEER}).", highlight=False)
-    print_goals(console, result.goals())
     print_caveats(console, result.machine, result.complete)
 
 

@@ -1,13 +1,9 @@
-"""Trials of `vslam bench exploration` summed up: means, paired differences, curves, and what is asked of them."""
+"""Trials of `vslam bench exploration` summed up: means, paired differences, curves."""
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from slam_backend.errors import FloatArray
-from training.bench_exploration import ALL_ORACLES, NO_ORACLE
+from training.bench_exploration import NO_ORACLE
 from training.exploration_trials import CURVES, TEAM
 from training.seed_means import ahead_by, mean_of
 
@@ -23,8 +19,6 @@ FIGURES = (
 COMPARED = {
     "mean_coverage": True, "below_90_s": False, "map_error": False, "map_rmse_m": False, "pose_error": False,
 }  # fmt: skip
-MOST_FALSE = 0.02  # of all merges that were not undone
-TOLD_M = 1e-3  # an oracle's merge is sure to a tenth of a millimetre
 
 
 def summarise(rows: Rows) -> list[dict[str, Any]]:
@@ -83,66 +77,6 @@ def curves(rows: Rows) -> list[dict[str, Any]]:
                 line |= mean_of(name, [row["curves"][name][point] for row in own])
             found.append(line)
     return found
-
-
-def check_goals(rows: Rows) -> list[dict[str, Any]]:
-    """Ask what must hold of scripted policies, as far as they were played.
-
-    Random goals show more floor over time than a random walk, and the nearest frontier more than random goals. Robots
-    that are told everything know where they are, and have better maps of what they see, in the mean over the policies.
-    Hardly a merge is false.
-
-    Returns:
-        Per goal: `goal`, `limit`, `reached`, `low` and `high` of its interval, `seeds`, `met`: whether the whole
-        interval is within the limit.
-    """
-    found = []
-    places = _grouped(rows, PLACE)
-    for (world, robots, oracle), own in places.items():
-        where = f"{Path(world).name}, K={robots}"
-        by_policy = _grouped(own, ("policy",))
-        for less, more in (("random_walk", "random_goals"), ("random_goals", "frontier")):
-            if oracle == NO_ORACLE and (less,) in by_policy and (more,) in by_policy:
-                values = ahead_by(*(_by_seed(by_policy[name,], "mean_coverage") for name in (less, more)))
-                found.append(_goal(f"{where}: floor over time, {less} - {more}", 0.0, values))
-        if oracle == ALL_ORACLES:
-            found += _goals_of_told(where, own, places.get((world, robots, NO_ORACLE), ()))
-    made = sum(row["right_merges"] + row["false_merges"] for row in rows)
-    if made:
-        share = sum(row["false_merges"] for row in rows) / made
-        seeds = len({row["seed"] for row in rows})
-        found.append(_goal("false merges, of all that were not undone", MOST_FALSE, np.array([share]), seeds))
-    return found
-
-
-def _goals_of_told(where: str, told: Rows, untold: Rows) -> list[dict[str, Any]]:
-    """Ask what must hold of robots that are told all, beside the same policies and seeds untold."""
-    worst = np.array([max(row["pose_error"] for row in told)])
-    found = [_goal(f"{where}, told all: worst pose error [m]", TOLD_M, worst, len({row["seed"] for row in told}))]
-    before = {(row["seed"], row["policy"]): row["map_rmse_m"] for row in untold}
-    by_seed: dict[int, list[float]] = {}
-    for row in told:
-        pair = row["map_rmse_m"], before.get((row["seed"], row["policy"]))
-        if None not in pair:
-            by_seed.setdefault(row["seed"], []).append(pair[0] - pair[1])
-    if by_seed:
-        means = np.array([np.mean(differences) for differences in by_seed.values()])
-        found.append(_goal(f"{where}: map RMSE, told - not told [m]", 0.0, means))
-    return found
-
-
-def _goal(name: str, limit: float, values: FloatArray, seeds: int | None = None) -> dict[str, Any]:
-    """Return a goal: the mean of values over seeds, with all of its interval, is at most `limit`.
-
-    With `seeds` given there is one value, of all these seeds together; otherwise one seed does not tell of the others.
-    """
-    mean = mean_of("reached", values)
-    reached, low, high = (mean[name] for name in ("reached", "reached_low", "reached_high"))
-    most = high if seeds is None else reached
-    return {
-        "goal": name, "limit": limit, "reached": reached, "low": low, "high": high,
-        "seeds": len(values) if seeds is None else seeds, "met": most is not None and most <= limit,
-    }  # fmt: skip
 
 
 def _differences(told: Mapping[str, Any], own: Rows, other: Rows) -> list[dict[str, Any]]:

@@ -93,15 +93,14 @@ def label(name: str) -> str:
     return f"{path.parent.name}/{path.name}" if path.name == MODEL_FILE else path.name
 
 
-def print_tables(console: Console, lines: Rows, policies: Rows, oracles: Rows, goals: Rows) -> None:
-    """Print, for each world and number of robots, the figures in short and the differences; then the goals.
+def print_tables(console: Console, lines: Rows, policies: Rows, oracles: Rows) -> None:
+    """Print, for each world and number of robots, the figures in short and the differences.
 
     Args:
         console: Where to; 80 columns are enough.
         lines: Of `summarise`.
         policies: Of `compare_policies`.
         oracles: Of `compare_oracles`.
-        goals: Of `check_goals`.
     """
     for (world, robots), own in _places(lines).items():
         title = f"{label(world)}, K={robots}, {_seeds(own)}"
@@ -110,12 +109,10 @@ def print_tables(console: Console, lines: Rows, policies: Rows, oracles: Rows, g
         for heading, differences in _comparisons(_at(policies, world, robots), _at(oracles, world, robots)):
             rows = [[who, *cells] for who, cells in _difference_rows(differences, True)]
             console.print(console_table(f"{title}: {heading}", _stacked(HEADINGS[name] for name in COMPARED), rows))
-    if goals:
-        console.print(console_table("Goals", *_goal_rows(goals)))
 
 
-def markdown(lines: Rows, policies: Rows, oracles: Rows, goals: Rows) -> str:
-    """Return all figures, differences and goals as Markdown."""
+def markdown(lines: Rows, policies: Rows, oracles: Rows) -> str:
+    """Return all figures and differences as Markdown."""
     parts = []
     for (world, robots), own in _places(lines).items():
         parts.append(f"### {label(world)}, K={robots}, {_seeds(own)}\n")
@@ -125,8 +122,6 @@ def markdown(lines: Rows, policies: Rows, oracles: Rows, goals: Rows) -> str:
         for heading, differences in _comparisons(_at(policies, world, robots), _at(oracles, world, robots)):
             rows = [[who, *cells] for who, cells in _difference_rows(differences, False)]
             parts.append(markdown_table([heading, *(HEADINGS[name] for name in COMPARED)], rows))
-    if goals:
-        parts += ["### Goals\n", markdown_table(*_goal_rows(goals))]
     return "\n".join(parts)
 
 
@@ -146,16 +141,6 @@ def who_is(line: Mapping[str, Any], between: str = ", ") -> str:
     told = "" if line["oracle"] == NO_ORACLE else f"{between}told {line['oracle']}"
     name = label(line["policy"])
     return (name.replace("@", f"{BELOW}@") if between == BELOW else name) + told
-
-
-def _goal_rows(goals: Rows) -> tuple[list[str], list[list[str]]]:
-    """Return headings and rows of text for the goals."""
-    rows = []
-    for goal in goals:
-        range_ = "" if goal["low"] is None else f"{goal['low']:z.3f} .. {goal['high']:z.3f}"
-        met = "yes" if goal["met"] else "no"
-        rows.append([goal["goal"], f"{goal['limit']:g}", f"{goal['reached']:z.3f}", range_, str(goal["seeds"]), met])
-    return ["goal", "at most", "reached", "95 %", "seeds", "met"], rows
 
 
 def _stacked(headings: Iterable[str]) -> list[str]:

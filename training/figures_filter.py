@@ -12,11 +12,11 @@ from matplotlib.patches import Patch
 
 from slam_backend.errors import FloatArray
 from training.bench_filter import BenchResult
-from training.filter_goals import COMMON, STEP_MS
 from training.filter_trials import Row
 from training.png import save_png
 
 COLOURS = {"fastslam1": "#0072B2", "fastslam2": "#D55E00"}
+COMMON = {"landmarks": 300, "measurements": 15, "robots": 1}
 INK = "0.35"
 AXES = (
     ("landmarks", "landmarks in the map, N", "B = 15, K = 1"),
@@ -27,13 +27,12 @@ LEGEND = [
     *(Line2D([], [], color=colour, marker="o", label=name) for name, colour in COLOURS.items()),
     Patch(color=INK, alpha=0.2, lw=0, label="10-90 % of the steps"),
     Line2D([], [], color=INK, ls=":", label="least possible: the greater of the two bounds"),
-    Line2D([], [], color=INK, ls="", marker="_", ms=14, mew=2, label="goal"),
     Line2D([], [], color=INK, ls="--", lw=1.0, label="plain reference, extrapolated"),
 ]
 
 
 def draw_speed(file: Path, result: BenchResult) -> None:
-    """Draw the time of a step against N, M and K into a PNG file: medians beside bounds, goals and the reference."""
+    """Draw the time of a step against N, M and K into a PNG file: medians beside bounds and the reference."""
     figure = Figure(figsize=(12.0, 5.0), layout="constrained")
     panels = figure.subplots(1, 3, sharey=True)
     for ax, (name, label, title) in zip(panels, AXES, strict=True):
@@ -77,9 +76,7 @@ def _draw_panel(ax: Axes, rows: Sequence[Row], name: str) -> None:
 
 
 def _draw_references(ax: Axes, rows: Sequence[Row], result: BenchResult) -> None:
-    """Draw the goals, and the plain reference where it was timed."""
-    for (proposal, particles), limit in STEP_MS.items():
-        ax.plot(particles, limit, ls="", marker="_", ms=16, mew=2, color=COLOURS[proposal])
+    """Draw the plain reference where it was timed."""
     for proposal, colour in COLOURS.items():
         plain: list[Any] = [
             (row.load.particles, result.plain_ms(row.load)) for row in rows if row.load.proposal == proposal

@@ -1,6 +1,5 @@
 """The tables that `vslam bench filter` ends with."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 from rich.console import Console
@@ -8,13 +7,12 @@ from rich.table import Table
 
 from training.bench_filter import BenchResult
 from training.filter_bounds import MULTIPLY_ADDS
-from training.filter_goals import Goal
 from training.filter_trials import PLAIN_PARTICLES, Row
 from training.timed_bench import print_caveats
 
 
-def print_result(console: Console, result: BenchResult, goals: Sequence[Goal]) -> None:
-    """Print rows, goals, and what else was measured."""
+def print_result(console: Console, result: BenchResult) -> None:
+    """Print rows and what else was measured."""
     machine = result.machine
     for proposal in dict.fromkeys(row.load.proposal for row in result.rows):
         console.print(_rows(result, proposal))
@@ -28,8 +26,6 @@ def print_result(console: Console, result: BenchResult, goals: Sequence[Goal]) -
             f"{PLAIN_PARTICLES}.",
             highlight=False,
         )
-    if goals:
-        console.print(_goals(goals))
     console.print(
         f"{machine['processor']}, one thread: copies {machine['copy_bytes_per_s'] / 1e9:.1f} GB/s "
         f"({machine['copy_in_cache_bytes_per_s'] / 1e9:.0f} GB/s in cache), multiplies and adds "
@@ -74,19 +70,6 @@ def _rows(result: BenchResult, proposal: str) -> Table:
             f"{timing.median_ms / row.copy_bound_ms:.3g}", f"{timing.median_ms / row.arithmetic_bound_ms:.3g}",
             f"{row.right:.0%}", "" if plain is None else f"{plain:.0f}",
         )  # fmt: skip
-    return table
-
-
-def _goals(goals: Sequence[Goal]) -> Table:
-    """Return the table of goals."""
-    table = Table(title="Goals")
-    for heading in ("figure", "measured", "at most", ""):
-        table.add_column(heading, justify="left" if heading in ("figure", "") else "right")
-    for goal in goals:
-        shown = _ms(goal.value) if goal.unit else f"{goal.value:.2f}"
-        limit = "" if goal.limit is None else f"{goal.limit:g} {goal.unit}".strip()
-        verdict = {True: "[green]met[/]", False: "[red]missed[/]", None: ""}[goal.is_met]
-        table.add_row(goal.name, f"{shown} {goal.unit}".strip(), limit, verdict)
     return table
 
 

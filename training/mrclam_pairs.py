@@ -19,8 +19,6 @@ from training.replay_scores import align_to_truth
 COMMAND = "bench mrclam"
 METHODS = ("ransac", "clique")
 ENOUGH_SHARED = 5  # landmarks from which on maps are to be aligned by their barcodes
-# What was set out for alignments by barcodes: medians, and the worst that is accepted.
-MEDIAN_M, MEDIAN_DEG, WORST_M = 0.15, 2.0, 0.5
 # Maps are bent by tenths of a metre, by more the younger they are.
 OPTIONS = AlignmentOptions(position_floor=0.3, min_inliers=ENOUGH_SHARED, max_sigma_heading=0.05)
 BARCODES: dict[str, AlignmentOptions] = {"given": OPTIONS, "hidden": replace(OPTIONS, appearance=False)}
@@ -136,24 +134,3 @@ def summarise(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
                 line[f"worst_{unit}"] = float(apart[:, column].max())
         lines.append(line)
     return lines
-
-
-def check_goals(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Return what was set out for alignments by barcodes, over all durations: `goal`, `measured`, `wanted`, `met`."""
-    own = [row for row in rows if row["barcodes"] == "given" and row["method"] == METHODS[0]]
-    enough = [row for row in own if row["shared"] >= ENOUGH_SHARED]
-    errors = np.array([[row["error_m"], row["error_deg"]] for row in own if row["error_m"] is not None]).reshape(-1, 2)
-    if not enough or not len(errors):
-        return []
-    share = sum(row["accepted"] for row in enough) / len(enough)
-    measured = (
-        (f"pairs that share {ENOUGH_SHARED} landmarks: share aligned", share, "all", share == 1.0),
-        ("median error [m]", float(np.median(errors[:, 0])), f"at most {MEDIAN_M:g}", None),
-        ("median error [°]", float(np.median(errors[:, 1])), f"at most {MEDIAN_DEG:g}", None),
-        ("worst accepted [m]", float(errors[:, 0].max()), f"at most {WORST_M:g}", None),
-    )
-    limits = (None, MEDIAN_M, MEDIAN_DEG, WORST_M)
-    return [
-        {"goal": goal, "measured": value, "wanted": wanted, "met": met if limit is None else value <= limit}
-        for (goal, value, wanted, met), limit in zip(measured, limits, strict=True)
-    ]

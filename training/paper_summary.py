@@ -47,7 +47,7 @@ def summarise(errors: Rows, times: Rows) -> list[dict[str, Any]]:
                 values = np.array([row[name] for row in rows if row[name] is not None], dtype=np.float64)
                 known = len(values) > 0
                 line[name] = float(values.mean()) if known else None
-                line[f"{name}_low"], line[f"{name}_high"] = interval((values,), np.mean) if known else (None, None)
+                line[f"{name}_low"], line[f"{name}_high"] = interval(values, np.mean) if known else (None, None)
         lines.append(line)
     return lines
 

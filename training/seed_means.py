@@ -23,7 +23,7 @@ def mean_of(name: str, values: Sequence[float | None] | FloatArray) -> dict[str,
     known = np.array([value for value in values if value is not None], dtype=np.float64)
     if not len(known):
         return dict.fromkeys((name, f"{name}_low", f"{name}_high"))
-    low, high = interval((known,), np.mean)
+    low, high = interval(known, np.mean)
     return {name: float(known.mean()), f"{name}_low": low, f"{name}_high": high}
 
 

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from typing import Any
 
 MEASURES = ("min_ms", "median_ms", "processor_ms")
-FRONT_END_MS, PAIR_MS = 3.0, 6.0  # goals at 320 x 240 with 100 landmarks and 40 walls
 NAMES = {
     "usurf": "u-SURF",
     "sift": "SIFT",

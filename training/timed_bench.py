@@ -1,4 +1,4 @@
-"""What benches of times have in common: trials one after the other until Ctrl-C, and goals that are met or missed."""
+"""What benches of times have in common: trials one after the other until Ctrl-C."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -26,20 +26,6 @@ def run_in_turn(
         on_trial(name)
         trial()
     return True
-
-
-def goal(name: str, measured: float, limit: float, at_least: bool = False) -> dict[str, Any]:
-    """Return a goal with what was measured: at most `limit`, or at least."""
-    met = measured >= limit if at_least else measured <= limit
-    return {"name": name, "measured": measured, "goal": limit, "at_least": at_least, "met": bool(met)}
-
-
-def print_goals(console: Console, goals: Sequence[Mapping[str, Any]]) -> None:
-    """Print a line for each goal."""
-    for each in goals:
-        sign = ">=" if each["at_least"] else "<="
-        verdict = f"goal {sign} {each['goal']:g}: {'met' if each['met'] else 'missed'}"
-        console.print(f"{each['name']}: {each['measured']:.4g}, {verdict}", highlight=False)
 
 
 def print_caveats(console: Console, machine: Mapping[str, Any], complete: bool) -> None:

@@ -146,7 +146,7 @@ def _beside_one(row: WorkerRow, times: WorkerTimes, alone: WorkerTimes) -> Worke
     """Return a row with what is compared with one worker, step by step."""
     work = times.spent[:, :, PROCESSOR].sum(axis=1) / alone.spent[:, :, PROCESSOR].sum(axis=1)
     ratios = alone.whole / times.whole
-    low, high = interval((ratios,), np.median)
+    low, high = interval(ratios, np.median)
     return replace(row, work=float(np.median(work)), gain=float(np.median(ratios)), gain_low=low, gain_high=high)
 
 

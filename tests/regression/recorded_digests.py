@@ -32,7 +32,7 @@ FILE = Path(__file__).with_name("digests.json")
 ROOT = Path(__file__).parents[2]
 DATA = Path(os.environ.get("VSLAM_DATA", ROOT.parent / "shared" / "data"))
 LIBRARIES = ("numpy", "scipy", "numba", "llvmlite", "opencv-python-headless", "pymunk")
-NOT_RESULTS = {"config", "versions", "seed", "goals"}  # tables of metrics.json; goals hold times
+NOT_RESULTS = {"config", "versions", "seed"}  # tables of metrics.json
 STEPS, STEREO_STEPS = 300, 40
 FALSE_MERGE, FALSE_MERGE_STEP = "fig5, undone merge", 60
 

@@ -17,7 +17,7 @@ from training.alignment_pairs import (
     draw_pair,
     draw_unalignable,
 )
-from training.alignment_summary import check_goals, summarise
+from training.alignment_summary import summarise
 from training.alignment_trials import Trial, play
 from training.bench_alignment import COMMAND, GRID, AlignmentBenchConfig
 
@@ -104,27 +104,6 @@ def test_errors_are_told_over_the_bound_and_refusals_count_as_failures() -> None
     assert line["reasons"] == {"ambiguous": 1}
     assert line["anees"] == 1.0
     assert line["anees_low"] < 1.0 < line["anees_high"]
-    assert not all(goal["met"] for goal in check_goals(summarise(rows), "ransac"))
-
-
-def test_goals_are_met_only_by_what_meets_them() -> None:
-    """Any one figure beyond its limit misses its goal, and no other."""
-    good = [row(error_m=0.02, error_rad=0.001)] * 50
-    good += [refusal("ambiguous", kind="U", case="half alike")] * 5 + [row(kind="I", case="area")] * 20
-    assert all(goal["met"] for goal in check_goals(summarise(good), "ransac"))
-    for bad, word in (
-        ([row(error_m=0.03)] * 60, "translation"),
-        ([row(error_rad=0.002)] * 60, "rotation"),
-        ([row(nees=9.0)] * 60, "ANEES"),
-        ([row(cpu_seconds=0.02)] * 60, "time"),
-        ([refusal("too few inliers")], "share right"),
-        ([row(kind="U", case="half alike", false=True)], "U: accepted"),
-        ([row(kind="I", case="area", false=True)], "I: accepted and false"),
-        ([refusal("ambiguous", kind="I", case="area")] * 4, "I: share"),
-    ):
-        missed = [goal["goal"] for goal in check_goals(summarise(good + bad), "ransac") if not goal["met"]]
-        assert len(missed) == 1, missed
-        assert word in missed[0]
 
 
 def test_a_trial_repeats() -> None:
@@ -163,21 +142,18 @@ def test_bad_configs_are_refused(changed: dict[str, Any], message: str) -> None:
 
 
 def test_the_command_leaves_tables_a_figure_and_every_trial(vslam: Any, tmp_path: Path) -> None:
-    """A small bench ends with its goals; begun again in the same folder, nothing is run twice."""
+    """A small bench leaves its tables; begun again in the same folder, nothing is run twice."""
     out, copy = tmp_path / "bench", tmp_path / "copy.json"
     options = ("--methods", "ransac,gnc", "--seeds", "1", "--hard", "9", "--first-seed", "100", "--out", str(out))
     said = vslam("bench", "alignment", *options, "--json", str(copy))
     assert said.status == 0
-    assert "I: share accepted" in said.out
+    assert "Maps that just can be aligned" in said.out
     metrics = json.loads((out / "metrics.json").read_text())
     assert metrics == json.loads(copy.read_text())
-    assert metrics["goals_of"] == "ransac"
     assert (out / "alignment.png").stat().st_size > 10_000
     assert "| 10 % | 90 % | ransac | 100.0 |" in (out / "tables.md").read_text()
     trials = (out / "trials.jsonl").read_text()
     assert len(trials.splitlines()) == 2 * (len(GRID) + 18)
     assert vslam("bench", "alignment", *options).status == 0
     assert (out / "trials.jsonl").read_text() == trials
-    poor = ("--methods", "svd", "--seeds", "1", "--hard", "0", "--check", "--out", str(tmp_path / "b"))
-    assert vslam("bench", "alignment", *poor).status == 1
     assert COMMAND in (out / "config.toml").read_text()

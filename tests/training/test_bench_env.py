@@ -143,7 +143,7 @@ def test_stopping_early_leaves_what_there_is() -> None:
 
 
 def test_the_command_writes_its_figures(tmp_path: Path) -> None:
-    """The run folder and the JSON hold rows, budget, snapshots, resets and goals; the config repeats the run."""
+    """The run folder and the JSON hold rows, budget, snapshots and resets; the config repeats the run."""
     out, file = tmp_path / "run", tmp_path / "figures.json"
     arguments = ["bench", "env", "--robots", "1", "--particles", "5", "--worlds", "fig5", "--modes", "flat,goal",
                  "--steps", "4", "--no-peer"]  # fmt: skip
@@ -156,8 +156,7 @@ def test_the_command_writes_its_figures(tmp_path: Path) -> None:
     assert figures["complete"]
     assert figures["peer"] is None
     assert {"get_state", "clone"} <= figures["snapshots"].keys()
-    assert {goal["name"] for goal in figures["goals"]} >= {"env.step, per second", "reset, ms"}
-    assert all(isinstance(goal["met"], bool) for goal in figures["goals"])
+    assert figures["reset"]["calls"] > 0
     again = runner.invoke(app, ["bench", "env", "--config", str(out / "config.toml"), "--out", str(tmp_path / "again")])
     assert again.exit_code == 0, again.output
     rows = json.loads((tmp_path / "again" / "metrics.json").read_text())["rows"]

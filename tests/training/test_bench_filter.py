@@ -13,7 +13,6 @@ from rich.console import Console
 from training import compile_timing, filter_bounds
 from training.bench_filter import BenchConfig, BenchResult, count_trials, run_bench
 from training.filter_bounds import arithmetic_bound_ms, bytes_moved, copy_bound_ms, map_bytes
-from training.filter_goals import goals_of
 from training.filter_load import FilterLoad
 from training.filter_tables import print_result
 from training.filter_trials import PlainRow, Row
@@ -45,7 +44,7 @@ def test_a_bench_leaves_a_folder_that_repeats_it(vslam: Any, tmp_path: Path) -> 
     first, second, copy = tmp_path / "first", tmp_path / "second", tmp_path / "copy.json"
     status, shown, _ = vslam("bench", "filter", *TINY, "--out", str(first), "--json", str(copy))
     assert status == 0
-    assert all(word in shown for word in ("K=2", "fastslam1", "fastslam2", "get_state", "bytes per particle"))
+    assert all(word in shown for word in ("K=2", "fastslam1", "fastslam2", "bytes per particle"))
     metrics = json.loads((first / "metrics.json").read_text())
     assert metrics == json.loads(copy.read_text())
     keys = ("proposal", "particles", "landmarks", "measurements", "robots")
@@ -109,33 +108,13 @@ def test_every_trial_is_announced() -> None:
     assert len(begun) == count_trials(config)
 
 
-def test_goals_are_held_against_the_rows_they_are_about() -> None:
-    """Times against limits, ratios over N, M and K from the rows that differ in these alone; missing rows, no goal."""
-    config = BenchConfig()
-    result = _result(lambda load: 1e-4 * load.particles * load.landmarks**0.25 * load.robots, config.loads())
-    goals = {goal.name: goal for goal in goals_of(result)}
-    assert goals["fastslam1, M=1000, N=300, B=15"].value == pytest.approx(0.1 * 300**0.25)
-    assert goals["fastslam1, M=1000, N=300, B=15"].is_met is False  # 0.42 over 0.4 ms
-    assert goals["fastslam2, M=1000, N=300, B=15"].is_met is True
-    assert goals["fastslam1, M=1000: time at N=1000 over N=100"].value == pytest.approx(10**0.25)
-    assert goals["fastslam1, M=1000: time at N=1000 over N=100"].is_met is False
-    assert goals["fastslam1, M=100: time at N=1000 over N=100"].is_met is True
-    assert goals["fastslam2, N=300: time at M=1000 over M=100"].value == pytest.approx(10.0)
-    assert goals["fastslam2, M=100: time at K=3 over K=1, same B"].value == pytest.approx(3.0)
-    assert goals["fastslam2, M=100: time at K=3 over K=1, same B"].is_met is None
-    assert (goals["get_state, M=100, N=300"].is_met, goals["set_state, M=100, N=300"].is_met) == (True, False)
-    few = _result(lambda load: 1.0, [FilterLoad()])
-    assert [goal.name for goal in goals_of(few)][:1] == ["fastslam2, M=100, N=300, B=15"]
-    assert len(goals_of(few)) == 3
-
-
 def test_the_table_tells_all() -> None:
     """On 80 columns: robots side by side, factors over both bounds, the reference, a busy machine, an early stop."""
     load = FilterLoad(particles=1000)
     plain = PlainRow(load=replace(load, particles=2), timing=Timing(7.0, 6.0, 8.0, 6.0, 5))
     result = _result(lambda load: 0.5 * load.robots, [load, replace(load, robots=3)], (plain,))
     shown = StringIO()
-    print_result(Console(file=shown, width=80), result, goals_of(result))
+    print_result(Console(file=shown, width=80), result)
     text = shown.getvalue()
     line = next(line for line in text.splitlines() if line.strip().startswith("1000"))
     assert line.split() == [
@@ -144,7 +123,7 @@ def test_the_table_tells_all() -> None:
     text = " ".join(text.split())
     for words in ("fastslam2: median in ms", "80 bytes per particle and landmark", "was busy (load 2.5)"):
         assert words in text
-    assert {"Stopped", "met"} <= set(text.split())
+    assert "Stopped" in text
 
 
 def test_the_widest_rows_fit_on_80_columns() -> None:
@@ -154,7 +133,7 @@ def test_the_widest_rows_fit_on_80_columns() -> None:
     plain = tuple(PlainRow(load=load, timing=slow) for load in BenchConfig(particles=(2,), robots=(1,)).loads())
     shown = StringIO()
     result = _result(lambda load: 64.2e-4 * load.particles, loads, plain)
-    print_result(Console(file=shown, width=80), result, [])
+    print_result(Console(file=shown, width=80), result)
     assert "…" not in shown.getvalue()
     assert "10000 1000 15" in shown.getvalue()
     assert "41500" in shown.getvalue()

@@ -12,10 +12,10 @@ pytest.importorskip("stable_baselines3", reason="stable-baselines3 is not instal
 pytest.importorskip("sb3_contrib", reason="sb3-contrib is not installed: pip install .[train]")
 pytest.importorskip("tensorboard", reason="tensorboard is not installed: pip install .[train]")
 
-from training.bench_train import TrainBenchConfig, TrainBenchResult, run_bench
+from training.bench_train import TrainBenchConfig, run_bench
 from training.cli import app
-from training.train_timing import ADAPTER_ALONE, RECORDED, Part, Replay, record
-from training.worker_timing import WorkerRow, WorkerTimes, summarise_workers
+from training.train_timing import ADAPTER_ALONE, RECORDED, Replay, record
+from training.worker_timing import WorkerTimes, summarise_workers
 
 runner = CliRunner()
 SMALL = TrainBenchConfig(world="fig5", robots=1, envs=1, workers=(0,), steps=2)
@@ -31,20 +31,6 @@ def test_a_replay_gives_what_was_recorded() -> None:
     for step in told[:RECORDED]:
         assert replay.observation_space("robot_0").contains(step[0]["robot_0"])
     assert not np.array_equal(told[0][0]["robot_0"]["local_grid"], told[-1][0]["robot_0"]["local_grid"])
-
-
-def test_goals_are_judged() -> None:
-    """The adapter must stay below its limit, and two workers must gain what was asked for."""
-    rows = (_row(1, None), _row(2, 1.7), _row(4, 3.0))
-    parts = (Part("adapter, between steps", 9.0, 8.0), Part(ADAPTER_ALONE, 4.0, 3.0))
-    result = TrainBenchResult({}, parts, rows, True)
-    adapter, gain = result.goals()
-    assert (adapter["measured"], adapter["met"]) == (4.0, True)
-    assert (gain["measured"], gain["met"]) == (pytest.approx(1.7), False)
-
-
-def _row(workers: int, gain: float | None) -> WorkerRow:
-    return WorkerRow(workers, 100.0, 110.0, 95.0, 5.0, 0.9, gain=gain)
 
 
 def test_times_of_workers_are_summed_up() -> None:
@@ -90,7 +76,7 @@ def test_stopping_early_leaves_what_there_is() -> None:
 
 @pytest.mark.slow
 def test_the_command_writes_its_figures(tmp_path: Path) -> None:
-    """The run folder and the JSON hold all parts of a decision, the rates over workers, and the goals."""
+    """The run folder and the JSON hold all parts of a decision, and the rates over workers."""
     out, file = tmp_path / "run", tmp_path / "figures.json"
     arguments = ["bench", "train", "--world", "fig5", "--robots", "1", "--envs", "1", "--workers", "0", "--steps", "3"]
     result = runner.invoke(app, [*arguments, "--out", str(out), "--json", str(file)])

@@ -110,8 +110,8 @@ def test_a_folder_that_cannot_be_had_is_refused_before_any_work(below: bool, tmp
 
 
 @pytest.mark.parametrize(("held", "status"), [([True, True], 0), ([True, False], 1), ([], 1)])
-def test_check_turns_missed_goals_into_status_1(held: list[bool], status: int, tmp_path: Path) -> None:
-    """With --check a missed goal, or none at all, is status 1; the metrics are written either way."""
+def test_check_turns_claims_that_fail_into_status_1(held: list[bool], status: int, tmp_path: Path) -> None:
+    """With --check a claim that does not hold, or none at all, is status 1; the metrics are written either way."""
     folder = RunFolder.create(tmp_path / "run", "count", {}, 0)
     copy = tmp_path / "copy.json"
     metrics = folder.write_metrics({"found": 1})

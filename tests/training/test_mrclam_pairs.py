@@ -9,7 +9,7 @@ import pytest
 from small_logs import write_log
 
 from slam_backend.readers.mrclam import load_mrclam
-from training.mrclam_pairs import MrclamPairsConfig, align_log, align_pairs, check_goals, summarise
+from training.mrclam_pairs import MrclamPairsConfig, align_log, align_pairs, summarise
 from training.replay_mrclam import ReplayConfig, replay
 
 
@@ -29,7 +29,6 @@ def test_exact_maps_are_aligned_exactly(tmp_path: Path) -> None:
         if row["accepted"]:
             assert row["error_m"] < 0.1
             assert row["error_deg"] < 2.0
-    assert all(goal["met"] for goal in check_goals([{"duration_s": None} | row for row in rows]))
 
 
 def row(**changed: Any) -> dict[str, Any]:
@@ -40,17 +39,14 @@ def row(**changed: Any) -> dict[str, Any]:
     } | changed  # fmt: skip
 
 
-def test_sums_count_what_is_false_and_goals_what_is_missed() -> None:
-    """Refusals miss the first goal, errors the others; pairs that share little are no failures."""
+def test_sums_count_what_is_false() -> None:
+    """Large errors count as false, refusals do not; pairs that share little are not counted."""
     refused = {"accepted": False, "reason": "ambiguous", "error_m": None, "error_deg": None}
     rows = [row(), row(error_m=0.6), row(error_deg=7.0), row(**refused), row(shared=3, **refused)]
     line = summarise(rows)[0]
     assert (line["pairs"], line["accepted"], line["false"]) == (4, 3, 2)
     assert line["median_m"] == 0.1
     assert line["worst_deg"] == 7.0
-    assert [goal["met"] for goal in check_goals(rows)] == [False, True, True, False]
-    assert [goal["met"] for goal in check_goals([row(), row(shared=3, **refused)])] == [True] * 4
-    assert check_goals([]) == []
     assert summarise([row(**refused)])[0]["median_m"] is None
 
 
@@ -76,7 +72,7 @@ def test_the_command_leaves_a_table(vslam: Any, tmp_path: Path) -> None:
     options = ("--path", str(tmp_path), "--durations", "30,0", "--particles", "10", "--out", str(out))
     said = vslam("bench", "mrclam", *options)
     assert said.status == 0
-    assert "share aligned" in said.out
+    assert "aligned pairwise" in said.out
     assert len((out / "table.md").read_text().splitlines()) == 2 + 8
     metrics = json.loads((out / "metrics.json").read_text())
     assert [line["duration_s"] for line in metrics["summary"]] == [30.0] * 4 + [None] * 4
@@ -88,8 +84,10 @@ def test_real_maps_are_aligned_by_barcodes_and_never_falsely_without(data_dir: P
     """After 200 s all ten pairs of data set 7 are aligned by barcodes; without them few are, none of them wrongly."""
     path = data_dir / "mrclam" / "MRCLAM_Dataset7"
     rows = align_log(MrclamPairsConfig(path=str(path), durations=(200.0,), particles=50, seed=100))
-    assert all(goal["met"] for goal in check_goals(rows))
     for line in summarise(rows):
         assert line["false"] == 0
-        assert line["accepted"] == 10 or line["barcodes"] == "hidden"
+        if line["barcodes"] == "given":
+            assert line["accepted"] == 10
+            assert line["median_deg"] < 2.0
+            assert line["worst_m"] < 0.5
     assert np.median([row["error_m"] for row in rows if row["error_m"] is not None]) < 0.1
