@@ -19,9 +19,8 @@ from training.env_timing import (
     time_simulator,
     time_snapshots,
 )
-from training.machine_rates import describe_machine
 from training.plain_config import PlainConfig, check_each_once
-from training.timed_bench import run_in_turn
+from training.timed_bench import describe_machine, run_in_turn
 from vslam_env import vslam_v0
 from vslam_env.config import MAX_ROBOTS, EnvConfig
 

@@ -9,15 +9,14 @@ from slam_backend.errors import check_choice, check_int
 from slam_backend.filter_options import PROPOSALS
 from training.compile_timing import time_compilation
 from training.filter_load import FilterLoad, Proposal
-from training.filter_trials import PlainRow, Row, time_plain, time_row, time_state
-from training.machine_rates import describe_machine
+from training.filter_trials import Row, time_row, time_state
 from training.plain_config import PlainConfig, check_each_once
 from training.step_timing import Timing
+from training.timed_bench import describe_machine
 
 STATE_LOAD = FilterLoad(particles=100, landmarks=300, measurements=15)
 LARGE_LOADS = [FilterLoad(particles=10_000, landmarks=n, measurements=15) for n in (300, 1000)]
 LARGE_STEPS = 60
-PLAIN_LANDMARKS = 300  # with more of them the plain reference takes minutes to be filled
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -33,7 +32,6 @@ class BenchConfig(PlainConfig):
         lookalikes: So many landmarks share one descriptor.
         steps: Timed steps per row.
         large: Also 10,000 particles with 300 and 1,000 landmarks each.
-        plain: Also the plain reference.
         compile: Also the compilation of the kernels.
         seed: Of all random draws.
     """
@@ -46,7 +44,6 @@ class BenchConfig(PlainConfig):
     lookalikes: int = 1
     steps: int = 300
     large: bool = False
-    plain: bool = True
     compile: bool = False
     seed: int = 0
 
@@ -69,14 +66,6 @@ class BenchConfig(PlainConfig):
         large = [replace(load, proposal=p, **common) for p in self.proposals for load in LARGE_LOADS]
         return rows + large if self.large else rows
 
-    def plain_loads(self) -> list[FilterLoad]:
-        """Return what the plain reference is timed on."""
-        first = (self.particles[0], self.robots[0])
-        return [
-            load for load in self.loads()
-            if self.plain and (load.particles, load.robots) == first and load.landmarks <= PLAIN_LANDMARKS
-        ]  # fmt: skip
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BenchResult:
@@ -85,7 +74,6 @@ class BenchResult:
     Attributes:
         machine: As `describe_machine` tells.
         rows: In the order of the loads; fewer where the user stopped.
-        plain: Likewise.
         state: Of `get_state` and `set_state`; none where the user stopped.
         compilation: As `time_compilation` tells, or None.
         complete: Whether nothing is missing.
@@ -93,7 +81,6 @@ class BenchResult:
 
     machine: dict[str, Any]
     rows: tuple[Row, ...]
-    plain: tuple[PlainRow, ...]
     state: dict[str, Timing]
     compilation: dict[str, Any] | None
     complete: bool
@@ -103,19 +90,11 @@ class BenchResult:
         found = (row for row in self.rows if all(getattr(row.load, k) == v for k, v in numbers.items()))
         return next(found, None)
 
-    def plain_ms(self, load: FilterLoad) -> float | None:
-        """Return the plain reference's time under a load, extrapolated in the number of particles."""
-        for row in self.plain:
-            if replace(load, particles=row.load.particles) == row.load:
-                return row.extrapolated_ms(load.particles)
-        return None
-
     def to_mapping(self) -> dict[str, Any]:
         """Return it as plain values."""
         return {
             "machine": self.machine,
-            "rows": [row.to_mapping() | {"plain_ms": self.plain_ms(row.load)} for row in self.rows],
-            "plain": [asdict(row.load) | asdict(row.timing) for row in self.plain],
+            "rows": [row.to_mapping() for row in self.rows],
             "state": {name: asdict(timing) for name, timing in self.state.items()},
             "compilation": self.compilation,
             "complete": self.complete,
@@ -143,18 +122,16 @@ def run_bench(
         on_trial(trial)
         return True
 
-    on_trial("this machine")
     machine = describe_machine()
     rows = [time_row(load, _steps(config, load)) for load in config.loads() if goes_on(_name(load))]
-    plain = [time_plain(load) for load in config.plain_loads() if goes_on(f"plain {_name(load)}")]
     state = time_state(STATE_LOAD) if goes_on("get_state, set_state") else {}
     compilation = time_compilation() if config.compile and goes_on("compilation") else None
-    return BenchResult(machine, tuple(rows), tuple(plain), state, compilation, not left_out)
+    return BenchResult(machine, tuple(rows), state, compilation, not left_out)
 
 
 def count_trials(config: BenchConfig) -> int:
     """Return how often `run_bench` calls `on_trial`."""
-    return 2 + len(config.loads()) + len(config.plain_loads()) + config.compile
+    return 1 + len(config.loads()) + config.compile
 
 
 def _steps(config: BenchConfig, load: FilterLoad) -> int:

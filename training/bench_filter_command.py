@@ -1,4 +1,4 @@
-"""The command `vslam bench filter`: how fast the filter is, on this machine, beside the plain reference and bounds."""
+"""The command `vslam bench filter`: how fast the filter is on this machine."""
 
 from typing import Annotated, Any
 
@@ -9,7 +9,7 @@ from training.command_options import Config, Json, Out, Seed, numbers
 from training.command_progress import trials_shown
 
 COMMAND = "bench filter"
-QUICK: dict[str, Any] = {"measurements": (15,), "robots": (1,), "steps": 100, "plain": False}
+QUICK: dict[str, Any] = {"measurements": (15,), "robots": (1,), "steps": 100}
 
 
 def bench_filter(
@@ -27,11 +27,10 @@ def bench_filter(
         int | None, typer.Option(help="So many landmarks share one descriptor.", show_default="1")
     ] = None,
     steps: Annotated[int | None, typer.Option(help="Timed steps per row.", show_default="300")] = None,
-    quick: Annotated[bool, typer.Option("--quick", help="B=15, K=1, 100 steps, no plain reference.")] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="B=15, K=1, 100 steps.")] = False,
     large: Annotated[
         bool | None, typer.Option(help="Also 10,000 particles with 300 and 1,000 landmarks.", show_default="no-large")
     ] = None,
-    plain: Annotated[bool | None, typer.Option(help="Also the plain reference.", show_default="plain")] = None,
     compilation: Annotated[
         bool | None,
         typer.Option("--compile/--no-compile", help="Also compiling into an empty cache.", show_default="no-compile"),
@@ -45,7 +44,7 @@ def bench_filter(
     from training.bench_filter import BenchConfig, count_trials, run_bench
     from training.figures_filter import draw_speed
     from training.filter_tables import print_result
-    from training.run_folder import plain as to_plain
+    from training.run_folder import plain
 
     given = {
         "particles": numbers("particles", particles),
@@ -55,7 +54,6 @@ def bench_filter(
         "lookalikes": lookalikes,
         "steps": steps,
         "large": large,
-        "plain": plain,
         "compile": compilation,
         "seed": seed,
     }
@@ -65,6 +63,6 @@ def bench_filter(
     with trials_shown(console, count_trials(chosen)) as (on_trial, interrupted):
         result = run_bench(chosen, on_trial, interrupted)
     print_result(console, result)
-    metrics = folder.write_metrics(to_plain(result.to_mapping()))
+    metrics = folder.write_metrics(plain(result.to_mapping()))
     draw_speed(folder.path / "speed.png", result)
     finish(console, folder, metrics, json)

@@ -10,11 +10,11 @@ import numpy as np
 from slam_backend.camera import StereoCamera
 from slam_backend.errors import check_choice, check_int
 from slam_backend.frontend import DESCRIPTORS, CornerOptions, FrontEndOptions, StereoFrontEnd
-from training.machine_rates import describe_machine
 from training.plain_config import PlainConfig, check_each_once
 from training.step_timing import Timing, time_calls
 from training.stereo_quality import quality_row, retrieval, second_looks
 from training.stereo_scenes import Scene, panel_hall
+from training.timed_bench import describe_machine
 from vslam_env.sensors.stereo_textures import STYLES, TextureConfig
 
 BUSY = TextureConfig(polygons=20.0, posters=0.6)  # enough corners for 100 landmarks in an image

@@ -6,9 +6,8 @@ from typing import Any
 
 from slam_backend.errors import bad_argument, check_int
 from training.learn_config import SPLIT_TRAIN, TrainConfig
-from training.machine_rates import describe_machine
 from training.plain_config import PlainConfig
-from training.timed_bench import run_in_turn
+from training.timed_bench import describe_machine, run_in_turn
 from training.train_timing import Part, Recording, record, time_adapter, time_learner
 from training.worker_timing import CLOCK, WorkerRow, WorkerTimes, summarise_workers, time_workers
 from vslam_env.config import EnvConfig

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -26,13 +25,11 @@ AXES = (
 LEGEND = [
     *(Line2D([], [], color=colour, marker="o", label=name) for name, colour in COLOURS.items()),
     Patch(color=INK, alpha=0.2, lw=0, label="10-90 % of the steps"),
-    Line2D([], [], color=INK, ls=":", label="least possible: the greater of the two bounds"),
-    Line2D([], [], color=INK, ls="--", lw=1.0, label="plain reference, extrapolated"),
 ]
 
 
 def draw_speed(file: Path, result: BenchResult) -> None:
-    """Draw the time of a step against N, M and K into a PNG file: medians beside bounds and the reference."""
+    """Draw the time of a step against N, M and K into a PNG file."""
     figure = Figure(figsize=(12.0, 5.0), layout="constrained")
     panels = figure.subplots(1, 3, sharey=True)
     for ax, (name, label, title) in zip(panels, AXES, strict=True):
@@ -40,8 +37,6 @@ def draw_speed(file: Path, result: BenchResult) -> None:
         rows = [row for row in result.rows if all(getattr(row.load, key) == value for key, value in numbers.items())]
         ax.set(xscale="linear" if name == "robots" else "log", yscale="log", xlabel=label, title=title)
         _draw_panel(ax, rows, name)
-        if name == "particles":
-            _draw_references(ax, rows, result)
         shown = sorted({getattr(row.load, name) for row in rows})
         ax.set_xticks(shown, [f"{value:,}" for value in shown])
         ax.set_xticks([], minor=True)
@@ -62,11 +57,10 @@ def _draw_panel(ax: Axes, rows: Sequence[Row], name: str) -> None:
         line.sort(key=lambda row: int(getattr(row.load, name)))
         if len(line) < longest:  # rows that were timed for another panel
             continue
-        x, low, median, high, bound = _columns(line, name)
+        x, low, median, high = _columns(line, name)
         colour = COLOURS[proposal]
         ax.plot(x, median, color=colour, marker="o", ms=4)
         ax.fill_between(x, low, high, color=colour, alpha=0.15, lw=0)
-        ax.plot(x, bound, color=colour, ls=":", lw=1.2)
         if particles:
             above = proposal == "fastslam2"  # the slower one, so that labels keep apart
             ax.annotate(
@@ -75,23 +69,8 @@ def _draw_panel(ax: Axes, rows: Sequence[Row], name: str) -> None:
             )  # fmt: skip
 
 
-def _draw_references(ax: Axes, rows: Sequence[Row], result: BenchResult) -> None:
-    """Draw the plain reference where it was timed."""
-    for proposal, colour in COLOURS.items():
-        plain: list[Any] = [
-            (row.load.particles, result.plain_ms(row.load)) for row in rows if row.load.proposal == proposal
-        ]
-        known = sorted(pair for pair in plain if pair[1] is not None)
-        if known:
-            ax.plot(*np.transpose(known), color=colour, ls="--", lw=1.0)
-
-
 def _columns(line: Sequence[Row], name: str) -> FloatArray:
-    """Return the abscissa, the low, median and high time, and the bound [ms] of a line, (5, n)."""
-    return np.transpose([
-        (
-            getattr(row.load, name), row.timing.low_ms, row.timing.median_ms, row.timing.high_ms,
-            max(row.copy_bound_ms, row.arithmetic_bound_ms),
-        )
-        for row in line
-    ])  # fmt: skip
+    """Return the abscissa and the low, median and high time [ms] of a line, (4, n)."""
+    return np.transpose(
+        [(getattr(row.load, name), row.timing.low_ms, row.timing.median_ms, row.timing.high_ms) for row in line]
+    )

@@ -6,8 +6,7 @@ from rich.console import Console
 from rich.table import Table
 
 from training.bench_filter import BenchResult
-from training.filter_bounds import MULTIPLY_ADDS
-from training.filter_trials import PLAIN_PARTICLES, Row
+from training.filter_trials import Row
 from training.timed_bench import print_caveats
 
 
@@ -18,21 +17,11 @@ def print_result(console: Console, result: BenchResult) -> None:
         console.print(_rows(result, proposal))
     if result.rows:
         console.print(
-            "Unknown association, resampling at every step. bytes: how many times the copy of 2 B M (72 + 4) bytes in "
-            f"a working set as large as the maps. arith: likewise B M {MULTIPLY_ADDS['fastslam1']} (fastslam1) or B M "
-            f"{MULTIPLY_ADDS['fastslam2']} (fastslam2) multiply-adds and the descriptors' product, at the rate of a "
-            "matrix product. right: measurements given to the landmark they are of. plain: the reference with "
-            f"{PLAIN_PARTICLES} particles, times M / "
-            f"{PLAIN_PARTICLES}.",
+            "Unknown association, resampling at every step, one thread. right: measurements given to the landmark they "
+            "are of.",
             highlight=False,
         )
-    console.print(
-        f"{machine['processor']}, one thread: copies {machine['copy_bytes_per_s'] / 1e9:.1f} GB/s "
-        f"({machine['copy_in_cache_bytes_per_s'] / 1e9:.0f} GB/s in cache), multiplies and adds "
-        f"{machine['multiply_adds_per_s_float64'] / 1e9:.0f} (float64), "
-        f"{machine['multiply_adds_per_s_float32'] / 1e9:.0f} (float32) billion times a second.",
-        highlight=False,
-    )
+    console.print(f"{machine['processor']}.", highlight=False)
     if result.rows:
         largest = max(result.rows, key=lambda row: row.load.particles * row.load.landmarks)
         console.print(
@@ -56,19 +45,18 @@ def _rows(result: BenchResult, proposal: str) -> Table:
     first, *more = sorted({row.load.robots for row in result.rows})
     table = Table(title=f"One step of {proposal}: median in ms", box=None, padding=(0, 1, 0, 0))
     headings = ("M", "N", "B", f"K={first}", "10-90 %", "least", *(f"K={k}" for k in more))
-    for heading in (*headings, "bytes", "arith", "right", "plain"):
+    for heading in (*headings, "right"):
         table.add_column(heading, justify="right", no_wrap=True)
     for row in result.rows:
         if row.load.robots != first or row.load.proposal != proposal:
             continue
         others = [result.find(**_numbers(row, robots=k)) for k in more]
-        timing, load, plain = row.timing, row.load, result.plain_ms(row.load)
+        timing, load = row.timing, row.load
         table.add_row(
             str(load.particles), str(load.landmarks), str(load.measurements),
             _ms(timing.median_ms), f"{_ms(timing.low_ms)}-{_ms(timing.high_ms)}", _ms(timing.min_ms),
             *("" if other is None else _ms(other.timing.median_ms) for other in others),
-            f"{timing.median_ms / row.copy_bound_ms:.3g}", f"{timing.median_ms / row.arithmetic_bound_ms:.3g}",
-            f"{row.right:.0%}", "" if plain is None else f"{plain:.0f}",
+            f"{row.right:.0%}",
         )  # fmt: skip
     return table
 

@@ -1,22 +1,18 @@
 """The trials of `vslam bench filter`: one filter, filled with a map, is timed step by step."""
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 
 from slam_backend.errors import IntArray
 from slam_backend.filter import FastSlam
-from slam_backend.plain import PlainFastSlam
 from slam_backend.reports import StepReport
-from training.filter_bounds import arithmetic_bound_ms, copy_bound_ms
 from training.filter_load import FilterLoad, LoadStep, LoadWorld
 from training.step_timing import Timing, time_calls
 
 SWEEPS = 3  # how often each landmark was measured before
 WARM_UP = 30  # steps that are not counted
-PLAIN_PARTICLES = 2
-PLAIN_STEPS = 5
 STATE_CALLS = 200
 
 
@@ -27,8 +23,6 @@ class Row:
     Attributes:
         load: What was timed.
         timing: Of `FastSlam.step`.
-        copy_bound_ms: See `training.filter_bounds`.
-        arithmetic_bound_ms: Likewise.
         right: Share of the measurements that the most probable particle gave to the landmark they are of.
         landmarks_held: By that particle at the end.
         ess: Mean effective sample size over M, before resampling.
@@ -38,18 +32,11 @@ class Row:
 
     load: FilterLoad
     timing: Timing
-    copy_bound_ms: float
-    arithmetic_bound_ms: float
     right: float
     landmarks_held: int
     ess: float
     resampled: float
     nbytes: int
-
-    @property
-    def times_bound(self) -> float:
-        """How many times longer than the greater of both bounds a step takes."""
-        return self.timing.median_ms / max(self.copy_bound_ms, self.arithmetic_bound_ms)
 
     @property
     def bytes_per_landmark(self) -> float:
@@ -59,25 +46,7 @@ class Row:
     def to_mapping(self) -> dict[str, Any]:
         """Return the row as one flat table of plain values."""
         rest = {name: value for name, value in asdict(self).items() if name not in ("load", "timing")}
-        derived = {"times_bound": self.times_bound, "bytes_per_landmark": self.bytes_per_landmark}
-        return asdict(self.load) | asdict(self.timing) | rest | derived
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PlainRow:
-    """The plain reference under a load; its time grows with the number of particles.
-
-    Attributes:
-        load: What was timed, with few particles.
-        timing: Of `PlainFastSlam.step`.
-    """
-
-    load: FilterLoad
-    timing: Timing
-
-    def extrapolated_ms(self, particles: int) -> float:
-        """Return the median for another number of particles, were it proportional."""
-        return self.timing.median_ms * particles / self.load.particles
+        return asdict(self.load) | asdict(self.timing) | rest | {"bytes_per_landmark": self.bytes_per_landmark}
 
 
 def time_row(load: FilterLoad, steps: int) -> Row:
@@ -89,25 +58,12 @@ def time_row(load: FilterLoad, steps: int) -> Row:
     return Row(
         load=load,
         timing=Timing.of(seconds),
-        copy_bound_ms=copy_bound_ms(load),
-        arithmetic_bound_ms=arithmetic_bound_ms(load),
         right=_share_right(course[WARM_UP:], reports, ids),
         landmarks_held=slam.map_size,
         ess=float(np.mean([report.ess for report in reports])) / load.particles,
         resampled=float(np.mean([report.resampled for report in reports])),
         nbytes=slam.nbytes,
     )
-
-
-def time_plain(load: FilterLoad) -> PlainRow:
-    """Time a few steps of the plain reference with a few particles."""
-    small = replace(load, particles=PLAIN_PARTICLES)
-    world = LoadWorld(small)
-    plain = PlainFastSlam(small.robots, small.options, small.seed, world.starts)
-    for step in world.mapping(1):
-        plain.step(step.odometry, step.frames, [names.tolist() for names in step.names])
-    seconds, _ = time_calls(lambda step: plain.step(step.odometry, step.frames), list(world.course(1 + PLAIN_STEPS)), 1)
-    return PlainRow(load=small, timing=Timing.of(seconds))
 
 
 def time_state(load: FilterLoad) -> dict[str, Timing]:

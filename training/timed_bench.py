@@ -1,6 +1,9 @@
-"""What benches of times have in common: trials one after the other until Ctrl-C."""
+"""What benches of times have in common: trials one after the other until Ctrl-C, and the machine that they ran on."""
 
+import os
+import platform
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
@@ -26,6 +29,22 @@ def run_in_turn(
         on_trial(name)
         trial()
     return True
+
+
+def describe_machine() -> dict[str, Any]:
+    """Return the processor, its number of cores, and the load of the last minute."""
+    load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
+    return {"processor": processor(), "cores": os.cpu_count(), "load_before": load}
+
+
+def processor() -> str:
+    """Return the processor's name, as far as the system reports it."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        lines = []
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()
 
 
 def print_caveats(console: Console, machine: Mapping[str, Any], complete: bool) -> None:

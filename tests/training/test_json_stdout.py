@@ -26,7 +26,7 @@ LEAST = {
     "replay stereo": (),
     "bench accuracy": ("--seeds", "1", *SEED, "--length", "2", "--methods", "fastslam2", "--particles", "5"),
     "bench filter": (
-        "--particles", "5", "--landmarks", "40", "--measurements", "3", "--robots", "1", "--steps", "2", "--no-plain",
+        "--particles", "5", "--landmarks", "40", "--measurements", "3", "--robots", "1", "--steps", "2",
     ),
     "bench stereo": ("--quick", "--steps", "2", "--views", "3", "--descriptors", "usurf"),
     "bench env": (
