@@ -1,4 +1,4 @@
-"""Where the time of `env.step` goes: each phase timed without what it calls of the others, beside the plan."""
+"""Where the time of `env.step` goes: each phase timed without what it calls of the others."""
 
 import time
 from collections import defaultdict
@@ -29,28 +29,25 @@ class Phase:
 
     Attributes:
         name: Shown in the table.
-        planned_us: For three robots with 100 particles and 5 measurements each [us].
         calls: What counts to it: owners and names of functions.
     """
 
     name: str
-    planned_us: float
     calls: tuple[tuple[Any, str], ...]
 
 
 PHASES = (
-    Phase("physics", 25, ((Simulator, "step"),)),
-    Phase("landmark sensor", 40, ((LandmarkSensor, "measure"),)),
-    Phase("scans", 20, ((Scan, "measure"),)),
-    Phase("grid painting", 20, ((SharedGrids, "step"),)),
-    Phase("filters", 135, ((FastSlam, "_step_checked"),)),
-    Phase("team, alignment", 40, ((TeamSlam, "step"),)),
-    Phase("errors", 15, ((Episode, "standing"),)),
-    Phase("observations", 20, ((observation, "observe_team"),)),
-    Phase("candidates", 40, ((TeamSlots, "update"),)),
+    Phase("physics", ((Simulator, "step"),)),
+    Phase("landmark sensor", ((LandmarkSensor, "measure"),)),
+    Phase("scans", ((Scan, "measure"),)),
+    Phase("grid painting", ((SharedGrids, "step"),)),
+    Phase("filters", ((FastSlam, "_step_checked"),)),
+    Phase("team, alignment", ((TeamSlam, "step"),)),
+    Phase("errors", ((Episode, "standing"),)),
+    Phase("observations", ((observation, "observe_team"),)),
+    Phase("candidates", ((TeamSlots, "update"),)),
     Phase(
         "beliefs, dictionaries",
-        70,
         ((TeamBelief, "step"), (environment, "observations_of"), (environment, "infos_of")),
     ),
 )
@@ -62,13 +59,11 @@ class BudgetRow:
 
     Attributes:
         phase: Its name.
-        planned_us: As `Phase`; 75 for what is in no phase, which makes the plan 500.
         median_us: Over steps [us].
         mean_us: Over steps; what happens now and then shows here alone [us].
     """
 
     phase: str
-    planned_us: float
     median_us: float
     mean_us: float
 
@@ -86,12 +81,10 @@ def measure_budget(step: Callable[[Any], Any], arguments: list[Any]) -> list[Bud
             step(argument)
             whole = time.perf_counter_ns() - begin
             totals.append({**spent, REST: whole - sum(spent.values())})
-    plan = {phase.name: phase.planned_us for phase in PHASES}
-    plan[REST] = 500.0 - sum(plan.values())
     rows = []
-    for name, planned in plan.items():
+    for name in (*(phase.name for phase in PHASES), REST):
         micros = np.array([total.get(name, 0) for total in totals]) / 1e3
-        rows.append(BudgetRow(name, planned, float(np.median(micros)), float(micros.mean())))
+        rows.append(BudgetRow(name, float(np.median(micros)), float(micros.mean())))
     return rows
 
 

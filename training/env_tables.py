@@ -17,10 +17,10 @@ def print_env_result(console: Console, result: EnvBenchResult, asked_peer: bool)
         rows = [(_told(row), *_times(row.times)) for row in result.rows]
         console.print(console_table("env.step [us]: robots, particles, world, walls, mode", ("", *TIMES), rows))
     if result.budget:
-        columns = ("planned_us", "median_us", "mean_us")
+        columns = ("median_us", "mean_us")
         budget = [(part.phase, *(f"{getattr(part, name):.0f}" for name in columns)) for part in result.budget]
         sums = (f"{sum(getattr(part, name) for part in result.budget):.0f}" for name in columns)
-        headings = ("part of a step", "planned", "median", "mean")
+        headings = ("part of a step", "median", "mean")
         console.print(console_table("Budget, first row [us]", headings, [*budget, ("sum", *sums)]))
     others: dict[str, StepTimes | None] = {
         "simulator only": result.simulator,
