@@ -6,7 +6,7 @@ from typing import Any
 from rich.console import Console
 
 from training.accuracy_summary import CONDITION
-from training.text_tables import console_table, markdown_table
+from training.text_tables import console_table, markdown_table, number
 
 NAMES = {
     "dead_reckoning": "dead reckoning", "batch_ml": "batch ML", "ideal_online": "ideal online",
@@ -103,10 +103,5 @@ def _cell(
         return "-"
     low, high = (None, None) if not with_interval else (found[f"{statistic}_{end}"] for end in ("low", "high"))
     if low is None or high is None:
-        return _number(factor * value, digits)
-    return f"{_number(factor * value, digits)} ({_number(factor * low, digits)}-{_number(factor * high, digits)})"
-
-
-def _number(value: float, digits: int) -> str:
-    """Show a number with fixed digits, a large one with an exponent."""
-    return f"{value:.{digits}f}" if abs(value) < 1e5 else f"{value:.0e}"
+        return number(value, digits, factor)
+    return f"{number(value, digits, factor)} ({number(low, digits, factor)}-{number(high, digits, factor)})"

@@ -5,7 +5,7 @@ from typing import Any
 
 from rich.console import Console
 
-from training.text_tables import console_table, markdown_table
+from training.text_tables import console_table, number, titled_markdown
 
 TITLES = {
     "grid": "200 landmarks in each map, 5 cm noise, by share in common and share of wrong look-alikes",
@@ -27,35 +27,30 @@ def table_rows(kind: str, lines: Sequence[Mapping[str, Any]]) -> list[list[str]]
 def print_tables(console: Console, lines: Sequence[Mapping[str, Any]]) -> None:
     """Print what each kind of trial came to."""
     for kind, title in TITLES.items():
-        _print(console, title, HEADINGS[kind], table_rows(kind, lines))
+        if rows := table_rows(kind, lines):
+            console.print(console_table(title, HEADINGS[kind], rows))
 
 
 def markdown(lines: Sequence[Mapping[str, Any]]) -> str:
     """Return the same tables as Markdown."""
-    parts = [(title, HEADINGS[kind], table_rows(kind, lines)) for kind, title in TITLES.items()]
-    return "\n".join(f"**{title}**\n\n{markdown_table(headings, rows)}" for title, headings, rows in parts if rows)
-
-
-def _print(console: Console, title: str, headings: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print one table, if it has rows."""
-    if rows:
-        console.print(console_table(title, headings, rows))
+    parts = (titled_markdown(title, HEADINGS[kind], table_rows(kind, lines)) for kind, title in TITLES.items())
+    return "\n".join(part for part in parts if part)
 
 
 def _cells(kind: str, line: Mapping[str, Any]) -> list[str]:
     """Return one line as text."""
     refused = ", ".join(f"{reason} {count}" for reason, count in line["reasons"].items())
-    anees = _number(line["anees"], 2)
+    anees = number(line["anees"], 2)
     if kind == "grid":
         pooled = line["overlap"] is None
         cell = ["all", "all"] if pooled else [f"{100 * line['overlap']:.0f} %", f"{100 * line['outliers']:.0f} %"]
-        over = [_number(line[name], 2) for name in ("translation", "rotation")]
+        over = [number(line[name], 2) for name in ("translation", "rotation")]
         return [*cell, line["method"], f"{100 * line['right']:.1f}", *over, anees, *_times(line)]
     case = line["case"] or "all"
     if kind == "U":
         accepted = f"{round(line['accepted'] * line['trials'])} of {line['trials']}"
         return [case, line["method"], accepted, refused, *_times(line)]
-    worst = [_number(line[name], 2) for name in ("worst_m", "worst_deg")]
+    worst = [number(line[name], 2) for name in ("worst_m", "worst_deg")]
     accepted = f"{100 * line['accepted']:.1f}"
     return [case, line["method"], accepted, str(line["false"]), *worst, anees, refused, _times(line)[0]]
 
@@ -63,8 +58,3 @@ def _cells(kind: str, line: Mapping[str, Any]) -> list[str]:
 def _times(line: Mapping[str, Any]) -> list[str]:
     """Return median and 95 % quantile of the time."""
     return [f"{line['median_ms']:.1f}", f"{line['p95_ms']:.1f}"]
-
-
-def _number(value: float | None, digits: int) -> str:
-    """Show a number; a dash where there is none."""
-    return "-" if value is None else f"{value:.{digits}f}"

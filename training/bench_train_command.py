@@ -88,12 +88,13 @@ def _told(row: "WorkerRow") -> tuple[str, ...]:
     from dataclasses import asdict
 
     from training.seed_means import shown
+    from training.text_tables import number
 
     return (
         str(row.workers),
         *(f"{rate:,.0f}" for rate in (row.per_second, row.best_per_second, row.mean_per_second)),
         shown(asdict(row), "gain", 2),
         f"{row.balance:.2f}",
-        "-" if row.work is None else f"{row.work:.2f}",
+        number(row.work),
         f"{row.beside_us:.0f}",
     )

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 from rich.table import Table
 
+from training.text_tables import number
+
 if TYPE_CHECKING:  # what computes is imported when the command runs, so that --help answers at once
     from slam_backend.consistency import Consistency
 
@@ -24,9 +26,8 @@ def print_consistency(console: Console, rows: Sequence[Mapping[str, Any]]) -> No
     for name in COLUMNS:
         table.add_column(name, justify="right")
     for row in rows:
-        mean = "-" if row["nis_mean"] is None else f"{row['nis_mean']:.2f}"
         shares = (f"{100.0 * row[key]:.1f} %" for key in ("nis_share", "ess_share", "rejected_share"))
-        table.add_row(str(row["robot"]), mean, *shares, _verdict(row))
+        table.add_row(str(row["robot"]), number(row["nis_mean"]), *shares, _verdict(row))
     console.print(table)
     texts: dict[str, list[str]] = {}
     for row in rows:

@@ -1,7 +1,5 @@
 """The tables of `vslam bench exploration`, on the console and as Markdown, and its CSV files."""
 
-import csv
-import io
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +12,7 @@ from agents.trained import MODEL_FILE
 from training.bench_exploration import NO_ORACLE
 from training.exploration_summary import COMPARED, Rows
 from training.seed_means import shown
-from training.text_tables import console_table, markdown_table
+from training.text_tables import console_table, csv_text, markdown_table
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,13 +125,8 @@ def markdown(lines: Rows, policies: Rows, oracles: Rows) -> str:
 
 def to_csv(rows: Rows) -> str:
     """Return rows as CSV under a heading; numbers have six digits, lists and tables are left out."""
-    flat = [{name: value for name, value in row.items() if not isinstance(value, Mapping | list)} for row in rows]
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(flat[0]) if flat else [], lineterminator="\n")
-    writer.writeheader()
-    for row in flat:
-        writer.writerow({name: f"{value:.6g}" if isinstance(value, float) else value for name, value in row.items()})
-    return text.getvalue()
+    names = [name for name, value in rows[0].items() if not isinstance(value, Mapping | list)] if rows else []
+    return csv_text(names, ([row[name] for name in names] for row in rows))
 
 
 def who_is(line: Mapping[str, Any], between: str = ", ") -> str:

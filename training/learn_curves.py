@@ -1,22 +1,19 @@
 """The rows of a training as CSV, and their first and last tenth."""
 
-import csv
-import io
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+
+from training.text_tables import csv_text
 
 Row = Mapping[str, float]
 
 
 def to_csv(rows: Sequence[Row]) -> str:
     """Return one line per rollout under a heading; numbers have six digits."""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(rows[0]) if rows else [], lineterminator="\n")
-    writer.writeheader()
-    writer.writerows({name: f"{value:.6g}" for name, value in row.items()} for row in rows)
-    return text.getvalue()
+    names = list(rows[0]) if rows else []
+    return csv_text(names, ([row[name] for name in names] for row in rows))
 
 
 def ends_of(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:

@@ -9,7 +9,7 @@ from training.command_folder import begin, choose, finish
 from training.command_options import Config, Json, Out, Seed, numbers
 from training.command_progress import share_shown
 from training.replay_command import DATASET, LOG
-from training.text_tables import console_table, markdown_table
+from training.text_tables import console_table, markdown_table, number
 
 HEADINGS = (
     "after [s]", "barcodes", "method", "pairs", "aligned", "false", "median [m]", "worst [m]", "median [°]",
@@ -57,7 +57,6 @@ def bench_mrclam(
 def cells(line: dict[str, Any]) -> list[str]:
     """Return one line of the table as text."""
     after = "all" if line["duration_s"] is None else f"{line['duration_s']:g}"
-    errors = (line[name] for name in ("median_m", "worst_m", "median_deg", "worst_deg"))
-    shown = ["-" if value is None else f"{value:.2f}" for value in errors]
+    shown = [number(line[name]) for name in ("median_m", "worst_m", "median_deg", "worst_deg")]
     counts = [str(line[name]) for name in ("pairs", "accepted", "false")]
     return [after, line["barcodes"], line["method"], *counts, *shown]

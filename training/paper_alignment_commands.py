@@ -9,6 +9,7 @@ from rich.console import Console
 from training.command_folder import begin, choose, finish
 from training.command_options import Check, Config, FirstSeed, Json, Out, OutToGoOn, Seed
 from training.command_progress import KeptPart, play_kept
+from training.text_tables import number
 
 if TYPE_CHECKING:  # what computes is imported when the command runs, so that --help answers at once
     from training.paper_fig3 import AlignedPair
@@ -67,7 +68,7 @@ def fig2(
     lines, claims, poor = plain(summarise(rows)), plain(check_claims(summarise(rows))), refusals(rows)
     for claim in claims:
         held = "holds" if claim["holds"] else "does not hold"
-        shown = "-" if claim["measured"] is None else f"{claim['measured']:.2f}"
+        shown = number(claim["measured"])
         console.print(f"{claim['claim']}: {shown}, at most {claim['at_most']:g}: {held}", highlight=False, markup=False)
     console.print(
         f"At {poor['share_too_little']} stages maps share too little; ours was false {poor['false']} times.",

@@ -1,7 +1,5 @@
 """The paper's Fig. 2: how far off each method's motion between two maps is, against the size of the maps."""
 
-import csv
-import io
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -14,6 +12,7 @@ from slam_backend.geometry import wrap_angle
 from training.paper_pairs import map_alone, simulate_pair, true_motion
 from training.plain_config import PlainConfig
 from training.stereo_runs import STEP
+from training.text_tables import csv_text
 
 COMMAND = "paper fig2"
 TRIALS_FILE = "runs.jsonl"
@@ -171,12 +170,11 @@ def check_claims(lines: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 def to_csv(rows: Iterable[Mapping[str, Any]]) -> str:
     """Return every stage and method as text with commas between."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["seed", "length_m", "size", "shared", "method", *PRACTICALLY_ZERO])
+    headings = ["seed", "length_m", "size", "shared", "method", *PRACTICALLY_ZERO]
+    lines = []
     for row in rows:
         for stage in row["stages"]:
             for method in METHODS:
-                error = stage[method] or dict.fromkeys(PRACTICALLY_ZERO, "")
-                writer.writerow([row["seed"], stage["length"], stage["size"], stage["shared"], method, *error.values()])
-    return text.getvalue()
+                error = stage[method] or dict.fromkeys(PRACTICALLY_ZERO)
+                lines.append([row["seed"], stage["length"], stage["size"], stage["shared"], method, *error.values()])
+    return csv_text(headings, lines)

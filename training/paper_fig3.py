@@ -1,7 +1,5 @@
 """The paper's Figs. 3 and 4: two maps, what matches, the motion found; and what fusing does to the ellipses."""
 
-import csv
-import io
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +14,7 @@ from slam_backend.landmark_map import LandmarkMap
 from training.paper_pairs import Stage, map_alone, simulate_pair, true_motion
 from training.plain_config import PlainConfig
 from training.stereo_runs import STEP
+from training.text_tables import csv_text
 
 FIG3, FIG4 = "paper fig3", "paper fig4"
 SHOWN = 3  # landmarks of Fig. 4
@@ -131,24 +130,22 @@ def fuse_pair(pair: AlignedPair, shown: int = SHOWN) -> FusedLandmarks:
 
 def matches_csv(pair: AlignedPair) -> str:
     """Return every inlier: where either map has it, and where the motion found puts that of the second."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["true_a", "true_b", "ax", "ay", "az", "bx", "by", "bz", "moved_x", "moved_y"])
+    headings = ["true_a", "true_b", "ax", "ay", "az", "bx", "by", "bz", "moved_x", "moved_y"]
     map_a, map_b = pair.maps
+    rows = []
     for a, b in pair.alignment.inliers.tolist():
         moved = transform_points(pair.alignment.transform, map_b.means[b])
         names = int(pair.stage.names[0][a]), int(pair.stage.names[1][b])
-        writer.writerow([*names, *(f"{v:.4f}" for v in (*map_a.means[a], *map_b.means[b], *moved[:2]))])
-    return text.getvalue()
+        rows.append([*names, *(f"{v:.4f}" for v in (*map_a.means[a], *map_b.means[b], *moved[:2]))])
+    return csv_text(headings, rows)
 
 
 def ellipses_csv(fused: FusedLandmarks) -> str:
     """Return means and covariances before and after fusion."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["landmark", "which", "x", "y", "z", "xx", "xy", "xz", "yy", "yz", "zz"])
+    headings = ["landmark", "which", "x", "y", "z", "xx", "xy", "xz", "yy", "yz", "zz"]
     upper = np.triu_indices(3)
+    rows = []
     for i, name in enumerate(fused.names.tolist()):
         for kind, means, covariances in zip(("map 1", "map 2", "fused"), fused.means, fused.covariances, strict=True):
-            writer.writerow([name, kind, *(f"{v:.3e}" for v in (*means[i], *covariances[i][upper]))])
-    return text.getvalue()
+            rows.append([name, kind, *(f"{v:.3e}" for v in (*means[i], *covariances[i][upper]))])
+    return csv_text(headings, rows)

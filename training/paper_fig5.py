@@ -1,7 +1,5 @@
 """Fig. 5 of the paper: three robots in a room, the landmarks that they see, and those that walls hide from them."""
 
-import csv
-import io
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +7,7 @@ import numpy as np
 from agents.registry import make_policy
 from slam_backend.errors import BoolArray, FloatArray, bad_argument, check_int
 from training.plain_config import PlainConfig
+from training.text_tables import csv_text
 from vslam_env import EnvConfig, vslam_v0
 from vslam_env.config import MAX_ROBOTS
 from vslam_env.environment import ExplorationEnv
@@ -84,15 +83,14 @@ class Fig5:
 
     def to_csv(self) -> str:
         """Return a row for each robot and landmark in its view: where both are, and what became of the landmark."""
-        text = io.StringIO()
-        table = csv.writer(text, lineterminator="\n")
-        table.writerow(["robot", "x", "y", "theta", "landmark", "landmark_x", "landmark_y", "landmark_z", "state"])
+        headings = ["robot", "x", "y", "theta", "landmark", "landmark_x", "landmark_y", "landmark_z", "state"]
+        rows = []
         for robot, pose in enumerate(self.poses):
             for mark in np.flatnonzero(self.in_view[robot]):
                 state = STATES[int(self.seen[robot, mark]) + int(self.measured[robot, mark])]
                 numbers = [f"{value:.4f}" for value in (*pose, *self.landmarks[mark])]
-                table.writerow([robot, *numbers[:3], int(mark), *numbers[3:], state])
-        return text.getvalue()
+                rows.append([robot, *numbers[:3], int(mark), *numbers[3:], state])
+        return csv_text(headings, rows)
 
 
 def simulate_fig5(config: Fig5Config) -> Fig5:

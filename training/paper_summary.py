@@ -1,7 +1,5 @@
 """The trials of Fig. 6 summed up: one line per point of the figure, and ratios paired over seeds."""
 
-import csv
-import io
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
@@ -11,6 +9,7 @@ from scipy import stats
 from slam_backend.errors import FloatArray
 from training.accuracy_summary import CONFIDENCE, interval
 from training.paper_trials import FIGURES
+from training.text_tables import csv_text
 
 POINT = ("regime", "proposal", "robots", "particles")
 TIMES = ("median_ms", "all_median_ms", "all_mean_ms", "measured")
@@ -54,15 +53,9 @@ def summarise(errors: Rows, times: Rows) -> list[dict[str, Any]]:
 
 def to_csv(lines: Sequence[Mapping[str, Any]]) -> str:
     """Return the lines of `summarise` as CSV with a heading; what is not known is empty, numbers have six digits."""
-    text = io.StringIO()
     figures = (f"{name}{end}" for name in (*FIGURES, *TIMES) for end in ("", "_low", "_high"))
     names = [*POINT, "seeds", "timed_seeds", *figures]
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(names)
-    for line in lines:
-        values = (line[name] for name in names)
-        writer.writerow([f"{v:.6g}" if isinstance(v, float) else "" if v is None else v for v in values])
-    return text.getvalue()
+    return csv_text(names, ([line[name] for name in names] for line in lines))
 
 
 def paired_ratio(above: Mapping[int, float], below: Mapping[int, float]) -> dict[str, Any]:

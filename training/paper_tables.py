@@ -8,7 +8,7 @@ from rich.markup import escape
 
 from training.paper_claims import Claim
 from training.paper_regimes import REGIMES
-from training.text_tables import console_table
+from training.text_tables import console_table, number
 
 
 def print_result(
@@ -33,7 +33,9 @@ def print_result(
         table = console_table(f"Map error, K={many} over K={few} (95 %)", ("regime", "M", "as it is", "aligned"))
         for row in ratios:
             name = f"{REGIMES[row['regime']].title}, {row['proposal']}"
-            table.add_row(escape(name), _number(row["particles"]), *(_interval(row[key]) for key in ("raw", "aligned")))
+            table.add_row(
+                escape(name), str(row["particles"] or "-"), *(_interval(row[key]) for key in ("raw", "aligned"))
+            )
         console.print(table)
     if claims:
         table = console_table("The paper's claims", ("claim", "ratio (95 %)", ""))
@@ -56,27 +58,20 @@ def _print_points(console: Console, title: str, lines: Sequence[Mapping[str, Any
     for m in dict.fromkeys(line["particles"] for line in lines):
         own = {line["robots"]: line for line in lines if line["particles"] == m}
         cells = [_cell(own.get(k), figure, digits, bool(wide)) for _, figure, digits, wide in parts for k in robots]
-        table.add_row(_number(m), *cells)
+        table.add_row(str(m or "-"), *cells)
     console.print(table)
-
-
-def _number(particles: int) -> str:
-    """Show M; the bound has none."""
-    return str(particles) if particles else "-"
 
 
 def _cell(line: Mapping[str, Any] | None, figure: str, digits: int, with_interval: bool) -> str:
     """Show a mean, with its interval if asked for, and what is not known as a dash."""
-    if line is None or line[figure] is None:
+    if line is None:
         return "-"
     low, high = line[f"{figure}_low"], line[f"{figure}_high"]
-    ends = f"\n{low:.{digits}f}-{high:.{digits}f}" if with_interval and low is not None else ""
-    return f"{line[figure]:.{digits}f}{ends}"
+    ends = f"\n{number(low, digits)}-{number(high, digits)}" if with_interval and low is not None else ""
+    return number(line[figure], digits) + ends
 
 
 def _interval(found: Mapping[str, Any]) -> str:
     """Show a ratio with its interval."""
-    if found["ratio"] is None:
-        return "-"
-    ends = "" if found["low"] is None else f" ({found['low']:.2f}-{found['high']:.2f})"
-    return f"{found['ratio']:.2f}{ends}"
+    ends = "" if found["low"] is None else f" ({number(found['low'])}-{number(found['high'])})"
+    return number(found["ratio"]) + ends

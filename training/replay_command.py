@@ -13,6 +13,7 @@ from training.command_options import Config, Duration, Estimator, Json, Out, Rej
 from training.command_progress import share_shown
 from training.consistency_table import print_consistency
 from training.rejuvenation_count import sentence_of
+from training.text_tables import number
 
 if TYPE_CHECKING:  # what computes is imported when the command runs, so that --help answers at once
     from slam_backend.readers.mrclam import MrclamLog
@@ -152,7 +153,7 @@ def _print_tables(console: Console, metrics: dict[str, Any], with_poses: set[int
             for name in ("robot", *shown):
                 table.add_column(name, justify="right")
             for row in rows:
-                table.add_row(str(row["robot"]), *(_number(row[key]) for key in shown.values()))
+                table.add_row(str(row["robot"]), *(number(row[key]) for key in shown.values()))
             console.print(table)
         unknown = [row["robot"] for row in metrics["robots"] if row not in rows]
         missed = [robot for robot in unknown if title == "Paths" and robot in with_poses]
@@ -169,13 +170,8 @@ def _print_tables(console: Console, metrics: dict[str, Any], with_poses: set[int
         merges.add_column(name, justify="right")
     for row in metrics["merges"]:
         sides = [", ".join(map(str, row[side])) for side in ("robots_a", "robots_b")]
-        off = [_number(row[key]) for key in errors.values()]
+        off = [number(row[key]) for key in errors.values()]
         merges.add_row(f"{row['time_s']:.1f}", *sides, str(row["landmarks"]), *off)
     console.print(merges if metrics["merges"] else "No merge.")
     print_refusals(console, metrics["refusals"])
     console.print("Groups at the end: " + "; ".join(", ".join(map(str, group)) for group in metrics["groups"]))
-
-
-def _number(value: float | None) -> str:
-    """Show a number with two digits, and what is not known as a dash."""
-    return "-" if value is None else f"{value:.2f}"

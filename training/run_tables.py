@@ -8,18 +8,19 @@ from rich.markup import escape
 from rich.table import Table
 
 from training.attempt_tables import print_refusals
+from training.text_tables import number
 
 ROWS = (
-    ("map error E [m], errors cut at 1 m", "map_error", "{:.3f}", 1.0),
-    ("map RMSE of matched landmarks [m]", "map_rmse_m", "{:.3f}", 1.0),
-    ("recall [%]", "map_recall", "{:.1f}", 100.0),
-    ("precision [%]", "map_precision", "{:.1f}", 100.0),
-    ("ATE, aligned [m]", "ate_aligned_m", "{:.3f}", 1.0),
-    ("   odometry's [m]", "dead_reckoning_ate_aligned_m", "{:.3f}", 1.0),
-    ("ATE, start frame [m]", "ate_start_m", "{:.3f}", 1.0),
-    ("   odometry's [m]", "dead_reckoning_ate_start_m", "{:.3f}", 1.0),
-    ("path [m]", "path_m", "{:.1f}", 1.0),
-    ("odometry's last error [% of path]", "dead_reckoning_end_percent", "{:.1f}", 1.0),
+    ("map error E [m], errors cut at 1 m", "map_error", 3, 1.0),
+    ("map RMSE of matched landmarks [m]", "map_rmse_m", 3, 1.0),
+    ("recall [%]", "map_recall", 1, 100.0),
+    ("precision [%]", "map_precision", 1, 100.0),
+    ("ATE, aligned [m]", "ate_aligned_m", 3, 1.0),
+    ("   odometry's [m]", "dead_reckoning_ate_aligned_m", 3, 1.0),
+    ("ATE, start frame [m]", "ate_start_m", 3, 1.0),
+    ("   odometry's [m]", "dead_reckoning_ate_start_m", 3, 1.0),
+    ("path [m]", "path_m", 1, 1.0),
+    ("odometry's last error [% of path]", "dead_reckoning_end_percent", 1, 1.0),
 )
 
 
@@ -35,8 +36,8 @@ def print_tables(console: Console, metrics: Mapping[str, Any]) -> None:
     table.add_column("")
     for heading in columns:
         table.add_column(heading, justify="right")
-    for label, key, form, factor in ROWS:
-        table.add_row(escape(label), *(_figure(row[key], form, factor) for row in columns.values()))
+    for label, key, digits, factor in ROWS:
+        table.add_row(escape(label), *(number(row[key], digits, factor) for row in columns.values()))
     console.print(table)
     if metrics["merges"]:
         console.print(_merges(metrics["merges"]))
@@ -49,11 +50,6 @@ def print_tables(console: Console, metrics: Mapping[str, Any]) -> None:
         f"Alignments tried: {metrics['attempts']}.",
         highlight=False,
     )
-
-
-def _figure(value: float | None, form: str, factor: float) -> str:
-    """Show a number, and what is not known as a dash."""
-    return "-" if value is None else form.format(factor * value)
 
 
 def _merges(rows: list[Mapping[str, Any]]) -> Table:

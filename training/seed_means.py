@@ -7,6 +7,7 @@ import numpy as np
 
 from slam_backend.errors import FloatArray
 from training.accuracy_summary import interval
+from training.text_tables import number
 
 
 def mean_of(name: str, values: Sequence[float | None] | FloatArray) -> dict[str, float | None]:
@@ -49,11 +50,7 @@ def shown(line: Mapping[str, Any], name: str, digits: int = 3, factor: float = 1
     >>> shown({"way": 3.0, "way_low": 2.5, "way_high": 3.25}, "way", 2)
     '3.00 (2.50 .. 3.25)'
     """
-    mean, low, high = (line[f"{name}{end}"] for end in ("", "_low", "_high"))
-    if mean is None:
-        return "-"
-    text = f"{factor * mean:z.{digits}f}"
-    if low is None:
+    text, *ends = (number(line[f"{name}{end}"], digits, factor) for end in ("", "_low", "_high"))
+    if line[f"{name}_low"] is None:
         return text
-    ends = [f"{factor * end:z.{digits}f}" for end in (low, high)]
     return f"{text}\n{'..'.join(ends)}" if stacked else f"{text} ({' .. '.join(ends)})"

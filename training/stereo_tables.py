@@ -3,6 +3,8 @@
 from collections.abc import Sequence
 from typing import Any
 
+from training.text_tables import number, titled_markdown
+
 MEASURES = ("min_ms", "median_ms", "processor_ms")
 NAMES = {
     "usurf": "u-SURF",
@@ -26,7 +28,8 @@ def markdown(result: dict[str, Any]) -> str:
             for scale, row in result["second_looks"].items()
         ]
         title = "Second looks at a landmark: NEES by the default camera noise, and by twice of it"
-        parts.append(table(title, ["noise", "pairs of looks", "within the 99.9 % gate", "ANEES of these"], lines))
+        headings = ["noise", "pairs of looks", "within the 99.9 % gate", "ANEES of these"]
+        parts.append(titled_markdown(title, headings, lines))
     for descriptor, rows in result.get("aloe", {}).items():
         parts.append(_guards(f"Aloe, {NAMES[descriptor]} (true disparities are whole pixels)", rows))
     if "chessboard" in result:
@@ -43,15 +46,7 @@ def markdown(result: dict[str, Any]) -> str:
     if result.get("failed"):
         failed = [f"- {name}: {why}" for name, why in result["failed"].items()]
         parts.append("\n".join(["**Failed**", "", *failed]))
-    return "\n\n".join(part for part in parts if part) + "\n"
-
-
-def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Return a table with a bold title; nothing if it has no rows."""
-    if not rows:
-        return ""
-    lines = [f"**{title}**", "", "| " + " | ".join(columns) + " |", "|" + "---|" * len(columns)]
-    return "\n".join(lines + ["| " + " | ".join(row) + " |" for row in rows])
+    return "\n\n".join(part.rstrip() for part in parts if part) + "\n"
 
 
 def _speed(rows: Sequence[dict[str, Any]]) -> str:
@@ -63,7 +58,7 @@ def _speed(rows: Sequence[dict[str, Any]]) -> str:
         times = [" / ".join(f"{value:.2f}" for value in part) for part in parts]
         size, name = f"{row['width']} x {row['height']}", NAMES[row["descriptor"]]
         lines.append([size, str(row["walls"]), f"{row['landmarks']} of {row['wanted']}", name, *times])
-    return table("Time on one thread: least / median by the clock / mean of the processor", columns, lines)
+    return titled_markdown("Time on one thread: least / median by the clock / mean of the processor", columns, lines)
 
 
 def _guards(title: str, rows: Sequence[dict[str, Any]]) -> str:
@@ -79,7 +74,7 @@ def _guards(title: str, rows: Sequence[dict[str, Any]]) -> str:
         ]
         for row in rows
     ]
-    return table(title, columns, lines)
+    return titled_markdown(title, columns, lines)
 
 
 def _retrieval(rows: Sequence[dict[str, Any]]) -> str:
@@ -92,9 +87,10 @@ def _retrieval(rows: Sequence[dict[str, Any]]) -> str:
         name = NAMES[row["descriptor"]] + (f", window {row['window']:g} m" if row["window"] else "")
         cells = [row["angles"][angle] for angle in angles] + [row["ratios"][ratio] for ratio in ratios[1:]]
         lines.append(
-            [row["style"], name, *(_share(cell["recall"]) + " / " + _share(cell["precision"]) for cell in cells)]
+            [row["style"], name, *(number(cell["recall"]) + " / " + number(cell["precision"]) for cell in cells)]
         )
-    return table("Found again by descriptor: recall / precision, by viewing angle and distance", columns, lines)
+    title = "Found again by descriptor: recall / precision, by viewing angle and distance"
+    return titled_markdown(title, columns, lines)
 
 
 def _planar(rows: Sequence[dict[str, Any]]) -> str:
@@ -105,7 +101,7 @@ def _planar(rows: Sequence[dict[str, Any]]) -> str:
         right, matches = (sum(row[key] for row in own.values()) for key in ("right", "matches"))
         cells = [f"{own[pair]['right']} / {own[pair]['matches']}" for pair in pairs]
         lines.append([NAMES[way], *cells, f"{100 * right / max(matches, 1):.0f} %"])
-    return table("Planar pairs: right matches / mutual matches", ["descriptor", *pairs, "score"], lines)
+    return titled_markdown("Planar pairs: right matches / mutual matches", ["descriptor", *pairs, "score"], lines)
 
 
 def _rigs(rows: Sequence[dict[str, Any]]) -> str:
@@ -115,10 +111,6 @@ def _rigs(rows: Sequence[dict[str, Any]]) -> str:
     lines = []
     for row in rows:
         counts = [f"{count:.0f}" for count in (row["matches"], *row["left"].values(), row["points"])]
-        depth = "-" if row["depth_m"] is None else f"{row['depth_m']:.2f}"
-        lines.append([row["rig"], NAMES[row["descriptor"]], str(row["pairs"]), *counts, depth, f"{row['ms']:.1f}"])
-    return table("Stereo pairs with a calibration: matches left after each guard, means", columns, lines)
-
-
-def _share(value: float | None) -> str:
-    return "-" if value is None or value != value else f"{value:.2f}"
+        means = [number(row["depth_m"]), number(row["ms"], 1)]
+        lines.append([row["rig"], NAMES[row["descriptor"]], str(row["pairs"]), *counts, *means])
+    return titled_markdown("Stereo pairs with a calibration: matches left after each guard, means", columns, lines)

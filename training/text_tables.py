@@ -1,10 +1,27 @@
-"""Tables of text, on the console and as Markdown: the first column to the left, numbers to the right."""
+"""Tables of text, on the console, as Markdown and as CSV: the first column to the left, numbers to the right."""
 
-from collections.abc import Sequence
+import csv
+import io
+from collections.abc import Iterable, Sequence
+from typing import Any
 
 from rich.box import SIMPLE_HEAD
 from rich.markup import escape
 from rich.table import Table
+
+LARGE = 1e5  # numbers from here on are shown with an exponent
+
+
+def number(value: float | None, digits: int = 2, factor: float = 1.0) -> str:
+    """Show a number, times a factor, with fixed digits; a dash where it is None or NaN.
+
+    >>> number(0.1234, 1, 100.0), number(-1e-9), number(3.2e7), number(None)
+    ('12.3', '0.00', '3e+07', '-')
+    """
+    if value is None or value != value:
+        return "-"
+    scaled = factor * value
+    return f"{scaled:z.{digits}f}" if abs(scaled) < LARGE else f"{scaled:.0e}"
 
 
 def console_table(title: str, headings: Sequence[str], rows: Sequence[Sequence[str]] = ()) -> Table:
@@ -25,3 +42,21 @@ def markdown_table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> st
     """
     rule = ["---", *["---:"] * (len(headings) - 1)]
     return "".join("| " + " | ".join(row) + " |\n" for row in (headings, rule, *rows))
+
+
+def titled_markdown(title: str, headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Return a Markdown table under a bold title; nothing if it has no rows."""
+    return f"**{title}**\n\n{markdown_table(headings, rows)}" if rows else ""
+
+
+def csv_text(headings: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+    r"""Return rows as CSV under a heading: floats have six significant digits, None is empty.
+
+    >>> csv_text(("robot", "error_m"), [(0, 1 / 3), (1, None)])
+    'robot,error_m\n0,0.333333\n1,\n'
+    """
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(headings)
+    writer.writerows([f"{value:.6g}" if isinstance(value, float) else value for value in row] for row in rows)
+    return text.getvalue()
