@@ -2,7 +2,8 @@
 
     python benchmarks/steps_in_turn.py ../before . --config '{"num_robots": 6}'
 
-Each checkout plays the same episode with the same actions in a process of its own, and only one of them runs at a time,
+Only public names are used, so that trees with different modules can be compared. Each checkout plays the same episode with
+the same actions in a process of its own, and only one of them runs at a time,
 in bursts of 20 steps. So a machine whose speed changes from one second to the next changes it for all of them. Two
 checkouts of the same arithmetic play the same episode; others drift apart by what rounding grows to.
 """
@@ -23,21 +24,30 @@ from slam_backend.errors import FloatArray, bad_argument, check_int
 BURST = 20  # steps
 WARM_UP = 60  # steps of each episode that do not count
 PLAYER = """
-import json, os, pickle, sys, time
+import json, os, sys, time
 root, overrides, path, count = sys.argv[1], json.loads(sys.argv[2]), sys.argv[3], int(sys.argv[4])
 sys.path.insert(0, root)
-import slam_backend
-assert slam_backend.__file__.startswith(root), slam_backend.__file__
-from training.env_timing import record_actions
-from vslam_env import vslam_v0
-from vslam_env.config import EnvConfig
+import numpy as np
+import vslam_env
+assert vslam_env.__file__.startswith(root), vslam_env.__file__
+from agents import make_policy
+from vslam_env import EnvConfig, vslam_v0
 env = vslam_v0.parallel_env(config=EnvConfig().replace(**overrides))
-if not os.path.exists(path):
-    with open(path, "wb") as file:
-        pickle.dump(record_actions(env, 100, count), file)
-with open(path, "rb") as file:
-    actions = pickle.load(file)
 env.max_cycles = count + 1
+if not os.path.exists(path):  # the first tree's nearest frontier drives, the others play its actions again
+    policies = {agent: make_policy("frontier", env.config.action_type) for agent in env.possible_agents}
+    rng = np.random.default_rng(100)
+    observations, actions = env.reset(seed=100)[0], []
+    for _ in range(count):
+        chosen = {agent: policies[agent].act(observations[agent], env.belief(agent), rng) for agent in env.agents}
+        actions.append({agent: np.asarray(action).tolist() for agent, action in chosen.items()})
+        observations = env.step(chosen)[0]
+    with open(path, "w") as file:
+        json.dump(actions, file)
+with open(path) as file:
+    actions = json.load(file)
+as_action = (lambda x: np.array(x, np.float32)) if env.config.action_type == "continuous" else int
+actions = [{agent: as_action(action) for agent, action in row.items()} for row in actions]
 for line in sys.stdin:
     first, last = json.loads(line)
     if first == 0:
@@ -55,10 +65,10 @@ class Player:
     """A process that plays episodes of one checkout.
 
     Args:
-        root: Of the checkout.
-        overrides: JSON of what the environment's configuration is changed by.
+        root: Folder of the checkout.
+        overrides: JSON object of the changes to the configuration of the environment.
         actions: File of the actions; the first player records them.
-        count: Of these.
+        count: Number of actions.
     """
 
     def __init__(self, root: Path, overrides: str, actions: Path, count: int) -> None:
