@@ -2,10 +2,10 @@
 
     python benchmarks/steps_in_turn.py ../before . --config '{"num_robots": 6}'
 
-Only public names are used, so that trees with different modules can be compared. Each checkout plays the same episode with
-the same actions in a process of its own, and only one of them runs at a time,
-in bursts of 20 steps. So a machine whose speed changes from one second to the next changes it for all of them. Two
-checkouts of the same arithmetic play the same episode; others drift apart by what rounding grows to.
+Only public names are used, so that trees with different modules can be compared. Each checkout plays the same episode
+with the same actions in a process of its own, and only one of them runs at a time, in bursts of 20 steps. So a machine
+whose speed changes from one second to the next changes it for all of them. Two checkouts of the same arithmetic play
+the same episode; others drift apart by what rounding grows to.
 """
 
 import json
