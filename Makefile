@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: demo test lint clients compat clean
+.PHONY: demo test lint metrics clients compat clean
 
 demo: $(VENV)/.core  ## three robots explore an office, build maps and merge them; writes a folder under runs/
 	$(BIN)/vslam run --world office --robots 3 --policy frontier --seed 0
@@ -17,6 +17,9 @@ lint: $(VENV)/.dev  ## style, types, and the direction of imports
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+metrics: $(VENV)/.core  ## sizes of the code, folders, the road of a measurement, private accesses, import circles
+	$(BIN)/python benchmarks/code_metrics.py
 
 CLIENTS := torchrl rllib agilerl tianshou benchmarl
 
