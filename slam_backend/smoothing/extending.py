@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend.errors import FloatArray, IntArray, bad_argument
-from slam_backend.geometry import compose, rotation
 from slam_backend.log_arrays import EXACT, LogArrays
 from slam_backend.motion import OdometryModel
 from slam_backend.smoothing import _kernels
@@ -123,27 +122,6 @@ def _with_room(column: NDArray[Any], extra: int) -> NDArray[Any]:
     longer = np.empty((len(column) + extra, *column.shape[1:]), dtype=column.dtype)
     longer[: len(column)] = column
     return longer
-
-
-def chained(
-    chain: FloatArray, noise: FloatArray, move: FloatArray, move_noise: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return a motion followed by another, and its covariance, to first order.
-
-    Args:
-        chain: (3,) the first motion [m, m, rad].
-        noise: (3, 3) its covariance, in the frame in which it begins.
-        move: (3,) the second motion, in the frame to which the first one led.
-        move_noise: (3, 3) its covariance, likewise.
-
-    Returns:
-        (3,) and (3, 3), in the frame in which the first begins.
-    """
-    by_first, by_second = np.eye(3), np.eye(3)
-    by_second[:2, :2] = rotation(chain[2])
-    by_first[:2, 2] = by_second[:2, :2] @ [-move[1], move[0]]
-    joint = by_first @ noise @ by_first.T + by_second @ move_noise @ by_second.T
-    return compose(chain, move), joint
 
 
 def first_rows(log: LogArrays, count: int) -> LogArrays:

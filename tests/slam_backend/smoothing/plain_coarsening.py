@@ -9,10 +9,19 @@ from slam_backend._packed import UNPACK, UPPER
 from slam_backend.errors import BoolArray, FloatArray, IntArray
 from slam_backend.geometry import between, compose, rotation
 from slam_backend.smoothing.coarsening import CONTRADICTION
-from slam_backend.smoothing.extending import chained
 from slam_backend.smoothing.graph import NONE, OF_POINTS, PathGraph
 from slam_backend.smoothing.options import SmoothingOptions
 from slam_backend.smoothing.sightings import Sightings
+
+
+def chained(
+    chain: FloatArray, noise: FloatArray, move: FloatArray, move_noise: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return a motion (3,) followed by another, and its covariance (3, 3), to first order; each in its first frame."""
+    by_first, by_second = np.eye(3), np.eye(3)
+    by_second[:2, :2] = rotation(chain[2])
+    by_first[:2, 2] = by_second[:2, :2] @ [-move[1], move[0]]
+    return compose(chain, move), by_first @ noise @ by_first.T + by_second @ move_noise @ by_second.T
 
 
 def plainly_coarsened(graph: PathGraph, camera: FloatArray, options: SmoothingOptions) -> PathGraph:

@@ -1,11 +1,12 @@
 import numpy as np
 import pytest
+from plain_coarsening import chained
 from small_problems import camera_of, graph_of, logs_of, small_run
 
 from slam_backend.geometry import between, compose
 from slam_backend.run_log import RobotLog
 from slam_backend.smoothing.coarsening import at_mode
-from slam_backend.smoothing.extending import Places, chained, extended, first_rows
+from slam_backend.smoothing.extending import Places, extended, first_rows
 from slam_backend.smoothing.graph import PathGraph
 from slam_backend.smoothing.guesses import Guesses
 from slam_backend.smoothing.options import SmoothingOptions

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from plain_coarsening import chained
 from python_entry import python_entry
 from small_problems import camera_of, graph_of, logs_of, small_run
 
@@ -12,7 +13,7 @@ from slam_backend.log_arrays import ODOMETRY, REJECTED, STOOD
 from slam_backend.motion import OdometryModel
 from slam_backend.smoothing._kernels.naming import number, place, rename, start_anew
 from slam_backend.smoothing._kernels.walking import choose, walk
-from slam_backend.smoothing.extending import chained, extended
+from slam_backend.smoothing.extending import extended
 from slam_backend.smoothing.graph import LEVER, PathGraph
 from slam_backend.smoothing.options import SmoothingOptions
 from slam_backend.smoothing.rejuvenation import rejuvenate
