@@ -48,11 +48,6 @@ class MrclamLog:
     positions: FloatArray | None
     notes: tuple[str, ...] = ()
 
-    @property
-    def has_truth(self) -> bool:
-        """Whether true landmarks or the true poses of a robot are known."""
-        return self.positions is not None or any(robot.truth is not None for robot in self.robots)
-
 
 def load_mrclam(
     path: str | Path,

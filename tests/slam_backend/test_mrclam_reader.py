@@ -130,7 +130,7 @@ def test_a_log_without_truth_is_read(folder: Path) -> None:
         file.unlink()
     log = load_mrclam(folder)
     assert log.positions is None
-    assert not log.has_truth
+    assert all(robot.truth is None for robot in log.robots)
     assert log.subjects.tolist() == [6, 7, 9]
 
 
