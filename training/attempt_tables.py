@@ -4,7 +4,8 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
-from rich.table import Table
+
+from training.text_tables import console_table
 
 if TYPE_CHECKING:  # what computes is imported when the command runs, so that --help answers at once
     from slam_backend.refusals import PairAttempts
@@ -71,16 +72,14 @@ def print_refusals(console: Console, rows: Sequence[Mapping[str, Any]]) -> None:
     told = [row for row in rows if row["refused"] or not row["attempts"]]
     if not told:
         return
-    table = Table(title="Refused attempts to merge maps (and by what factor a bound was missed)")
-    for heading in ("robots", "with", "attempts"):
-        table.add_column(heading, justify="right")
-    for heading in ("refused as", "last", "at the end"):
-        table.add_column(heading)
+    cells = []
     for row in told:
         sides = [", ".join(map(str, row[side])) for side in ("robots_a", "robots_b")]
         reasons = ", ".join(f"{reason} ({count})" for reason, count in row["refused"].items())
-        table.add_row(*sides, str(row["attempts"]), reasons, _last(row), "apart" if row["apart"] else "one map")
-    console.print(table)
+        cells.append([*sides, str(row["attempts"]), reasons, _last(row), "apart" if row["apart"] else "one map"])
+    title = "Refused attempts to merge maps (and by what factor a bound was missed)"
+    headings = ("robots", "with", "attempts", "refused as", "last", "at the end")
+    console.print(console_table(title, headings, cells))
     for reason in dict.fromkeys(row["last_reason"] for row in told if row["apart"] and row["last_reason"]):
         console.print(f"{reason}: {HINTS[reason]}", highlight=False)
     for missed in dict.fromkeys(row["missed"] for row in told if row["apart"] and row["missed"]):

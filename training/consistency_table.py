@@ -4,9 +4,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
-from rich.table import Table
 
-from training.text_tables import number
+from training.text_tables import console_table, number
 
 if TYPE_CHECKING:  # what computes is imported when the command runs, so that --help answers at once
     from slam_backend.consistency import Consistency
@@ -22,13 +21,12 @@ def consistency_rows(robots: Iterable[int], reports: Iterable["Consistency"]) ->
 
 def print_consistency(console: Console, rows: Sequence[Mapping[str, Any]]) -> None:
     """Print what `consistency_rows` gave, NaN as None; each warning in words, once."""
-    table = Table(title="Consistency: do filters err as little as they claim? (shares of frames)")
-    for name in COLUMNS:
-        table.add_column(name, justify="right")
+    cells = []
     for row in rows:
         shares = (f"{100.0 * row[key]:.1f} %" for key in ("nis_share", "ess_share", "rejected_share"))
-        table.add_row(str(row["robot"]), number(row["nis_mean"]), *shares, _verdict(row))
-    console.print(table)
+        cells.append([str(row["robot"]), number(row["nis_mean"]), *shares, _verdict(row)])
+    title = "Consistency: do filters err as little as they claim? (shares of frames)"
+    console.print(console_table(title, COLUMNS, cells))
     texts: dict[str, list[str]] = {}
     for row in rows:
         for warning in row["warnings"]:

@@ -7,6 +7,7 @@ from rich.table import Table
 
 from training.bench_filter import BenchResult
 from training.filter_trials import Row
+from training.text_tables import console_table
 from training.timed_bench import print_caveats
 
 
@@ -43,22 +44,20 @@ def print_result(console: Console, result: BenchResult) -> None:
 def _rows(result: BenchResult, proposal: str) -> Table:
     """Return the table of one proposal's times: a line for each number of particles, landmarks and measurements."""
     first, *more = sorted({row.load.robots for row in result.rows})
-    table = Table(title=f"One step of {proposal}: median in ms", box=None, padding=(0, 1, 0, 0))
-    headings = ("M", "N", "B", f"K={first}", "10-90 %", "least", *(f"K={k}" for k in more))
-    for heading in (*headings, "right"):
-        table.add_column(heading, justify="right", no_wrap=True)
+    headings = ("M", "N", "B", f"K={first}", "10-90 %", "least", *(f"K={k}" for k in more), "right")
+    cells = []
     for row in result.rows:
         if row.load.robots != first or row.load.proposal != proposal:
             continue
         others = [result.find(**_numbers(row, robots=k)) for k in more]
         timing, load = row.timing, row.load
-        table.add_row(
+        cells.append([
             str(load.particles), str(load.landmarks), str(load.measurements),
             _ms(timing.median_ms), f"{_ms(timing.low_ms)}-{_ms(timing.high_ms)}", _ms(timing.min_ms),
             *("" if other is None else _ms(other.timing.median_ms) for other in others),
             f"{row.right:.0%}",
-        )  # fmt: skip
-    return table
+        ])  # fmt: skip
+    return console_table(f"One step of {proposal}: median in ms", headings, cells)
 
 
 def _numbers(row: Row, robots: int) -> dict[str, object]:

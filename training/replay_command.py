@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.table import Table
 
 from training.attempt_tables import print_refusals
 from training.command_folder import begin, choose, finish
@@ -13,7 +12,7 @@ from training.command_options import Config, Duration, Estimator, Json, Out, Rej
 from training.command_progress import share_shown
 from training.consistency_table import print_consistency
 from training.rejuvenation_count import sentence_of
-from training.text_tables import number
+from training.text_tables import console_table, number
 
 if TYPE_CHECKING:  # what computes is imported when the command runs, so that --help answers at once
     from slam_backend.readers.mrclam import MrclamLog
@@ -149,12 +148,8 @@ def _print_tables(console: Console, metrics: dict[str, Any], with_poses: set[int
         rows = [row for row in metrics["robots"] if any(row[key] is not None for key in columns.values())]
         shown = {name: key for name, key in columns.items() if any(row[key] is not None for row in rows)}
         if rows:
-            table = Table(title=title)
-            for name in ("robot", *shown):
-                table.add_column(name, justify="right")
-            for row in rows:
-                table.add_row(str(row["robot"]), *(number(row[key]) for key in shown.values()))
-            console.print(table)
+            cells = [[str(row["robot"]), *(number(row[key]) for key in shown.values())] for row in rows]
+            console.print(console_table(title, ("robot", *shown), cells))
         unknown = [row["robot"] for row in metrics["robots"] if row not in rows]
         missed = [robot for robot in unknown if title == "Paths" and robot in with_poses]
         for robots, why in (
@@ -163,15 +158,14 @@ def _print_tables(console: Console, metrics: dict[str, Any], with_poses: set[int
         ):
             if robots:
                 console.print(f"{title} of robots {', '.join(map(str, robots))}: {why}.", highlight=False)
-    merges = Table(title="Merges")
     errors = {"off by (m)": "error_m", "off by (°)": "error_deg"}
     errors = {name: key for name, key in errors.items() if any(row[key] is not None for row in metrics["merges"])}
-    for name in ("time (s)", "group", "with", "shared landmarks", *errors):
-        merges.add_column(name, justify="right")
+    merges = []
     for row in metrics["merges"]:
         sides = [", ".join(map(str, row[side])) for side in ("robots_a", "robots_b")]
         off = [number(row[key]) for key in errors.values()]
-        merges.add_row(f"{row['time_s']:.1f}", *sides, str(row["landmarks"]), *off)
-    console.print(merges if metrics["merges"] else "No merge.")
+        merges.append([f"{row['time_s']:.1f}", *sides, str(row["landmarks"]), *off])
+    headings = ("time (s)", "group", "with", "shared landmarks", *errors)
+    console.print(console_table("Merges", headings, merges) if merges else "No merge.")
     print_refusals(console, metrics["refusals"])
     console.print("Groups at the end: " + "; ".join(", ".join(map(str, group)) for group in metrics["groups"]))

@@ -7,8 +7,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
 from training.command_folder import begin, choose, finish, gather
 from training.command_options import Config, Duration, Estimator, Json, Out, Particles, RejuvenateEvery, Seed
@@ -16,6 +14,7 @@ from training.command_progress import share_shown
 from training.consistency_table import print_consistency
 from training.rejuvenation_count import sentence_of
 from training.replay_images_command import replay_folder_of_images
+from training.text_tables import console_table, number
 
 if TYPE_CHECKING:  # what computes is imported when the command runs, so that --help answers at once
     from slam_backend.errors import FloatArray
@@ -217,12 +216,10 @@ def print_table(console: Console, metrics: dict[str, Any], result: "OneReplay", 
     if row["ate_aligned_m"] is None:
         console.print(unknown, soft_wrap=True, highlight=False)
     else:
-        table = Table(title=escape("RMS distance to the truth [m]"))
-        for name in ("", "after the best rigid fit", "from the start, no fit"):
-            table.add_column(name, justify="right")
-        for name, key in (("estimate", "ate"), ("odometry", "dead_reckoning_ate")):
-            table.add_row(name, *(f"{row[f'{key}_{kind}_m']:.2f}" for kind in ("aligned", "start")))
-        console.print(table)
+        headings = ("", "after the best rigid fit", "from the start, no fit")
+        names = {"estimate": "ate", "odometry": "dead_reckoning_ate"}
+        rows = [[name, *(number(row[f"{key}_{end}_m"]) for end in ("aligned", "start"))] for name, key in names.items()]
+        console.print(console_table("RMS distance to the truth [m]", headings, rows))
     made = metrics["measurements"]
     console.print(
         f"{metrics['landmarks']} landmarks; of the measurements {made['matched']} matched, {made['created']} began "

@@ -5,10 +5,10 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.table import Table
 
 from training.command_folder import begin, finish, gather
 from training.command_options import Config, Duration, Json, Out, Particles, Seed
+from training.text_tables import console_table
 
 COMMAND = "replay stereo"
 PAIRS = Path("euroc_pairs")
@@ -115,16 +115,15 @@ def _align(values: Mapping[str, Any], out: Path | None, json: Path | None) -> No
     told = chosen.to_mapping() | {"seed": chosen.seed}
     results = {name: align_pairs(log, PairsConfig.from_mapping(told | {"descriptor": name})) for name in order}
     metrics = plain(summarise_pairs(results))
-    table = Table(title="Motion between the two places")
     known = log.poses is not None
-    for title in ("descriptor", "points", "matches", "inliers", *(("error (m)", "error (degrees)") if known else ())):
-        table.add_column(title, justify="right")
+    headings = ("descriptor", "points", "matches", "inliers", *(("error (m)", "error (degrees)") if known else ()))
+    rows = []
     for name, row in metrics["alignments"].items():
         kinds = (("error_m", 3), ("error_deg", 2)) if known else ()
         errors = ["none" if row[key] is None else f"{row[key]:.{n}f}" for key, n in kinds]
         points = " + ".join(str(count) for count in row["points"])
-        table.add_row(name, points, str(row["matches"]), str(row["inliers"]), *errors)
-    console.print(table)
+        rows.append([name, points, str(row["matches"]), str(row["inliers"]), *errors])
+    console.print(console_table("Motion between the two places", headings, rows))
     if not known:
         console.print("Errors: no ground truth in this folder.")
     main = results[chosen.descriptor]

@@ -4,11 +4,10 @@ from collections.abc import Mapping
 from typing import Any
 
 from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
 
 from training.attempt_tables import print_refusals
-from training.text_tables import number
+from training.text_tables import console_table, number
 
 ROWS = (
     ("map error E [m], errors cut at 1 m", "map_error", 3, 1.0),
@@ -32,13 +31,10 @@ def print_tables(console: Console, metrics: Mapping[str, Any]) -> None:
         metrics: As `score_episode` names them; None stands for what is not known.
     """
     columns = {f"robot {robot}": row for robot, row in enumerate(metrics["robots"])} | {"team": metrics["team"]}
-    table = Table(title="Maps and paths, each robot in its own start frame")
-    table.add_column("")
-    for heading in columns:
-        table.add_column(heading, justify="right")
-    for label, key, digits, factor in ROWS:
-        table.add_row(escape(label), *(number(row[key], digits, factor) for row in columns.values()))
-    console.print(table)
+    rows = [
+        [label, *(number(row[key], digits, factor) for row in columns.values())] for label, key, digits, factor in ROWS
+    ]
+    console.print(console_table("Maps and paths, each robot in its own start frame", ("", *columns), rows))
     if metrics["merges"]:
         console.print(_merges(metrics["merges"]))
     else:
@@ -54,14 +50,13 @@ def print_tables(console: Console, metrics: Mapping[str, Any]) -> None:
 
 def _merges(rows: list[Mapping[str, Any]]) -> Table:
     """Return the table of merges."""
-    table = Table(title="Merges, against the true motion between the start poses")
-    for heading in ("time [s]", "robots", "with", "landmarks", "off by [m]", "off by [deg]", "verdict"):
-        table.add_column(escape(heading), justify="right")
+    headings = ("time [s]", "robots", "with", "landmarks", "off by [m]", "off by [deg]", "verdict")
+    cells = []
     for row in rows:
         sides = [", ".join(map(str, row[side])) for side in ("robots_a", "robots_b")]
         errors = f"{row['error_m']:.3f}", f"{row['error_deg']:.2f}"
         verdict = "false" if row["false"] else ""
         if row["undone_s"] is not None:
             verdict += f"{', ' if verdict else ''}undone at {row['undone_s']:.1f} s"
-        table.add_row(f"{row['time_s']:.1f}", *sides, str(row["landmarks"]), *errors, verdict)
-    return table
+        cells.append([f"{row['time_s']:.1f}", *sides, str(row["landmarks"]), *errors, verdict])
+    return console_table("Merges, against the true motion between the start poses", headings, cells)
