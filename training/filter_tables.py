@@ -5,7 +5,7 @@ from dataclasses import replace
 from rich.console import Console
 from rich.table import Table
 
-from training.bench_filter import BenchResult
+from training.bench_filter import STATE_LOAD, BenchResult
 from training.filter_trials import Row
 from training.text_tables import console_table
 from training.timed_bench import print_caveats
@@ -30,6 +30,9 @@ def print_result(console: Console, result: BenchResult) -> None:
             f"for M={largest.load.particles}, N={largest.load.landmarks}.",
             highlight=False,
         )
+    if result.state:
+        times = ", ".join(f"{name} {_ms(timing.median_ms)} ms" for name, timing in result.state.items())
+        console.print(f"M={STATE_LOAD.particles}, N={STATE_LOAD.landmarks}: {times} (medians).", highlight=False)
     if result.compilation is not None:
         cold, cached = result.compilation["cold"], result.compilation["cached"]
         console.print(

@@ -40,7 +40,7 @@ def test_a_bench_leaves_a_folder_that_repeats_it(vslam: Any, tmp_path: Path) -> 
     first, second, copy = tmp_path / "first", tmp_path / "second", tmp_path / "copy.json"
     status, shown, _ = vslam("bench", "filter", *TINY, "--out", str(first), "--json", str(copy))
     assert status == 0
-    assert all(word in shown for word in ("K=2", "fastslam1", "fastslam2", "bytes per particle"))
+    assert all(word in shown for word in ("K=2", "fastslam1", "fastslam2", "get_state", "bytes per particle"))
     metrics = json.loads((first / "metrics.json").read_text())
     assert metrics == json.loads(copy.read_text())
     keys = ("proposal", "particles", "landmarks", "measurements", "robots")
@@ -114,7 +114,12 @@ def test_the_table_tells_all() -> None:
     line = next(line for line in text.splitlines() if line.strip().startswith("1000"))
     assert line.split() == ["1000", "300", "15", "0.500", "0.100-9.00", "0.100", "1.50", "100%"]
     text = " ".join(text.split())
-    for words in ("fastslam2: median in ms", "80 bytes per particle and landmark", "was busy (load 2.5)"):
+    for words in (
+        "fastslam2: median in ms",
+        "80 bytes per particle and landmark",
+        "was busy (load 2.5)",
+        "set_state 0.600 ms",
+    ):
         assert words in text
     assert "Stopped" in text
 
