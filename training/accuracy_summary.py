@@ -1,15 +1,13 @@
 """Trials of many seeds in one line each: means and medians with bootstrap intervals."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
-from scipy import stats
 
 from slam_backend.errors import FloatArray
+from training.seed_means import grouped, interval
 
-CONFIDENCE = 0.95
-RESAMPLES = 5000
 CONDITION = ("preset", "association", "robots", "length")
 GROUP = (*CONDITION, "method", "particles")
 FIGURES = (
@@ -31,11 +29,8 @@ def summarise(rows: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
         `mean_low`, `mean_high`, `median_low`, `median_high` (95 %, percentile bootstrap over seeds; None for a single
         seed) and `worst`; or None where no seed has the figure.
     """
-    groups: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
-    for row in rows:
-        groups.setdefault(tuple(row[name] for name in GROUP), []).append(row)
     lines = []
-    for key, members in groups.items():
+    for key, members in grouped(rows, GROUP).items():
         line: dict[str, Any] = dict(zip(GROUP, key, strict=True)) | {"seeds": len(members)}
         for figure in FIGURES:
             values = np.array([np.nan if row[figure] is None else row[figure] for row in members], dtype=np.float64)
@@ -57,18 +52,3 @@ def describe(values: FloatArray) -> dict[str, float | None] | None:
         found[name] = float(statistic(values))
         found[f"{name}_low"], found[f"{name}_high"] = interval(values, statistic)
     return found
-
-
-def interval(values: FloatArray, statistic: Callable[..., Any]) -> tuple[float | None, float | None]:
-    """Return the 95 % percentile bootstrap interval of a statistic of values (n,).
-
-    One seed tells nothing of the others: (None, None).
-    """
-    if len(values) < 2:
-        return None, None
-    result = stats.bootstrap(
-        (values,), statistic, n_resamples=RESAMPLES, confidence_level=CONFIDENCE, method="percentile",
-        vectorized=True, random_state=np.random.default_rng(0),
-    )  # fmt: skip
-    low, high = result.confidence_interval
-    return float(low), float(high)

@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2
 
+from training.seed_means import CONFIDENCE, grouped
+
 CELL = ("kind", "case", "overlap", "outliers", "method")
-CONFIDENCE = 0.95
 
 
 def summarise(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
@@ -21,11 +22,9 @@ def summarise(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         honest, `worst_m`, `worst_deg`; computing time `median_ms`, `p95_ms`, `max_ms`, and `passed_ms`, the median of
         what passed, which other processes lengthen.
     """
-    cells: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
-    for row in rows:
-        cells.setdefault(tuple(row[name] for name in CELL), []).append(row)
-    for row in rows:
-        cells.setdefault((row["kind"], None, None, None, row["method"]), []).append(row)
+    cells = grouped(rows, CELL)
+    for (kind, method), own in grouped(rows, ("kind", "method")).items():
+        cells[kind, None, None, None, method] = own
     return [dict(zip(CELL, cell, strict=True)) | _describe(own) for cell, own in cells.items()]
 
 

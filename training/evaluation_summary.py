@@ -6,7 +6,7 @@ from typing import Any
 from rich.console import Console
 
 from training.evaluation import FIGURES, MODEL
-from training.seed_means import ahead_by, mean_of, shown
+from training.seed_means import ahead_by, grouped, mean_of, shown
 from training.text_tables import console_table
 
 Rows = Sequence[Mapping[str, Any]]
@@ -27,8 +27,7 @@ def summarise(rows: Rows) -> list[dict[str, Any]]:
     With `_low` and `_high` appended, the ends of its 95 % bootstrap interval over the seeds.
     """
     lines = []
-    for name in dict.fromkeys(row["policy"] for row in rows):
-        own = [row for row in rows if row["policy"] == name]
+    for (name,), own in grouped(rows, ("policy",)).items():
         line: dict[str, Any] = {"policy": name, "seeds": len(own)}
         for figure in FIGURES:
             line |= mean_of(figure, [row[figure] for row in own])

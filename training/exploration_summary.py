@@ -5,7 +5,7 @@ from typing import Any
 
 from training.bench_exploration import NO_ORACLE
 from training.exploration_trials import CURVES, TEAM
-from training.seed_means import ahead_by, mean_of
+from training.seed_means import ahead_by, grouped, mean_of
 
 Rows = Sequence[Mapping[str, Any]]
 PLACE = ("world", "robots", "oracle")
@@ -28,7 +28,7 @@ def summarise(rows: Rows) -> list[dict[str, Any]]:
     90 % of the floor are not always reached, the mean of `below_90_s` is a restricted one: of the time spent below.
     """
     lines = []
-    for key, own in _grouped(rows, CONDITION).items():
+    for key, own in grouped(rows, CONDITION).items():
         line: dict[str, Any] = dict(zip(CONDITION, key, strict=True)) | {"seeds": len(own)}
         for figure in FIGURES:
             line |= mean_of(figure, [row[figure] for row in own])
@@ -43,8 +43,8 @@ def compare_policies(rows: Rows) -> list[dict[str, Any]]:
     bootstrap over the seeds), `better`: the share of seeds in which the policy is the better one.
     """
     found = []
-    for key, own in _grouped(rows, PLACE).items():
-        by_policy = _grouped(own, ("policy",))
+    for key, own in grouped(rows, PLACE).items():
+        by_policy = grouped(own, ("policy",))
         (first,), *others = by_policy
         for (policy,) in others:
             told = dict(zip(PLACE, key, strict=True)) | {"policy": policy, "than": first}
@@ -55,8 +55,8 @@ def compare_policies(rows: Rows) -> list[dict[str, Any]]:
 def compare_oracles(rows: Rows) -> list[dict[str, Any]]:
     """Return how each policy with an oracle differs from itself without, in the same form; `than` is `"none"`."""
     found = []
-    for (world, robots, policy), own in _grouped(rows, ("world", "robots", "policy")).items():
-        by_oracle = _grouped(own, ("oracle",))
+    for (world, robots, policy), own in grouped(rows, ("world", "robots", "policy")).items():
+        by_oracle = grouped(own, ("oracle",))
         for (oracle,) in by_oracle:
             if oracle != NO_ORACLE and (NO_ORACLE,) in by_oracle:
                 told = {"world": world, "robots": robots, "oracle": oracle, "policy": policy, "than": NO_ORACLE}
@@ -70,7 +70,7 @@ def curves(rows: Rows) -> list[dict[str, Any]]:
     Policies that decide at other times may have other times.
     """
     found = []
-    for key, own in _grouped(rows, CONDITION).items():
+    for key, own in grouped(rows, CONDITION).items():
         for point, when in enumerate(own[0]["curves"]["time_s"]):
             line: dict[str, Any] = dict(zip(CONDITION, key, strict=True)) | {"time_s": when}
             for name in CURVES:
@@ -94,11 +94,3 @@ def _differences(told: Mapping[str, Any], own: Rows, other: Rows) -> list[dict[s
 def _by_seed(rows: Rows, figure: str) -> dict[int, float]:
     """Return a figure by seed, of the trials that have it."""
     return {row["seed"]: row[figure] for row in rows if row[figure] is not None}
-
-
-def _grouped(rows: Rows, names: Sequence[str]) -> dict[tuple[Any, ...], list[Mapping[str, Any]]]:
-    """Return the rows by the values of some fields."""
-    groups: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
-    for row in rows:
-        groups.setdefault(tuple(row[name] for name in names), []).append(row)
-    return groups

@@ -15,6 +15,7 @@ from slam_backend.readers.mrclam import MrclamLog, load_mrclam
 from training.plain_config import PlainConfig, check_each_once
 from training.replay_mrclam import Replay, ReplayConfig, replay
 from training.replay_scores import align_to_truth
+from training.seed_means import grouped
 
 COMMAND = "bench mrclam"
 METHODS = ("ransac", "clique")
@@ -116,11 +117,8 @@ def summarise(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         Lines of `duration_s`, `barcodes`, `method`, `pairs` that share enough landmarks, `accepted` of these, `false`
         (off by more than 0.5 m or 5 degrees), `median_m`, `worst_m`, `median_deg`, `worst_deg` of what was accepted.
     """
-    groups: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
-    for row in rows:
-        groups.setdefault((row["duration_s"], row["barcodes"], row["method"]), []).append(row)
     lines = []
-    for (duration, barcodes, method), own in groups.items():
+    for (duration, barcodes, method), own in grouped(rows, ("duration_s", "barcodes", "method")).items():
         apart = np.array([[row["error_m"], row["error_deg"]] for row in own if row["error_m"] is not None])
         line: dict[str, Any] = {
             "duration_s": duration, "barcodes": barcodes, "method": method,

@@ -7,8 +7,8 @@ import numpy as np
 from scipy import stats
 
 from slam_backend.errors import FloatArray
-from training.accuracy_summary import CONFIDENCE, interval
 from training.paper_trials import FIGURES
+from training.seed_means import CONFIDENCE, grouped, mean_of
 from training.text_tables import csv_text
 
 POINT = ("regime", "proposal", "robots", "particles")
@@ -29,9 +29,7 @@ def summarise(errors: Rows, times: Rows) -> list[dict[str, Any]]:
         The fields of `POINT`, `seeds`, `timed_seeds`, and for each of `FIGURES` and `TIMES` its mean over the seeds,
         with `_low` and `_high` appended the ends of its 95 % bootstrap interval; None where it is not known.
     """
-    groups: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
-    for row in errors:
-        groups.setdefault(tuple(row[name] for name in POINT), []).append(row)
+    groups = grouped(errors, POINT)
     clocked: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
     for row in times:
         for i, robots in enumerate(row["robots"]):
@@ -43,10 +41,7 @@ def summarise(errors: Rows, times: Rows) -> list[dict[str, Any]]:
         line = dict(zip(POINT, point, strict=True)) | {"seeds": len(own), "timed_seeds": len(timed)}
         for names, rows in ((FIGURES, own), (TIMES, timed)):
             for name in names:
-                values = np.array([row[name] for row in rows if row[name] is not None], dtype=np.float64)
-                known = len(values) > 0
-                line[name] = float(values.mean()) if known else None
-                line[f"{name}_low"], line[f"{name}_high"] = interval(values, np.mean) if known else (None, None)
+                line |= mean_of(name, [row[name] for row in rows])
         lines.append(line)
     return lines
 

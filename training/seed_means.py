@@ -1,13 +1,39 @@
 """Means over seeds with 95 % bootstrap intervals, differences on common seeds, and how they are shown."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from scipy import stats
 
 from slam_backend.errors import FloatArray
-from training.accuracy_summary import interval
 from training.text_tables import number
+
+CONFIDENCE = 0.95
+RESAMPLES = 5000
+
+
+def grouped(rows: Iterable[Mapping[str, Any]], names: Sequence[str]) -> dict[tuple[Any, ...], list[Mapping[str, Any]]]:
+    """Return rows by the values of some fields, in the order in which these first come."""
+    groups: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
+    for row in rows:
+        groups.setdefault(tuple(row[name] for name in names), []).append(row)
+    return groups
+
+
+def interval(values: FloatArray, statistic: Callable[..., Any]) -> tuple[float | None, float | None]:
+    """Return the 95 % percentile bootstrap interval of a statistic of values (n,).
+
+    One seed tells nothing of the others: (None, None).
+    """
+    if len(values) < 2:
+        return None, None
+    result = stats.bootstrap(
+        (values,), statistic, n_resamples=RESAMPLES, confidence_level=CONFIDENCE, method="percentile",
+        vectorized=True, random_state=np.random.default_rng(0),
+    )  # fmt: skip
+    low, high = result.confidence_interval
+    return float(low), float(high)
 
 
 def mean_of(name: str, values: Sequence[float | None] | FloatArray) -> dict[str, float | None]:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend.errors import BoolArray, FloatArray
-from training.accuracy_summary import interval
+from training.seed_means import interval
 from training.step_timing import no_garbage_collection
 from training.vec_env import make_vec_env
 from vslam_env.config import EnvConfig
