@@ -25,7 +25,7 @@ from slam_backend.metrics import align_se2
 from slam_backend.readers.mrclam_steps import SightingNoise
 from slam_backend.readers.polar import points_from_polar
 from slam_backend.team import TeamSlam
-from training.replay_mrclam import GATES, MAX_SIGMA_HEADING, MOTION, PARTICLES_PER_ROBOT, POSITION_FLOOR
+from training.replay.mrclam import GATES, MAX_SIGMA_HEADING, MOTION, PARTICLES_PER_ROBOT, POSITION_FLOOR
 
 DT = 0.25  # [s]
 HALL = np.array([15.0, 8.0])  # [m]

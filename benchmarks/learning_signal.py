@@ -33,10 +33,10 @@ from rich.table import Table
 from agents import make_policy
 from agents.policy import Policy
 from slam_backend.errors import FloatArray, check_int
-from training.episode import Progress, run_episode
-from training.learn_config import SPLIT_TRAIN, TrainConfig
-from training.seed_means import mean_of, shown
-from training.text_tables import markdown_table
+from training.episodes.runner import Progress, run_episode
+from training.experiments.statistics import mean_of, shown
+from training.experiments.tables import markdown_table
+from training.rl.config import SPLIT_TRAIN, TrainConfig
 from vslam_env import ExplorationEnv, vslam_v0
 from vslam_env.belief import Belief
 from vslam_env.reward import RUNNING_COST

@@ -16,7 +16,7 @@ from slam_backend.geometry import between
 from slam_backend.reports import MergeEvent
 from slam_backend.team import TeamSlam
 from slam_backend.watching import moved_share
-from training.episode import is_false_merge
+from training.episodes.runner import is_false_merge
 from vslam_env.errors_of_maps import FALSE, ClaimLedger
 
 WINDOW = 200  # [steps] after which a false merge counts

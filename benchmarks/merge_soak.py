@@ -44,11 +44,11 @@ from slam_backend.geometry import between, rotation
 from slam_backend.landmark_map import LandmarkMap
 from slam_backend.merge_options import MergeOptions
 from slam_backend.team import TeamSlam
-from training.episode import Progress, is_false_merge, run_episode
-from training.episode_scores import score_episode
-from training.run_config import RunConfig
-from training.run_folder import plain
-from training.stereo_runs import STEP, RunSpec, simulate_run
+from training.bench.accuracy.runs import STEP, RunSpec, simulate_run
+from training.episodes.config import RunConfig
+from training.episodes.metrics import score_episode
+from training.episodes.runner import Progress, is_false_merge, run_episode
+from training.experiments.run_folder import plain
 from vslam_env import ExplorationEnv, preset_config
 from vslam_env.errors_of_maps import ClaimLedger
 

@@ -16,7 +16,7 @@ import numpy as np
 import typer
 
 from slam_backend.errors import FloatArray, bad_argument, check_int
-from training.episode import is_false_merge
+from training.episodes.runner import is_false_merge
 
 FAR = 0.3  # [m]
 

@@ -10,26 +10,26 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from training.bench_alignment_command import bench_alignment
-from training.bench_command import bench
-from training.bench_env_command import bench_env
-from training.bench_exploration_command import bench_exploration
-from training.bench_filter_command import bench_filter
-from training.bench_stereo_command import bench_stereo
-from training.bench_train_command import bench_train
-from training.drive_command import drive_by_hand
-from training.evaluate_command import evaluate
-from training.interrupt import signals_answered
-from training.mrclam_pairs_command import bench_mrclam
-from training.paper_alignment_commands import fig2, fig3, fig4
-from training.paper_command import paper
-from training.paper_fig5_command import fig5
-from training.replay_command import replay_mrclam
-from training.replay_one_command import replay_kitti, replay_victoria
-from training.replay_pairs_command import replay_stereo
-from training.run import run
-from training.train_command import train
-from training.worlds_command import worlds
+from training.commands.bench import bench
+from training.commands.bench_alignment import bench_alignment
+from training.commands.bench_env import bench_env
+from training.commands.bench_exploration import bench_exploration
+from training.commands.bench_filter import bench_filter
+from training.commands.bench_mrclam import bench_mrclam
+from training.commands.bench_stereo import bench_stereo
+from training.commands.bench_train import bench_train
+from training.commands.drive import drive_by_hand
+from training.commands.evaluate import evaluate
+from training.commands.paper import paper
+from training.commands.paper_alignment import fig2, fig3, fig4
+from training.commands.paper_fig5 import fig5
+from training.commands.replay import replay_mrclam
+from training.commands.replay_one import replay_kitti, replay_victoria
+from training.commands.replay_pairs import replay_stereo
+from training.commands.run import run
+from training.commands.train import train
+from training.commands.worlds import worlds
+from training.experiments.interrupt import signals_answered
 
 BAD_INPUT = 2
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)

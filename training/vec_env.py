@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
 from slam_backend.errors import BoolArray, FloatArray, bad_argument, check_int
-from training.compiling import prepare
-from training.vec_slots import MASK, WHOLE, MakeEnv, SlotBatch, Stepped
-from training.vec_workers import SlotWorkers
+from training.experiments.compilation import prepare
+from training.rl.slots import MASK, WHOLE, MakeEnv, SlotBatch, Stepped
+from training.rl.workers import SlotWorkers
 from vslam_env import vslam_v0, warm_up
 from vslam_env.config import EnvConfig
 

@@ -6,8 +6,8 @@ import pytest
 from rich.console import Console
 
 from slam_backend.refusals import PairAttempts
-from training.attempt_tables import pair_rows, print_refusals
-from training.run_folder import plain
+from training.episodes.attempt_tables import pair_rows, print_refusals
+from training.experiments.run_folder import plain
 
 
 def tried(a: tuple[int, ...], b: tuple[int, ...], attempts: int, **refused: Any) -> PairAttempts:

@@ -10,10 +10,10 @@ from scipy import stats
 from slam_backend.errors import FloatArray
 from slam_backend.geometry import between, inverse, transform_points, wrap_angle
 from slam_backend.measurements import Measurements
-from training.batch_ml import BatchEstimate, batch_ml
-from training.batch_problem import BatchProblem, Estimate
-from training.ideal_online import ideal_online
-from training.stereo_runs import FALSE_POINT, PRESETS, NoisePreset, RunSpec, StereoRun, simulate_run
+from training.bench.accuracy.batch_ml import BatchEstimate, batch_ml
+from training.bench.accuracy.batch_problem import BatchProblem, Estimate
+from training.bench.accuracy.online_bound import ideal_online
+from training.bench.accuracy.runs import FALSE_POINT, PRESETS, NoisePreset, RunSpec, StereoRun, simulate_run
 
 FALSE_ALARM = 1e-3
 SPEC = RunSpec(robots=2, length=12.0, measurements=9, landmarks=170)

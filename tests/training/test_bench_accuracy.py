@@ -11,16 +11,16 @@ import pytest
 from rich.console import Console
 
 from slam_backend.geometry import compose, transform_points
-from training import accuracy_trials
-from training.accuracy_summary import FIGURES, describe, summarise
-from training.accuracy_tables import markdown, print_tables
-from training.accuracy_trials import FALSE_POINT, Answer, Trial, play, score
-from training.bench_accuracy import COMMAND, TRIALS_FILE, AccuracyConfig
-from training.figures_accuracy import draw_accuracy
-from training.kept_trials import finished_trials, open_folder, run_trials
-from training.run_folder import RunFolder, plain
-from training.seed_means import interval
-from training.stereo_runs import RunSpec, StereoRun, simulate_run
+from training.bench.accuracy import trials as accuracy_trials
+from training.bench.accuracy.bench import COMMAND, TRIALS_FILE, AccuracyConfig
+from training.bench.accuracy.figures import draw_accuracy
+from training.bench.accuracy.runs import RunSpec, StereoRun, simulate_run
+from training.bench.accuracy.summary import FIGURES, describe, summarise
+from training.bench.accuracy.tables import markdown, print_tables
+from training.bench.accuracy.trials import FALSE_POINT, Answer, Trial, play, score
+from training.experiments.run_folder import RunFolder, plain
+from training.experiments.statistics import interval
+from training.experiments.trial_store import finished_trials, open_folder, run_trials
 
 SMALL = AccuracyConfig(robots=(2,), lengths=(4.0,), particles=(5, 9), seeds=2, seed=31)
 

@@ -7,7 +7,8 @@ import pytest
 
 from slam_backend.alignment import AlignmentOptions, align_maps, candidate_matches
 from slam_backend.geometry import transform_points
-from training.alignment_pairs import (
+from training.bench.alignment.bench import COMMAND, GRID, AlignmentBenchConfig
+from training.bench.alignment.map_pairs import (
     IDENTIFIABLE,
     LANDMARKS,
     LEAST_SPREAD,
@@ -17,9 +18,8 @@ from training.alignment_pairs import (
     draw_pair,
     draw_unalignable,
 )
-from training.alignment_summary import summarise
-from training.alignment_trials import Trial, play
-from training.bench_alignment import COMMAND, GRID, AlignmentBenchConfig
+from training.bench.alignment.summary import summarise
+from training.bench.alignment.trials import Trial, play
 
 
 @pytest.mark.parametrize(("overlap", "outliers"), GRID)

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from training import env_budget, env_timing
-from training.bench_env import EnvBenchConfig, run_bench
+from training.bench.env import profile as env_budget
+from training.bench.env import timing as env_timing
+from training.bench.env.bench import EnvBenchConfig, run_bench
+from training.bench.env.timing import BURST, Play, StepTimes, play_in_turn, play_peer, ratio_of_bursts, record_actions
 from training.cli import app
-from training.env_timing import BURST, Play, StepTimes, play_in_turn, play_peer, ratio_of_bursts, record_actions
 from vslam_env import vslam_v0
 
 runner = CliRunner()

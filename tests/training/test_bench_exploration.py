@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from training import exploration_trials
-from training.bench_exploration import TRIALS_FILE, ExplorationBenchConfig, ExplorationTrial
-from training.episode import MergeRecord
-from training.exploration_summary import FIGURES, compare_oracles, compare_policies, curves, summarise
-from training.exploration_tables import markdown, print_tables, to_csv
-from training.exploration_trials import CURVE_POINTS, CURVES, count_merges, play
-from training.figures_exploration import draw_exploration
+from training.bench.exploration import trials as exploration_trials
+from training.bench.exploration.bench import TRIALS_FILE, ExplorationBenchConfig, ExplorationTrial
+from training.bench.exploration.figures import draw_exploration
+from training.bench.exploration.summary import FIGURES, compare_oracles, compare_policies, curves, summarise
+from training.bench.exploration.tables import markdown, print_tables, to_csv
+from training.bench.exploration.trials import CURVE_POINTS, CURVES, count_merges, play
+from training.episodes.runner import MergeRecord
 from vslam_env import vslam_v0
 
 SMALL = ExplorationBenchConfig(

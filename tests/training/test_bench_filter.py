@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from training import compile_timing
-from training.bench_filter import BenchConfig, BenchResult, count_trials, run_bench
-from training.filter_load import FilterLoad
-from training.filter_tables import print_result
-from training.filter_trials import Row
-from training.step_timing import Timing, time_calls
-from training.timed_bench import processor
+from training.bench.filter import compile_time as compile_timing
+from training.bench.filter.bench import BenchConfig, BenchResult, count_trials, run_bench
+from training.bench.filter.tables import print_result
+from training.bench.filter.trials import Row
+from training.bench.filter.workload import FilterLoad
+from training.experiments.step_timing import Timing, time_calls
+from training.experiments.timed_bench import processor
 
 TINY = ("--particles", "5,9", "--landmarks", "40", "--measurements", "3", "--robots", "1,2", "--steps", "4")
 

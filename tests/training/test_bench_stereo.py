@@ -8,12 +8,12 @@ import pytest
 from typer.testing import CliRunner
 
 from slam_backend.frontend import GUARDS, StereoFrontEnd
-from training.bench_stereo import StereoBenchConfig, camera_of, speed_row
+from training.bench.stereo.bench import StereoBenchConfig, camera_of, speed_row
+from training.bench.stereo.quality import guard_rows, quality_row, retrieval, second_looks
+from training.bench.stereo.real_images import aloe_rows, chessboard, find_parts, measure_parts, planar_scores, rig_rows
+from training.bench.stereo.scenes import WALL, Scene, panel_hall, wall_pose
+from training.bench.stereo.tables import markdown
 from training.cli import app
-from training.stereo_quality import guard_rows, quality_row, retrieval, second_looks
-from training.stereo_real import aloe_rows, chessboard, find_parts, measure_parts, planar_scores, rig_rows
-from training.stereo_scenes import WALL, Scene, panel_hall, wall_pose
-from training.stereo_tables import markdown
 
 
 def test_a_speed_row_times_what_it_says() -> None:
@@ -204,7 +204,7 @@ def test_what_fails_is_noted_and_the_rest_goes_on(tmp_path: Path) -> None:
 def test_the_command_keeps_what_it_has(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, vslam: Any) -> None:
     """A real part that fails costs the exit status 2 and one line, not the results of the others."""
     rendered: dict[str, Any] = {"speed": [], "quality": [], "retrieval": []}
-    monkeypatch.setattr("training.bench_stereo.run_stereo_bench", lambda *arguments: dict(rendered))
+    monkeypatch.setattr("training.bench.stereo.bench.run_stereo_bench", lambda *arguments: dict(rendered))
     _write_pairs(tmp_path)
     (tmp_path / "broken_model.txt").write_text("no numbers")
     run = tmp_path / "out"

@@ -12,10 +12,10 @@ pytest.importorskip("stable_baselines3", reason="stable-baselines3 is not instal
 pytest.importorskip("sb3_contrib", reason="sb3-contrib is not installed: pip install .[train]")
 pytest.importorskip("tensorboard", reason="tensorboard is not installed: pip install .[train]")
 
-from training.bench_train import TrainBenchConfig, run_bench
+from training.bench.train.bench import TrainBenchConfig, run_bench
+from training.bench.train.timing import ADAPTER_ALONE, RECORDED, Replay, record
+from training.bench.train.workers import WorkerTimes, summarise_workers
 from training.cli import app
-from training.train_timing import ADAPTER_ALONE, RECORDED, Replay, record
-from training.worker_timing import WorkerTimes, summarise_workers
 
 runner = CliRunner()
 SMALL = TrainBenchConfig(world="fig5", robots=1, envs=1, workers=(0,), steps=2)

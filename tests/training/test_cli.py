@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from training import cli
-from training.command_options import numbers, words
+from training.commands._options import numbers, words
 
 MRCLAM = "path: expected a folder of the MR.CLAM log, with Barcodes.dat, Landmark_Groundtruth.dat and Robot*.dat"
 

@@ -13,12 +13,12 @@ import pytest
 import typer
 from rich.console import Console
 
-from training import command_progress
-from training.command_folder import begin, choose, finish, gather
-from training.command_progress import KeptPart, play_kept, share_shown, trials_shown
-from training.kept_trials import open_folder
-from training.plain_config import PlainConfig
-from training.run_folder import RunFolder
+from training.commands import _progress as command_progress
+from training.commands._progress import KeptPart, play_kept, share_shown, trials_shown
+from training.commands._run_folder import begin, choose, finish, gather
+from training.experiments.config import PlainConfig
+from training.experiments.run_folder import RunFolder
+from training.experiments.trial_store import open_folder
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

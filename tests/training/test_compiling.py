@@ -6,7 +6,7 @@ import pytest
 from rich.console import Console
 
 from slam_backend.compilation import MESSAGE
-from training.compiling import compilation_shown, prepare
+from training.experiments.compilation import compilation_shown, prepare
 
 
 def _compile_two() -> None:

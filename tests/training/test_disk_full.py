@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 from training import cli
-from training.kept_trials import open_folder, run_trials
-from training.video import VideoWriter
+from training.episodes.video import VideoWriter
+from training.experiments.trial_store import open_folder, run_trials
 
 SHORT = ("--world", "fig5", "--robots", "1", "--particles", "5", "--max-cycles", "20", "--out", "run")
 FULL = Path("/dev/full")

@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from agents import make_policy
 from training.cli import app
-from training.drive import action_of, drive
+from training.episodes.teleoperation import action_of, drive
 from vslam_env import vslam_v0
 from vslam_env.window import Window
 

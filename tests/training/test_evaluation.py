@@ -10,12 +10,12 @@ import pytest
 from rich.console import Console
 
 from agents import POLICIES
-from training import learn_extra
-from training.evaluation import FIGURES, EvaluateConfig
-from training.evaluation_summary import leads, print_evaluation, summarise
-from training.figures_learning import running_mean
-from training.learn_config import TrainConfig
-from training.learn_curves import ends_of, to_csv
+from training.rl import require_extra as learn_extra
+from training.rl.config import TrainConfig
+from training.rl.curves import ends_of, to_csv
+from training.rl.evaluation import FIGURES, EvaluateConfig
+from training.rl.evaluation_summary import leads, print_evaluation, summarise
+from training.rl.figures import running_mean
 
 
 def _row(policy: str, seed: int, gained: float) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from typer.testing import CliRunner
 
 from slam_backend.camera import StereoCamera
 from training.cli import app
-from training.eye_pictures import beside_the_map, draw_eye
+from training.episodes.camera_overlay import beside_the_map, draw_eye
 from vslam_env.sensors import EyeFrame, StereoSensor, StereoSensorConfig
 from vslam_env.world import FreeSpace, World
 

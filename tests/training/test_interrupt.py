@@ -15,9 +15,9 @@ from typing import Any
 import pytest
 
 from training import cli
-from training.command_progress import trials_shown
-from training.interrupt import SIGNALS, interrupt_flag, signals_answered, signals_held
-from training.kept_trials import open_folder, run_trials
+from training.commands._progress import trials_shown
+from training.experiments.interrupt import SIGNALS, interrupt_flag, signals_answered, signals_held
+from training.experiments.trial_store import open_folder, run_trials
 
 BOTH = pytest.mark.parametrize("number", SIGNALS)
 Disposition = Callable[[int], Any]

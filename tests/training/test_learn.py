@@ -28,10 +28,10 @@ from agents.goal_network import logits
 from agents.trained import load_model
 from slam_backend.state_codec import decoded, encoded
 from training.cli import app
-from training.learn import Training, as_arrays, as_tensors, check_device, kept_of
-from training.learn_checkpoint import CHECKPOINT_FILE, FORMAT, MAGIC, read_checkpoint, write_checkpoint
-from training.learn_config import TrainConfig
-from training.learn_network import GoalPolicy
+from training.rl.checkpoint import CHECKPOINT_FILE, FORMAT, MAGIC, read_checkpoint, write_checkpoint
+from training.rl.config import TrainConfig
+from training.rl.network import GoalPolicy
+from training.rl.trainer import Training, as_arrays, as_tensors, check_device, kept_of
 from training.vec_env import ExplorationVecEnv
 from vslam_env.observation import observation_space
 from vslam_env.state_kinds import ENV_KINDS
@@ -208,7 +208,7 @@ def _marked(body: bytes, number: int) -> bytes:
 
 def test_a_pickle_in_the_place_of_a_checkpoint_is_not_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever its format and checksum say, it runs nothing; checkpoints of other formats are refused by number."""
-    monkeypatch.setattr("training.learn_checkpoint._versions", dict)
+    monkeypatch.setattr("training.rl.checkpoint._versions", dict)
     file, proof = tmp_path / CHECKPOINT_FILE, tmp_path / "proof"
     body = pickle.dumps({"config": Trap(proof)})
     for number, says in ((FORMAT, "got a broken file"), (1, "expected one of format 2, got a checkpoint of format 1")):

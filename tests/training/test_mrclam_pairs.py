@@ -9,8 +9,8 @@ import pytest
 from small_logs import write_log
 
 from slam_backend.readers.mrclam import load_mrclam
-from training.mrclam_pairs import MrclamPairsConfig, align_log, align_pairs, summarise
-from training.replay_mrclam import ReplayConfig, replay
+from training.bench.alignment.mrclam import MrclamPairsConfig, align_log, align_pairs, summarise
+from training.replay.mrclam import ReplayConfig, replay
 
 
 def test_exact_maps_are_aligned_exactly(tmp_path: Path) -> None:

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from slam_backend.geometry import transform_points
-from training.paper_fig2 import (
+from training.bench.accuracy.runs import FALSE_POINT
+from training.paper.fig2 import (
     ENOUGH_SHARED,
     METHODS,
     OURS,
@@ -19,9 +20,8 @@ from training.paper_fig2 import (
     refusals,
     summarise,
 )
-from training.paper_fig3 import AlignedPair, PairConfig, align_pair, fuse_pair
-from training.paper_pairs import map_alone, simulate_pair, true_motion
-from training.stereo_runs import FALSE_POINT
+from training.paper.fig3 import AlignedPair, PairConfig, align_pair, fuse_pair
+from training.paper.map_pairs import map_alone, simulate_pair, true_motion
 
 SMALL = Fig2Config(length=30.0, every=10.0, particles=30, seeds=2, seed=100)
 

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from training.paper_fig1 import Clouds, Fig1Config, draw_clouds, figures_of, simulate_fig1
-from training.paper_regimes import FILTER_OPTIONS
-from training.stereo_runs import PRESETS, STEP, StereoRun
+from training.bench.accuracy.runs import PRESETS, STEP, StereoRun
+from training.paper.fig1 import Clouds, Fig1Config, draw_clouds, figures_of, simulate_fig1
+from training.paper.fig6.noise_regimes import FILTER_OPTIONS
 
 SMALL = Fig1Config(robots=2, particles=50, length=12.0, every=3.0, seed=60)
 

@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from training.cli import app
-from training.paper_fig5 import STATES, Fig5, Fig5Config, simulate_fig5
+from training.paper.fig5 import STATES, Fig5, Fig5Config, simulate_fig5
 
 runner = CliRunner()
 

@@ -11,13 +11,15 @@ import numpy as np
 import pytest
 
 from training import cli
-from training.accuracy_trials import Answer
-from training.figures_fig6 import draw_fig6
-from training.paper_claims import Claim, check_claims, flat_within, robots_ratios
-from training.paper_fig6 import ERRORS_FILE, PARTICLES, TIMES_FILE, Fig6Config, cost
-from training.paper_regimes import BOUND, FEW, FILTER_OPTIONS, REGIMES
-from training.paper_summary import POINT, TIMES, paired_ratio, summarise, to_csv
-from training.paper_trials import (
+from training.bench.accuracy.runs import FALSE_POINT, StereoRun, simulate_run
+from training.bench.accuracy.trials import Answer
+from training.experiments.run_folder import plain
+from training.paper.fig6.claims import Claim, check_claims, flat_within, robots_ratios
+from training.paper.fig6.config import ERRORS_FILE, PARTICLES, TIMES_FILE, Fig6Config, cost
+from training.paper.fig6.figure import draw_fig6
+from training.paper.fig6.noise_regimes import BOUND, FEW, FILTER_OPTIONS, REGIMES
+from training.paper.fig6.summary import POINT, TIMES, paired_ratio, summarise, to_csv
+from training.paper.fig6.trials import (
     FIGURES,
     ErrorTrial,
     TimeTrial,
@@ -27,8 +29,6 @@ from training.paper_trials import (
     rms_of_all,
     time_in_turns,
 )
-from training.run_folder import plain
-from training.stereo_runs import FALSE_POINT, StereoRun, simulate_run
 
 ARGUMENTS = ["paper", "fig6", "--seeds", "2", "--first-seed", "50", "--robots", "1,2", "--particles", "3,10"]
 ARGUMENTS += ["--length", "4", "--regimes", "paper,good"]

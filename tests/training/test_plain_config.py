@@ -5,29 +5,29 @@ from typing import Any
 
 import pytest
 
-from training.bench_accuracy import AccuracyConfig
-from training.bench_alignment import AlignmentBenchConfig
-from training.bench_env import EnvBenchConfig
-from training.bench_exploration import ExplorationBenchConfig
-from training.bench_filter import BenchConfig
-from training.bench_stereo import StereoBenchConfig
-from training.bench_train import TrainBenchConfig
-from training.evaluation import EvaluateConfig
-from training.learn_config import TrainConfig
-from training.mrclam_pairs import MrclamPairsConfig
-from training.paper_fig1 import Fig1Config
-from training.paper_fig2 import Fig2Config
-from training.paper_fig3 import PairConfig
-from training.paper_fig5 import Fig5Config
-from training.paper_fig6 import Fig6Config
-from training.plain_config import PlainConfig, check_each_once
-from training.replay_images import ImagesConfig
-from training.replay_kitti import KittiConfig
-from training.replay_mrclam import ReplayConfig
-from training.replay_pairs import PairsConfig
-from training.replay_victoria import VictoriaConfig
-from training.run_config import RunConfig
-from training.run_folder import RunFolder, read_config
+from training.bench.accuracy.bench import AccuracyConfig
+from training.bench.alignment.bench import AlignmentBenchConfig
+from training.bench.alignment.mrclam import MrclamPairsConfig
+from training.bench.env.bench import EnvBenchConfig
+from training.bench.exploration.bench import ExplorationBenchConfig
+from training.bench.filter.bench import BenchConfig
+from training.bench.stereo.bench import StereoBenchConfig
+from training.bench.train.bench import TrainBenchConfig
+from training.episodes.config import RunConfig
+from training.experiments.config import PlainConfig, check_each_once
+from training.experiments.run_folder import RunFolder, read_config
+from training.paper.fig1 import Fig1Config
+from training.paper.fig2 import Fig2Config
+from training.paper.fig3 import PairConfig
+from training.paper.fig5 import Fig5Config
+from training.paper.fig6.config import Fig6Config
+from training.replay.kitti import KittiConfig
+from training.replay.mrclam import ReplayConfig
+from training.replay.stereo_images import ImagesConfig
+from training.replay.stereo_pairs import PairsConfig
+from training.replay.victoria import VictoriaConfig
+from training.rl.config import TrainConfig
+from training.rl.evaluation import EvaluateConfig
 
 # Per class what it cannot do without, and a value that is not its default.
 CASES: dict[type[PlainConfig], dict[str, Any]] = {

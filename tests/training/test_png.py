@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from training.png import save_png
+from training.experiments.plotting import save_png
 
 
 def _figure() -> Figure:

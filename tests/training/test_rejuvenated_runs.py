@@ -10,11 +10,11 @@ import pytest
 from small_logs import write_drive, write_log, write_park
 
 from slam_backend import _rejuvenation_step
-from training.replay_images import ImagesConfig
-from training.replay_kitti import KittiConfig
-from training.replay_mrclam import ReplayConfig
-from training.replay_victoria import VictoriaConfig
-from training.run_config import RunConfig
+from training.episodes.config import RunConfig
+from training.replay.kitti import KittiConfig
+from training.replay.mrclam import ReplayConfig
+from training.replay.stereo_images import ImagesConfig
+from training.replay.victoria import VictoriaConfig
 from vslam_env.config import EnvConfig
 from vslam_env.presets import preset_config
 

@@ -1,7 +1,7 @@
 """How replays count what came of drawing particles anew, and how they tell it."""
 
 from slam_backend.reports import RejuvenationReport
-from training.rejuvenation_count import RejuvenationCount, sentence_of
+from training.replay.rejuvenation_counts import RejuvenationCount, sentence_of
 
 
 def count_of(*reasons: str | None) -> RejuvenationCount:

@@ -12,9 +12,9 @@ from slam_backend.readers.kitti_images import holds_images, load_kitti_images
 from slam_backend.readers.stereo_files import StereoFiles, load_stereo_images
 from slam_backend.trajectory import Trajectory
 from training.cli import app
-from training.figures_images import expected_pixels
-from training.replay_images import ImagesConfig, replay_images, score_images
-from training.replay_pairs import PairsConfig, align_pairs, load_pairs
+from training.replay.image_figures import expected_pixels
+from training.replay.stereo_images import ImagesConfig, replay_images, score_images
+from training.replay.stereo_pairs import PairsConfig, align_pairs, load_pairs
 
 FOCAL, BASELINE, WIDTH, HEIGHT, STEP = 300.0, 0.5, 400, 240, 0.4
 

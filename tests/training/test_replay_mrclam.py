@@ -14,8 +14,8 @@ from slam_backend.motion import OdometryModel
 from slam_backend.readers.mrclam import load_mrclam
 from slam_backend.readers.mrclam_steps import Drive, SightingNoise
 from slam_backend.trajectory import Trajectory
-from training.replay_mrclam import MOTION, ReplayConfig, replay
-from training.replay_scores import align_to_truth, score_path, summarise
+from training.replay.metrics import align_to_truth, score_path, summarise
+from training.replay.mrclam import MOTION, ReplayConfig, replay
 
 EXACT = ReplayConfig(
     path="log",

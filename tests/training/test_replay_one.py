@@ -13,16 +13,16 @@ from slam_backend.readers.velocities import integrate_commands
 from slam_backend.readers.victoria import load_victoria
 from slam_backend.readers.victoria_steps import axle_velocities, steps
 from slam_backend.trajectory import Trajectory
-from training.replay_kitti import KittiConfig, find_loop, mean_drift
-from training.replay_kitti import replay as replay_kitti
-from training.replay_kitti import score as score_kitti
-from training.replay_kitti import summarise as summarise_kitti
-from training.replay_one import path_length, score_positions
-from training.replay_one_command import drift_told
-from training.replay_victoria import VictoriaConfig, describe_by_place
-from training.replay_victoria import replay as replay_victoria
-from training.replay_victoria import score as score_victoria
-from training.replay_victoria import summarise as summarise_victoria
+from training.commands.replay_one import drift_told
+from training.replay.kitti import KittiConfig, find_loop, mean_drift
+from training.replay.kitti import replay as replay_kitti
+from training.replay.kitti import score as score_kitti
+from training.replay.kitti import summarise as summarise_kitti
+from training.replay.single_robot import path_length, score_positions
+from training.replay.victoria import VictoriaConfig, describe_by_place
+from training.replay.victoria import replay as replay_victoria
+from training.replay.victoria import score as score_victoria
+from training.replay.victoria import summarise as summarise_victoria
 
 
 def test_a_park_is_mapped_by_position_alone(tmp_path: Path) -> None:

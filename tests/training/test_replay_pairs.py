@@ -10,9 +10,9 @@ from typer.testing import CliRunner
 
 from slam_backend.camera import ROBOT_FROM_CAMERA, StereoCamera
 from slam_backend.landmark_map import LandmarkMap
+from training.bench.stereo.scenes import WALL, Scene, wall_pose
 from training.cli import app
-from training.replay_pairs import PairsConfig, align_pairs, load_pairs
-from training.stereo_scenes import WALL, Scene, wall_pose
+from training.replay.stereo_pairs import PairsConfig, align_pairs, load_pairs
 
 CAMERA = StereoCamera()
 SENSOR = """T_BS:

@@ -12,12 +12,12 @@ from rich.console import Console
 from slam_backend.geometry import between, compose
 from slam_backend.landmark_map import LandmarkMap
 from slam_backend.trajectory import Trajectory
-from training.episode import EpisodeRecord, MergeRecord, Progress, run_episode
-from training.episode_scores import score_episode
-from training.figures import draw_errors, draw_maps
-from training.live import LiveProgress, describe
-from training.run_config import EPISODE_S, RunConfig
-from training.run_tables import print_tables
+from training.episodes.config import EPISODE_S, RunConfig
+from training.episodes.figures import draw_errors, draw_maps
+from training.episodes.live import LiveProgress, describe
+from training.episodes.metrics import score_episode
+from training.episodes.runner import EpisodeRecord, MergeRecord, Progress, run_episode
+from training.episodes.tables import print_tables
 from vslam_env import vslam_v0
 from vslam_env.config import EnvConfig
 from vslam_env.world import World

@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from slam_backend.trajectory import Trajectory
-from training.kept_trials import finished_trials
-from training.run_folder import METRICS_FILE, RunFolder, plain, read_config
+from training.experiments.run_folder import METRICS_FILE, RunFolder, plain, read_config
+from training.experiments.trial_store import finished_trials
 
 
 @dataclass(frozen=True)

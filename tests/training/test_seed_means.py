@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from training.seed_means import ahead_by, mean_of, shown
+from training.experiments.statistics import ahead_by, mean_of, shown
 
 
 def test_seeds_without_a_figure_do_not_count() -> None:

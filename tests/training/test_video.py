@@ -7,7 +7,7 @@ import pytest
 
 from slam_backend.alignment import Alignment
 from slam_backend.reports import MergeEvent
-from training.video import LONGEST_S, VideoWriter, choose_pace, with_slow_flashes
+from training.episodes.video import LONGEST_S, VideoWriter, choose_pace, with_slow_flashes
 from vslam_env.rendering import Scene
 
 SIZE = (98, 62)

@@ -9,7 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from training.cli import app
-from training.worlds_survey import contact_sheet, survey
+from training.episodes.world_survey import contact_sheet, survey
 from vslam_env.world import WORLD_FAMILIES, load_walls_json
 
 runner = CliRunner()

@@ -11,8 +11,8 @@ from slam_backend.smoothing.extending import extended
 from slam_backend.smoothing.graph import PathGraph
 from slam_backend.smoothing.options import SmoothingOptions
 from slam_backend.smoothing.solving import Mode
-from training.batch_problem import BatchProblem
-from training.stereo_runs import RunSpec, StereoRun, simulate_run
+from training.bench.accuracy.batch_problem import BatchProblem
+from training.bench.accuracy.runs import RunSpec, StereoRun, simulate_run
 
 SPEC = RunSpec(length=5.0, landmarks=120, measurements=7)
 TIGHT = SmoothingOptions(kernel=0.0, tolerance=1e-12, max_iterations=50, max_keys=1000, fresh_keys=1000)

@@ -26,7 +26,7 @@ from slam_backend.smoothing.holding import (
     move_tiles,
     share,
 )
-from training.stereo_runs import RunSpec, simulate_run
+from training.bench.accuracy.runs import RunSpec, simulate_run
 
 add_scatter, bring_nearer, fit, look_at, measure_off, share, widen = map(
     python_entry, (add_scatter, bring_nearer, fit, look_at, measure_off, share, widen)

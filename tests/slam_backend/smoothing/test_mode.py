@@ -23,8 +23,8 @@ from slam_backend.smoothing.extending import extended
 from slam_backend.smoothing.graph import PathGraph
 from slam_backend.smoothing.options import SmoothingOptions
 from slam_backend.smoothing.solving import find_mode
-from training.batch_ml import batch_ml
-from training.stereo_runs import NoisePreset, RunSpec, simulate_run
+from training.bench.accuracy.batch_ml import batch_ml
+from training.bench.accuracy.runs import NoisePreset, RunSpec, simulate_run
 
 advance, invert, seek = map(python_entry, (advance, invert, seek))
 

@@ -12,8 +12,8 @@ from slam_backend.motion import OdometryModel
 from slam_backend.smoothing import rejuvenation, solving
 from slam_backend.smoothing.options import SmoothingOptions
 from slam_backend.smoothing.sampling import drawn_spreads
-from training.accuracy_trials import follow, score
-from training.stereo_runs import RunSpec, simulate_run
+from training.bench.accuracy.runs import RunSpec, simulate_run
+from training.bench.accuracy.trials import follow, score
 
 EVERY = 8
 

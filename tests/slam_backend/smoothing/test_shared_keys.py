@@ -17,7 +17,7 @@ from slam_backend.smoothing.extending import extended
 from slam_backend.smoothing.graph import LEVER, PathGraph
 from slam_backend.smoothing.options import SmoothingOptions
 from slam_backend.smoothing.rejuvenation import rejuvenate
-from training.stereo_runs import RunSpec, simulate_run
+from training.bench.accuracy.runs import RunSpec, simulate_run
 
 choose, number, place, start_anew, walk = map(python_entry, (choose, number, place, start_anew, walk))
 

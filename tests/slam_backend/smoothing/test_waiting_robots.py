@@ -16,7 +16,7 @@ from slam_backend.smoothing.extending import extended
 from slam_backend.smoothing.graph import PathGraph
 from slam_backend.smoothing.options import SmoothingOptions
 from slam_backend.smoothing.solving import find_mode
-from training.stereo_runs import StereoRun
+from training.bench.accuracy.runs import StereoRun
 
 EVERY = 10
 FEW_KEYS = {"max_keys": 10, "fresh_keys": 5}  # so that a log is taken in 20 steps at a time

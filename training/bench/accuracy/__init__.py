@@ -1,0 +1,1 @@
+"""Errors and consistency of the filter beside batch maximum likelihood."""

@@ -1,0 +1,257 @@
+"""One trial of the accuracy bench: a simulated run, one method, and how far its answer is from the truth."""
+
+import time
+from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
+from typing import Any, Literal
+
+import numpy as np
+
+from slam_backend.errors import FloatArray, IntArray, check_choice, check_float, check_int
+from slam_backend.existence import ExistenceModel
+from slam_backend.filter import FastSlam
+from slam_backend.geometry import transform_points, wrap_angle
+from slam_backend.metrics import align_se2, ate, map_rmse, nees
+from training.bench.accuracy.batch_ml import BatchEstimate, batch_ml
+from training.bench.accuracy.batch_problem import BatchProblem
+from training.bench.accuracy.online_bound import ideal_online
+from training.bench.accuracy.runs import FALSE_POINT, RunSpec, StereoRun, simulate_run
+
+PEERS = ("dead_reckoning", "batch_ml", "ideal_online")
+FILTERS = ("fastslam1", "fastslam2", "fastslam2+existence", "fastslam2+rejuvenation")
+METHODS = (*PEERS, *FILTERS)
+REJUVENATE_EVERY = 25  # steps
+CONFIRMED = 2  # sightings that confirm a landmark
+LEAST_SIGMA = 1e-5  # [m, rad]; a collapsed set of particles claims no error at all, which has no NEES
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Trial:
+    """What decides a trial.
+
+    Attributes:
+        preset: Of the noise.
+        association: "known" or "unknown"; what uses no filter is told the names in any case.
+        robots: K.
+        length: Of each robot's path [m].
+        method: One of `METHODS`.
+        particles: M of a filter, 0 of the others.
+        seed: Of the run, and of the filter's draws.
+        noise_factor: What a filter multiplies the true variance of the measurements by.
+        landmark_noise: Of a filter [m], see `FilterOptions`.
+    """
+
+    preset: str
+    association: Literal["known", "unknown"]
+    robots: int
+    length: float
+    method: str
+    particles: int
+    seed: int
+    noise_factor: float = 1.0
+    landmark_noise: float | None = None
+
+    def __post_init__(self) -> None:
+        check_float("noise_factor", self.noise_factor, "Use 1 for the noise as it is.", above=0.0)
+        check_choice("method", self.method, METHODS)
+        least = 1 if self.method in FILTERS else 0
+        check_int("particles", self.particles, least, "Use at least one particle; 100 is a good start.")
+        check_int("seed", self.seed, 0, "Use 0 or a positive number.")
+        _ = self.spec  # refuses the rest
+
+    @property
+    def spec(self) -> RunSpec:
+        """The run that is simulated."""
+        return RunSpec(robots=self.robots, length=self.length, preset=self.preset, association=self.association)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Answer:
+    """What a method says about a run; None where it says nothing.
+
+    Attributes:
+        paths: (K, T, 3) float64 [m, m, rad], world frame. Online methods: each pose as known at its own step.
+        covariances: (K, T, 3, 3) float64, of these poses.
+        means: (n, 3) float64 [m], world frame. The map at the end.
+        claims: (n,) int64. The true landmark behind each, by the run's own index; `FALSE_POINT`: none.
+        confirmed: (n,) bool. Whether it was seen at least `CONFIRMED` times.
+        extra: Further figures of a filter.
+    """
+
+    paths: FloatArray
+    covariances: FloatArray | None = None
+    means: FloatArray | None = None
+    claims: IntArray | None = None
+    confirmed: Any = None
+    extra: dict[str, float] | None = None
+
+
+def play(trial: Trial) -> dict[str, Any]:
+    """Run a trial.
+
+    Returns:
+        The trial's own fields, and: `pose_rms_m` (all robots and steps, as it is), `pose_aligned_rms_m` (after the one
+        SE(2) motion that fits all paths best), `heading_rms_deg`; `map_rmse_m`, `map_aligned_rmse_m`, `map_recall` (of
+        the landmarks that were measured), `map_precision`, `confirmed_recall`, `confirmed_precision` (of landmarks seen
+        twice and more); `nees_median`, `nees_mean` (3-D, ideal 3), `anees` (the mean over the dimension, ideal 1); of
+        filters `ess_share` (mean of ESS / M), `nis` (mean, ideal 3), `wrong_match_share` (of all matches of the most
+        probable particle), `held_back_share` (of all measurements, neither matched nor new), `step_ms` (median),
+        `rejuvenation_ms` (median of the steps in which it was tried), `refused_share` (of these attempts); and
+        `seconds`. NaN stands for what is not known.
+    """
+    begin = time.perf_counter()
+    run = _run_of(trial.spec, trial.seed)
+    if trial.method in FILTERS:
+        answer = follow(run, _build_filter(run, trial))
+    elif trial.method == "dead_reckoning":
+        answer = Answer(BatchProblem.of_run(run).dead_reckoning().paths)
+    else:
+        answer = optimal(run, trial.method)
+    row = asdict(trial) | score(run, answer)
+    return row | {"seconds": time.perf_counter() - begin}
+
+
+def _build_filter(run: StereoRun, trial: Trial) -> FastSlam:
+    """Return the filter that a trial's method names, fresh.
+
+    "+existence": with the default model of existence; "+rejuvenation": every `REJUVENATE_EVERY` steps.
+    """
+    proposal, _, extra = trial.method.partition("+")
+    camera, factor = run.spec.noise.camera, float(np.sqrt(trial.noise_factor))
+    options: dict[str, Any] = {"landmark_noise": trial.landmark_noise}
+    options["camera"] = replace(
+        camera, sigma_px=factor * camera.sigma_px, sigma_disparity_px=factor * camera.sigma_disparity_px
+    )
+    if extra == "existence":
+        options["existence"] = ExistenceModel(frame_limit=run.spec.measurements // run.spec.robots)
+    elif extra == "rejuvenation":
+        options["rejuvenate_every"] = REJUVENATE_EVERY
+    return run.build_filter(trial.particles, proposal, trial.seed, **options)  # type: ignore[arg-type]
+
+
+def score(run: StereoRun, answer: Answer) -> dict[str, float]:
+    """Compare an answer with the truth; see `play` for the figures."""
+    errors = answer.paths - run.true_paths
+    errors[..., 2] = wrap_angle(errors[..., 2])
+    fitted = ate(answer.paths.reshape(-1, 3), run.true_paths.reshape(-1, 3))
+    row = {
+        "pose_rms_m": fitted.start,
+        "pose_aligned_rms_m": fitted.aligned,
+        "heading_rms_deg": float(np.degrees(np.sqrt((errors[..., 2] ** 2).mean()))),
+    }
+    row |= dict.fromkeys(
+        ("map_rmse_m", "map_aligned_rmse_m", "map_recall", "map_precision", "confirmed_recall", "confirmed_precision",
+         "nees_median", "nees_mean", "anees", "ess_share", "nis", "wrong_match_share", "held_back_share", "step_ms",
+         "rejuvenation_ms", "refused_share"),
+        float("nan"),
+    )  # fmt: skip
+    if answer.covariances is not None:
+        claimed = answer.covariances[:, 1:].reshape(-1, 3, 3) + LEAST_SIGMA**2 * np.eye(3)  # the start is given
+        values = nees(errors[:, 1:].reshape(-1, 3), claimed)
+        row |= {"nees_median": float(np.median(values)), "nees_mean": float(values.mean())}
+        row["anees"] = row["nees_mean"] / 3.0
+    if answer.means is not None and answer.claims is not None:
+        row |= _score_map(run, answer.means, answer.claims, answer.confirmed)
+    return row | (answer.extra or {})
+
+
+def _score_map(run: StereoRun, means: FloatArray, claims: IntArray, confirmed: Any) -> dict[str, float]:
+    """Return the figures of a map; only landmarks that were measured can be missed."""
+    measured = run.measured_landmarks()
+    rows = np.full(len(run.landmarks), FALSE_POINT)
+    rows[measured] = np.arange(len(measured))
+    named = np.where(claims == FALSE_POINT, FALSE_POINT, rows[claims])
+    truths = run.landmarks[measured]
+    whole = map_rmse(means, truths, named)
+    sure = map_rmse(means[confirmed], truths, named[confirmed])
+    pairs = whole.matched
+    aligned = float("nan")
+    if len(pairs):
+        motion = align_se2(truths[pairs[:, 1], :2], means[pairs[:, 0], :2])
+        apart = transform_points(motion, means[pairs[:, 0]]) - truths[pairs[:, 1]]
+        aligned = float(np.sqrt((apart**2).sum(axis=1).mean()))
+    return {
+        "map_rmse_m": whole.rmse,
+        "map_aligned_rmse_m": aligned,
+        "map_recall": whole.recall,
+        "map_precision": whole.precision,
+        "confirmed_recall": sure.recall,
+        "confirmed_precision": sure.precision,
+    }
+
+
+def follow(run: StereoRun, slam: FastSlam) -> Answer:
+    """Let a filter, fresh from `run.build_filter`, take the run step by step; note each pose when it is estimated."""
+    robots = range(slam.num_robots)
+    claims: dict[int, int] = {}  # id of a landmark -> true landmark behind the measurement that created it
+    paths, covariances, ess, nis, times = [], [], [], [], []
+    attempts: list[tuple[float, bool]] = []
+    matched = wrong = held_back = total = 0
+    for reading, names in zip(run.readings(), run.names, strict=True):
+        begin = time.perf_counter()
+        report = slam.step(**reading)
+        times.append(time.perf_counter() - begin)
+        if report.rejuvenation is not None:
+            attempts.append((times[-1], report.rejuvenation.reason != ""))
+        ess.append(report.ess / slam.num_particles)
+        nis.append(report.nis)
+        for robot in robots:
+            found, name = report.associations[robot].tolist(), names[robot].tolist()
+            pairs = [(claims[i], n) for i, n in zip(found, name, strict=True) if i in claims]
+            matched += len(pairs)
+            wrong += sum(claim == FALSE_POINT or claim != n for claim, n in pairs)
+            held_back += sum(i < 0 for i in found)
+            total += len(found)
+        for robot in robots:
+            made = report.created[robot]
+            claims |= {int(made[b]): int(names[robot][b]) for b in np.flatnonzero(made >= 0)}
+        estimates = [slam.pose(robot) for robot in robots]
+        paths.append([estimate.mean for estimate in estimates])
+        covariances.append([estimate.covariance for estimate in estimates])
+    held = slam.map()
+    return Answer(
+        paths=np.array(paths).transpose(1, 0, 2),
+        covariances=np.array(covariances).transpose(1, 0, 2, 3),
+        means=held.means,
+        claims=np.array([claims[int(i)] for i in held.ids], dtype=np.int64),
+        confirmed=held.counts >= CONFIRMED,
+        extra={
+            "ess_share": float(np.mean(ess)),
+            "nis": float(np.mean(values)) if len(values := np.array(nis)[np.isfinite(nis)]) else float("nan"),
+            "wrong_match_share": wrong / max(matched, 1),
+            "held_back_share": held_back / max(total, 1),
+            "step_ms": 1e3 * float(np.median(times)),
+            "rejuvenation_ms": 1e3 * float(np.median([t for t, _ in attempts])) if attempts else float("nan"),
+            "refused_share": float(np.mean([refused for _, refused in attempts])) if attempts else float("nan"),
+        },
+    )
+
+
+def optimal(run: StereoRun, method: str) -> Answer:
+    """Return the batch or the ideal online estimate; both know which landmark is behind each measurement.
+
+    Args:
+        run: Whatever its association is, names are told.
+        method: "batch_ml" or "ideal_online".
+    """
+    problem, batch = _batch_of(run)
+    if method == "ideal_online":
+        online = ideal_online(problem, batch)
+        paths, covariances, means = online.paths, online.covariances, online.landmarks
+    else:
+        paths, covariances, means = batch.paths, batch.path_covariances, batch.landmarks
+    sightings = np.bincount(problem.landmarks, minlength=len(problem.names))
+    return Answer(paths, covariances, means, problem.names, sightings >= CONFIRMED)
+
+
+@lru_cache(maxsize=1)
+def _run_of(spec: RunSpec, seed: int) -> StereoRun:
+    """Simulate a run once for the trials on it that follow each other."""
+    return simulate_run(spec, seed)
+
+
+@lru_cache(maxsize=1)
+def _batch_of(run: StereoRun) -> tuple[BatchProblem, BatchEstimate]:
+    """Optimise a run once for the two methods that need it."""
+    problem = BatchProblem.of_run(run)
+    return problem, batch_ml(problem)

@@ -1,0 +1,1 @@
+"""Map alignment on simulated and real pairs of maps."""

@@ -1,0 +1,97 @@
+"""The trials of `vslam bench alignment`: one pair of maps, one method, and how far the motion found is off."""
+
+import time
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, Literal
+
+import numpy as np
+
+from slam_backend.alignment import RIVAL_ANGLE, RIVAL_DISTANCE, align_maps
+from slam_backend.geometry import wrap_angle
+from training.bench.alignment.map_pairs import (
+    IDENTIFIABLE,
+    UNALIGNABLE,
+    MapPair,
+    draw_identifiable,
+    draw_pair,
+    draw_unalignable,
+)
+
+Kind = Literal["grid", "U", "I"]
+KINDS: tuple[Kind, ...] = ("grid", "U", "I")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Trial:
+    """One alignment.
+
+    Attributes:
+        kind: "grid": 200 landmarks each, of which a share is common, and of the look-alikes a share is wrong. "U": maps
+            that must not be aligned. "I": maps that just can be.
+        case: Of the hard kinds, which of `UNALIGNABLE` or `IDENTIFIABLE`; empty for the grid.
+        overlap: Of the grid, share of the landmarks that are common; 0 for the hard kinds.
+        outliers: Of the grid, share of the look-alike pairs that are wrong; 0 for the hard kinds.
+        method: Of `align_maps`.
+        seed: Of maps and search.
+    """
+
+    kind: Kind
+    case: str
+    overlap: float
+    outliers: float
+    method: str
+    seed: int
+
+
+def cases(kind: Kind) -> tuple[str, ...]:
+    """Return the cases of a hard kind."""
+    return {"U": UNALIGNABLE, "I": IDENTIFIABLE, "grid": ("",)}[kind]
+
+
+@lru_cache(maxsize=1)
+def maps_of(kind: Kind, case: str, overlap: float, outliers: float, seed: int) -> MapPair:
+    """Return the maps of a trial; all methods are tried on the same."""
+    cell = KINDS.index(kind), cases(kind).index(case), round(1000 * overlap), round(1000 * outliers)
+    rng = np.random.default_rng([seed, *cell])  # cells share no draws, so that their errors are independent
+    if kind == "grid":
+        return draw_pair(overlap, outliers, rng)
+    return draw_unalignable(case, rng) if kind == "U" else draw_identifiable(case, rng)
+
+
+def play(trial: Trial) -> dict[str, Any]:
+    """Align the maps of a trial.
+
+    Returns:
+        The trial's fields; `success`, `reason`, `ratio`, `inliers`; `seconds` as they passed, `cpu_seconds` of
+        computing. Where there is a true motion and one was found: `error_m` and `error_rad`, `false` if they are above
+        0.5 m or 5 degrees, `nees`, and the Cramer-Rao variances `bound_m2` and `bound_rad2`. Whatever is found where
+        there is none is false.
+    """
+    pair = maps_of(trial.kind, trial.case, trial.overlap, trial.outliers, trial.seed)
+    rng = np.random.default_rng(trial.seed)
+    begun, begun_cpu = time.perf_counter(), time.thread_time()
+    found = align_maps(pair.a, pair.b, trial.method, rng)
+    seconds, cpu_seconds = time.perf_counter() - begun, time.thread_time() - begun_cpu
+    row: dict[str, Any] = {name: getattr(trial, name) for name in Trial.__dataclass_fields__} | {
+        "success": found.success,
+        "reason": found.reason,
+        "ratio": found.ratio,
+        "inliers": len(found.inliers),
+        "seconds": seconds,
+        "cpu_seconds": cpu_seconds,
+        "false": found.success,
+    }
+    if found.success and len(pair.pairs):
+        error = found.transform - pair.pose
+        error[2] = wrap_angle(error[2])
+        bound = pair.bound()
+        row |= {
+            "error_m": float(np.hypot(error[0], error[1])),
+            "error_rad": abs(float(error[2])),
+            "false": bool(np.hypot(error[0], error[1]) > RIVAL_DISTANCE or abs(error[2]) > RIVAL_ANGLE),
+            "nees": float(error @ np.linalg.solve(found.covariance, error)),
+            "bound_m2": float(bound[0, 0] + bound[1, 1]),
+            "bound_rad2": float(bound[2, 2]),
+        }
+    return row

@@ -1,0 +1,1 @@
+"""Speed of the environment, and where the time goes."""

@@ -1,0 +1,194 @@
+"""Environments timed step by step on actions that were recorded beforehand, so that no policy is timed with them."""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+
+from agents.registry import make_policy
+from slam_backend.errors import FloatArray
+from training.experiments.step_timing import no_garbage_collection
+from vslam_env import vslam_v0
+from vslam_env.config import TICK, EnvConfig
+from vslam_env.environment import ExplorationEnv
+from vslam_env.setting import draw_setting
+from vslam_env.world import Simulator, read_odometry
+
+PEER = "mpe2"  # the package whose simple_spread is timed beside
+BURST = 50  # calls in a row, of plays that take turns
+
+
+@dataclass(frozen=True, slots=True)
+class StepTimes:
+    """Of calls that were timed one by one [us].
+
+    Attributes:
+        median_us: Half of the calls took longer.
+        mean_us: What happens now and then, and what other programs take, shows here.
+        p99_us: 1 % took longer.
+        min_us: The shortest.
+        undisturbed_us: Half of the calls took longer, each at the best of its repeats.
+        per_second: Calls in a second, by the median.
+        per_second_mean: Calls in a second, by the mean.
+        calls: How many differ; each was repeated as often.
+    """
+
+    median_us: float
+    mean_us: float
+    p99_us: float
+    min_us: float
+    undisturbed_us: float
+    per_second: float
+    per_second_mean: float
+    calls: int
+
+    @classmethod
+    def of(cls, seconds: FloatArray) -> "StepTimes":
+        """Summarise durations (n,) or (repeats, n) [s]."""
+        micros = 1e6 * np.atleast_2d(seconds)
+        median, high = (float(q) for q in np.quantile(micros, (0.5, 0.99)))
+        mean, undisturbed = float(micros.mean()), float(np.median(micros.min(axis=0)))
+        return cls(median, mean, high, float(micros.min()), undisturbed, 1e6 / median, 1e6 / mean, micros.shape[1])
+
+
+def record_actions(env: ExplorationEnv, seed: int, steps: int) -> list[dict[str, Any]]:
+    """Let the nearest-frontier policy drive an episode; return its actions, which can be played again."""
+    env.max_cycles = max(env.max_cycles, steps + 1)
+    policies = {agent: make_policy("frontier", env.config.action_type) for agent in env.possible_agents}
+    rng = np.random.default_rng(seed)
+    observations, _ = env.reset(seed=seed)
+    actions = []
+    for _ in range(steps):
+        # A flat vector is no dict of arrays: the policy goes by the belief alone.
+        actions.append({a: policies[a].act(observations[a], env.belief(a), rng) for a in env.agents})
+        observations = env.step(actions[-1])[0]
+    return actions
+
+
+def time_steps(call: Callable[[Any], Any], arguments: Sequence[Any], warm_up: int) -> FloatArray:
+    """Return how long calls took (n - warm_up,) [s], nothing of their results kept."""
+    with no_garbage_collection():
+        return _seconds(call, arguments)[warm_up:]
+
+
+def _seconds(call: Callable[[Any], Any], arguments: Sequence[Any]) -> FloatArray:
+    """Return how long each call took (n,) [s]."""
+    durations = np.empty(len(arguments), np.int64)
+    for i, argument in enumerate(arguments):
+        begin = time.perf_counter_ns()
+        call(argument)
+        durations[i] = time.perf_counter_ns() - begin
+    return durations / 1e9
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Play:
+    """What is played again and again, the same each time.
+
+    Attributes:
+        begin: Called before each play.
+        call: What is timed.
+        arguments: Of its calls, in order.
+    """
+
+    begin: Callable[[], object]
+    call: Callable[[Any], Any]
+    arguments: Sequence[Any]
+
+
+def play_in_turn(plays: Sequence[Play], warm_up: int, repeats: int) -> FloatArray:
+    """Return how long the calls of each play took (plays, repeats, n - warm_up) [s], if all have n of them.
+
+    The plays take turns in bursts of calls, each with its own order, so that a machine whose speed changes from one
+    second to the next changes it for all of them.
+    """
+    count = len(plays[0].arguments)
+    durations = np.empty((len(plays), repeats, count))
+    for repeat in range(repeats):
+        for play in plays:
+            play.begin()
+        with no_garbage_collection():
+            for burst, first in enumerate(range(0, count, BURST)):
+                chosen = slice(first, first + BURST)
+                for k in range(len(plays))[:: 1 if (burst + repeat) % 2 == 0 else -1]:
+                    durations[k, repeat, chosen] = _seconds(plays[k].call, plays[k].arguments[chosen])
+    return durations[:, :, warm_up:]
+
+
+def ratio_of_bursts(ours: FloatArray, others: FloatArray) -> float:
+    """Return how many times as long calls (repeats, n) [s] took as others beside them: the median over all bursts."""
+    firsts = range(0, ours.shape[1], BURST)
+    own, beside = (
+        np.array([np.median(each[:, first : first + BURST], axis=1) for first in firsts]) for each in (ours, others)
+    )
+    return float(np.median(own / beside))
+
+
+def play_env(env: ExplorationEnv, seed: int, steps: int) -> Play:
+    """Return an episode of the nearest-frontier policy."""
+    return Play(partial(env.reset, seed=seed), env.step, record_actions(env, seed, steps))
+
+
+def time_env(env: ExplorationEnv, seed: int, steps: int, warm_up: int, plays: int = 1) -> StepTimes:
+    """Time `env.step` along an episode of the nearest-frontier policy, which is played again so many times."""
+    return StepTimes.of(play_in_turn([play_env(env, seed, warm_up + steps)], warm_up, plays)[0])
+
+
+def time_simulator(config: EnvConfig, seed: int, steps: int, warm_up: int) -> StepTimes:
+    """Time ticks of the simulator alone: physics, odometry, landmark sensor and scans, no filter, no observation."""
+    setting = draw_setting(config, config.world, np.random.SeedSequence(seed).spawn(1)[0])
+    simulator = Simulator(setting.world, setting.true_starts, config.robot_radius, TICK)
+    odometry, sensor, scan = (np.random.default_rng(seed + i) for i in range(3))
+    rng = np.random.default_rng(seed)
+
+    def tick(commands: FloatArray) -> None:
+        before = simulator.poses
+        simulator.step(commands)
+        after = simulator.poses
+        read_odometry(before, after, setting.bias, config.odometry, odometry)
+        setting.sensor.measure(after, sensor)
+        setting.scan.measure(after, scan)
+
+    commands, turn = [], np.zeros(config.num_robots)
+    for _ in range(warm_up + steps):  # they wander, and meet walls now and then
+        turn = np.clip(0.9 * turn + 0.4 * rng.standard_normal(config.num_robots), -1.5, 1.5)
+        commands.append(np.column_stack([np.full(config.num_robots, 0.5), turn]))
+    return StepTimes.of(time_steps(tick, commands, warm_up))
+
+
+def time_resets(env: ExplorationEnv, first_seed: int, resets: int) -> StepTimes:
+    """Time resets, each of another seed; the first is not counted."""
+    return StepTimes.of(time_steps(lambda seed: env.reset(seed=seed), range(first_seed, first_seed + resets + 1), 1))
+
+
+def time_snapshots(env: ExplorationEnv, seed: int, steps: int, repeats: int) -> Mapping[str, StepTimes]:
+    """Time taking and restoring states after `steps` steps of the nearest-frontier policy, and clones."""
+    record_actions(env, seed, steps)
+    state = env.get_state()
+    other = vslam_v0.parallel_env(config=env.config)
+    other.reset(seed=seed + 1)
+    states = [other.get_state(), state]
+    some: list[int] = list(range(repeats))
+    return {
+        "get_state": StepTimes.of(time_steps(lambda _: env.get_state(), some, 1)),
+        "set_state, same episode": StepTimes.of(time_steps(lambda _: env.set_state(state), some, 1)),
+        "set_state, another seed": StepTimes.of(time_steps(lambda i: other.set_state(states[i % 2]), some, 2)),
+        "clone": StepTimes.of(time_steps(lambda _: env.clone(), some, 1)),
+    }
+
+
+def play_peer(agents: int, seed: int, steps: int) -> Play | None:
+    """Return an episode of MPE2's simple_spread under random actions, or None where it is not installed."""
+    if find_spec(PEER) is None:
+        return None
+    peer = import_module(f"{PEER}.simple_spread_v3").parallel_env(N=agents, max_cycles=steps + 1)
+    peer.reset(seed=seed)
+    for agent in peer.agents:
+        peer.action_space(agent).seed(seed)
+    actions = [{a: peer.action_space(a).sample() for a in peer.agents} for _ in range(steps)]
+    return Play(partial(peer.reset, seed=seed), peer.step, actions)

@@ -1,0 +1,1 @@
+"""Exploration policies compared over worlds."""

@@ -1,0 +1,365 @@
+"""The front end on real images, whatever a folder holds of them.
+
+A pair with known disparities and a chessboard rig (OpenCV's samples), planar pairs with homographies, and stereo pairs
+with the calibration of their rig.
+"""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from slam_backend.camera import StereoCamera
+from slam_backend.errors import Float32Array, FloatArray, bad_argument
+from slam_backend.frontend import GUARDS, KINDS, CornerOptions, FrontEndOptions, StereoFrontEnd, harris_corners
+from slam_backend.frontend.descriptors import describe_points, nearest
+from slam_backend.frontend.images import Image
+from slam_backend.readers.calibration import Eye, Rectifier
+from slam_backend.readers.kitti_images import read_grey
+from slam_backend.readers.stereo_files import load_rig
+from training.bench.stereo.quality import guard_rows
+
+ALOE_SPAN = 3740.0 * 0.16  # focal length [px] times baseline [m] of the Middlebury rig of 2006
+ALOE_DISPARITIES = (15.0, 260.0)
+BOARD = (9, 6)  # inner corners of the chessboard
+MODEL = "_model.txt"  # ends the name of a planar pair's homography
+SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".ppm", ".tif", ".tiff")
+LAYOUTS = (
+    ("left*", "right*"), ("image_0/*", "image_1/*"), ("image_l/*", "image_r/*"), ("cam0/*", "cam1/*"),
+    ("cam0/data/*", "cam1/data/*"), ("*_l.*", "*_r.*"), ("*L.*", "*R.*"),
+)  # fmt: skip
+CALIBRATIONS = ("calib.txt", "sensorLeft.yaml,sensorRight.yaml", "cam0/sensor.yaml,cam1/sensor.yaml")
+MOST_PAIRS = 10  # of a rig are measured
+LEAST_DISPARITY, LARGEST_DISPARITY = 1.0, 0.25  # px; share of the width
+EXPECTED = (
+    "pairs with a model file: NAMEA, NAMEB and NAME_model.txt (a homography), or left and right images with calib.txt "
+    "or two sensor.yaml"
+)
+PLANAR_CORNERS, PLANAR_TOLERANCE = 1000, 4.0  # px in the first image
+FARTHEST_SQUARES = 60.0  # points farther than this are dropped [squares]
+
+
+@dataclass(frozen=True, slots=True)
+class RealPart:
+    """Something that a folder of real images lets be measured.
+
+    Attributes:
+        key: Under which the bench keeps it.
+        name: Name of the part, for people.
+        measure: Returns rows, or one row.
+    """
+
+    key: str
+    name: str
+    measure: Callable[[], Any]
+
+
+def find_parts(folder: Path, descriptors: Sequence[str]) -> list[RealPart]:
+    """Return what there is to be measured in a folder and in those within it.
+
+    Args:
+        folder: With any of OpenCV's samples; planar pairs `NAMEA`, `NAMEB` with their homography `NAME_model.txt`;
+            stereo pairs in one of `LAYOUTS` with one of `CALIBRATIONS`.
+        descriptors: Keys of `KINDS`.
+    """
+    parts: list[RealPart] = []
+    for place in (folder, *_folders_in(folder)):
+        if (place / "aloeGT.png").is_file():
+            parts += [RealPart("aloe", f"aloe, {way}", partial(_aloe, place, way)) for way in descriptors]
+        if (place / "left01.jpg").is_file() and not _calibration(place):
+            parts.append(RealPart("chessboard", "chessboard", partial(chessboard, place)))
+        for model in sorted(place.glob(f"*{MODEL}")):
+            parts.append(
+                RealPart("planar", f"planar pair {model.name.removesuffix(MODEL)}", partial(planar_rows, model))
+            )
+        for rig in (place, *(_folders_in(place) if place != folder else ())):
+            if _calibration(rig):
+                parts.append(RealPart("rigs", f"stereo pairs in {rig.name}", partial(rig_rows, rig, descriptors)))
+    return parts
+
+
+def measure_parts(
+    parts: Sequence[RealPart],
+    result: dict[str, Any],
+    on_part: Callable[[str], None] = lambda name: None,
+    interrupted: Callable[[], bool] = lambda: False,
+) -> None:
+    """Measure parts one after the other, and add each to a result; one that fails is noted, and the others go on.
+
+    Args:
+        parts: Parts that `find_parts` returned.
+        result: Result of the bench; changed. `failed` holds what was wrong, by the names of the parts.
+        on_part: Called with the name of each part.
+        interrupted: Asked before each part.
+    """
+    for part in parts:
+        if interrupted():
+            return
+        on_part(part.name)
+        try:
+            found = part.measure()
+        except Exception as error:  # of any kind: OpenCV's, numpy's or ours, on images of anyone
+            result.setdefault("failed", {})[part.name] = str(error) or type(error).__name__
+            continue
+        if isinstance(found, list):
+            result.setdefault(part.key, []).extend(found)
+        else:
+            result.setdefault(part.key, {}).update(found)
+
+
+def _folders_in(folder: Path) -> list[Path]:
+    """Return the folders within one, in order."""
+    return sorted(below for below in folder.iterdir() if below.is_dir())
+
+
+def _aloe(folder: Path, descriptor: str) -> dict[str, Any]:
+    """Return `aloe_rows` under the name of the descriptor."""
+    return {descriptor: aloe_rows(folder, descriptor)}
+
+
+def rig_rows(folder: Path, descriptors: Sequence[str]) -> list[dict[str, Any]]:
+    """Measure stereo pairs of a calibrated rig: how many matches each guard leaves, how far points are, and the time.
+
+    Args:
+        folder: In one of `LAYOUTS`, with one of `CALIBRATIONS`; at most `MOST_PAIRS` of its pairs are measured, evenly
+            chosen.
+        descriptors: Keys of `KINDS`.
+
+    Returns:
+        Per descriptor: `rig`, `descriptor`, `pairs`; means over the pairs of `matches`, of those left after each guard
+        (`left`), of `points`, of the median depth `depth_m` (None without points), and the time of a pair `ms`.
+
+    Raises:
+        ValueError: If there are no such images, or the calibration cannot be used.
+    """
+    left, right = _eyes(folder)
+    chosen = np.unique(np.linspace(0, len(left) - 1, min(len(left), MOST_PAIRS)).round().astype(int))
+    pairs = [(read_grey(left[n]), read_grey(right[n])) for n in chosen]
+    height, width = pairs[0][0].shape
+    rig = load_rig(folder, _calibration(folder), (width, height))
+    span = rig.pair.focal_px * rig.pair.baseline
+    camera = rig.pair.camera(width, height, max_range=span / LEAST_DISPARITY)
+    rectified = [rig.rectify(*pair) for pair in pairs]
+    rows = []
+    for descriptor in descriptors:
+        nearest_m = span / (LARGEST_DISPARITY * width)
+        kind: Any = descriptor
+        options = FrontEndOptions(descriptor=kind, nearest=nearest_m, corners=CornerOptions(most=1500))
+        eye = StereoFrontEnd(camera, options, rig.pair.centre_px)
+        eye.measure(*rectified[0])  # nothing is loaded or compiled any more when it is timed
+        began = time.perf_counter()
+        frames = [eye.measure(*pair) for pair in rectified]
+        spent = 1e3 * (time.perf_counter() - began) / len(frames)
+        kept = [np.cumprod(frame.matches.passed, axis=0).sum(axis=1) for frame in frames]
+        depths = np.concatenate([frame.measurements.points[:, 2] for frame in frames])
+        rows.append(
+            {
+                "rig": folder.name,
+                "descriptor": descriptor,
+                "pairs": len(frames),
+                "matches": float(np.mean([frame.matches.passed.shape[1] for frame in frames])),
+                "left": dict(zip(GUARDS, np.mean(kept, axis=0).tolist(), strict=True)),
+                "points": float(np.mean([len(frame.measurements) for frame in frames])),
+                "depth_m": float(np.median(depths)) if len(depths) else None,
+                "ms": spent,
+            }
+        )
+    return rows
+
+
+def _calibration(folder: Path) -> str:
+    """Return the calibration of a rig that a folder holds, "" if there is none."""
+    for names in CALIBRATIONS:
+        if all((folder / name).is_file() for name in names.split(",")):
+            return names
+    return ""
+
+
+def _eyes(folder: Path) -> tuple[list[Path], list[Path]]:
+    """Return the images of the left and of the right eye."""
+    for layout in LAYOUTS:
+        left, right = (
+            sorted(file for file in folder.glob(names) if file.suffix.lower() in SUFFIXES) for names in layout
+        )
+        if left and len(left) == len(right):
+            return left, right
+    got = f"a folder with {_calibration(folder)} alone"
+    expected = "as many left as right images, " + ", ".join(f"{one} and {other}" for one, other in LAYOUTS[:4])
+    raise bad_argument("real", expected, got, f"Check {str(folder)!r}.")
+
+
+def aloe_rows(folder: Path, descriptor: Any) -> list[dict[str, Any]]:
+    """Return errors before and after each guard on the aloe pair, whose disparities are known to whole pixels.
+
+    Args:
+        folder: With `aloeL.jpg`, `aloeR.jpg` and `aloeGT.png`.
+        descriptor: Key of `KINDS`.
+    """
+    left, right = (read_grey(folder / f"aloe{eye}.jpg") for eye in "LR")
+    true = read_grey(folder / "aloeGT.png").astype(np.float64)
+    height, width = left.shape
+    nearest_m, farthest = ALOE_SPAN / ALOE_DISPARITIES[1], ALOE_SPAN / ALOE_DISPARITIES[0]
+    camera = StereoCamera(focal_px=3740.0, baseline=0.16, width=width, height=height, max_range=farthest)
+    options = FrontEndOptions(descriptor=descriptor, nearest=nearest_m, corners=CornerOptions(most=1500))
+    matches = StereoFrontEnd(camera, options).match(left, right)
+    columns, rows = np.rint(matches.corners.T).astype(int)
+    known = true[rows, columns] > 0.0
+    truth = true[rows, columns][known]
+    by_corners, by_patches = matches.corner_disparity[known] - truth, matches.disparity[known] - truth
+    return guard_rows(by_corners, by_patches, matches.passed[:, known])
+
+
+def chessboard(folder: Path) -> dict[str, Any]:
+    """Calibrate the chessboard rig, rectify its pairs, and measure the board.
+
+    Returns:
+        Pairs; the reprojection error of the calibration [px]; points of the front end on the board; their distance
+        from the plane of the board's corners, as OpenCV's search for a chessboard finds them in both images: median in
+        squares and as a share of the depth, and the share of the points within a twentieth of a square.
+    """
+    images, left_points, right_points = [], [], []
+    for number in (1, 2, 3, 4, 5, 6, 7, 8, 9, 11, 12, 13, 14):
+        pair = [read_grey(folder / f"{eye}{number:02d}.jpg") for eye in ("left", "right")]
+        found = [_board(image) for image in pair]
+        if found[0] is not None and found[1] is not None:
+            images.append(pair)
+            left_points.append(found[0])
+            right_points.append(found[1])
+    if len(images) < 5:
+        raise bad_argument("path", "five or more pairs of a chessboard", f"a folder with {len(images)}", "Check it.")
+    grid = np.zeros((BOARD[0] * BOARD[1], 3), np.float32)
+    grid[:, :2] = np.mgrid[: BOARD[0], : BOARD[1]].T.reshape(-1, 2)
+    height, width = images[0][0].shape
+    grids = [grid] * len(images)
+    single: Any = [
+        cv2.calibrateCamera(grids, points, (width, height), None, None) for points in (left_points, right_points)
+    ]
+    stereo: Any = cv2.stereoCalibrate(
+        grids, left_points, right_points, single[0][1], single[0][2], single[1][1], single[1][2], (width, height)
+    )
+    left_from_right = np.eye(4)
+    left_from_right[:3, :3] = stereo[5].T
+    left_from_right[:3, 3] = -stereo[5].T @ np.ravel(stereo[6])
+    left_eye = Eye(width, height, stereo[1], np.ravel(stereo[2])[:5], np.eye(4))
+    right_eye = Eye(width, height, stereo[3], np.ravel(stereo[4])[:5], left_from_right)
+    rectifier = Rectifier(left_eye, right_eye)
+    camera = rectifier.pair.camera(width, height, max_range=FARTHEST_SQUARES)
+    options = FrontEndOptions(nearest=5.0, corners=CornerOptions(most=600))
+    front_end = StereoFrontEnd(camera, options, rectifier.pair.centre_px)
+    away, depths = [], []
+    for raw in images:
+        rectified = rectifier.rectify(*raw)
+        corners, others = _board(rectified[0]), _board(rectified[1])
+        if corners is None or others is None:
+            continue
+        frame = front_end.measure(*rectified)
+        hull = cv2.convexHull(corners)
+        on_board = [cv2.pointPolygonTest(hull, (float(u), float(v)), False) >= 0 for u, v in frame.pixels[:, :2]]
+        points = frame.measurements.points[np.array(on_board, dtype=bool)]
+        if len(points) < 10:
+            continue
+        here, there = corners.reshape(-1, 2), others.reshape(-1, 2)
+        centre = rectifier.pair.centre_px
+        board = camera.triangulate(np.column_stack([here - centre, here[:, 0] - there[:, 0]]).astype(np.float64))
+        middle = board.mean(axis=0)
+        normal = np.linalg.svd(board - middle)[2][2]
+        away.append(np.abs((points - middle) @ normal))
+        depths.append(points[:, 2])
+    distances, depth = np.concatenate(away), np.concatenate(depths)
+    return {
+        "pairs": len(away),
+        "calibration_px": float(stereo[0]),
+        "points": len(distances),
+        "median_squares": float(np.median(distances)),
+        "within_20th": float((distances < 0.05).mean()),
+        "median_percent_of_depth": float(100.0 * np.median(distances / depth)),
+    }
+
+
+def planar_scores(folder: Path) -> list[dict[str, Any]]:
+    """Return matching scores on planar pairs with known homographies.
+
+    Args:
+        folder: Folder with pairs `NAMEA`, `NAMEB` with `NAME_model.txt`.
+    """
+    return [row for model in sorted(folder.glob(f"*{MODEL}")) for row in planar_rows(model)]
+
+
+def planar_rows(file: Path) -> list[dict[str, Any]]:
+    """Return matching scores on one planar pair.
+
+    Descriptors of Harris corners, upright, by u-SURF, SIFT and ORB; and OpenCV's SIFT and ORB with their own keypoints
+    and rotations beside them. A match is a mutual nearest descriptor; it is right if the homography takes it within
+    4 px. Score: right ones among the matches.
+
+    Args:
+        file: `NAME_model.txt`, the homography from image `NAMEB` to `NAMEA` beside it.
+
+    Raises:
+        ValueError: If it holds no 3 x 3 homography, or an image is missing.
+    """
+    name = file.name.removesuffix(MODEL)
+    model = _homography(file)
+    a, b = (read_grey(_image(file.parent, f"{name}{side}")) for side in "AB")
+    rows = []
+    for way in (*KINDS, "sift_own", "orb_own"):
+        (at_a, described_a), (at_b, described_b) = (_described(image, way) for image in (a, b))
+        row = {"pair": name, "way": way, "matches": 0, "right": 0}
+        rows.append(row)
+        if not len(at_a) or not len(at_b):
+            continue
+        there, _ = nearest(described_b, described_a)
+        back, _ = nearest(described_a, described_b)
+        matched = np.flatnonzero(back[there] == np.arange(len(there)))
+        lifted = np.column_stack([at_b[matched], np.ones(len(matched))]) @ model.T
+        errors = np.hypot(*(lifted[:, :2] / lifted[:, 2:] - at_a[there[matched]]).T)
+        row |= {"matches": len(matched), "right": int((errors <= PLANAR_TOLERANCE).sum())}
+    return rows
+
+
+def _homography(file: Path) -> FloatArray:
+    """Return the homography (3, 3) that a file of nine numbers holds."""
+    try:
+        numbers = np.array(file.read_text(encoding="utf-8").replace(",", " ").split(), dtype=np.float64)
+    except (OSError, ValueError):
+        numbers = np.empty(0)
+    if numbers.shape != (9,) or not np.isfinite(numbers).all() or abs(np.linalg.det(numbers.reshape(3, 3))) == 0.0:
+        raise bad_argument("real", f"{file.name} with a 3 x 3 homography", "a different one", f"Correct {str(file)!r}.")
+    return numbers.reshape(3, 3)
+
+
+def _image(folder: Path, stem: str) -> Path:
+    """Return the image of a name, whatever its suffix."""
+    found = [folder / f"{stem}{suffix}" for suffix in SUFFIXES if (folder / f"{stem}{suffix}").is_file()]
+    if not found:
+        raise bad_argument("real", f"an image {stem}.png, .jpg, ...", "no such file", f"Add it to {str(folder)!r}.")
+    return found[0]
+
+
+def _described(image: Image, way: str) -> tuple[FloatArray, Float32Array]:
+    """Return points (n, 2) [px] and unit descriptors of an image."""
+    if way in KINDS:
+        points = harris_corners(image, CornerOptions(most=PLANAR_CORNERS)).points
+        described = describe_points(image, points, np.full(len(points), 2.3), way)
+        known = described.any(axis=1)
+        return points[known], described[known]
+    maker: Any = cv2.SIFT.create(PLANAR_CORNERS) if way == "sift_own" else cv2.ORB.create(PLANAR_CORNERS)
+    keypoints, found = maker.detectAndCompute(image, None)
+    points = np.array([keypoint.pt for keypoint in keypoints], dtype=np.float64).reshape(-1, 2)
+    if way == "orb_own":
+        return points, ((2.0 * np.unpackbits(found, axis=1) - 1.0) / 16.0).astype(np.float32)
+    return points, (found / np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1e-9)).astype(np.float32)
+
+
+def _board(image: Image) -> Float32Array | None:
+    """Return the inner corners (54, 1, 2) [px] of the chessboard, to a fraction of a pixel; None if it is not found."""
+    found, corners = cv2.findChessboardCorners(image, BOARD)
+    if not found:
+        return None
+    criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 30, 0.01)
+    return np.asarray(cv2.cornerSubPix(image, corners, (5, 5), (-1, -1), criteria), dtype=np.float32)

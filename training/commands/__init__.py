@@ -1,0 +1,1 @@
+"""Commands of `vslam`: options, progress and run folders; the work is done elsewhere."""

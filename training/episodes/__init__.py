@@ -1,0 +1,1 @@
+"""Episodes of scripted policies: runner, metrics, tables, figures and videos."""

@@ -1,0 +1,120 @@
+"""The figures of an episode, by the names that `metrics.json` uses."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from slam_backend.geometry import compose, transform_points
+from slam_backend.metrics import align_se2, ate, map_rmse
+from training.episodes.attempt_tables import pair_rows
+from training.episodes.consistency_table import consistency_rows
+from training.episodes.runner import EpisodeRecord, is_false_merge
+
+
+def score_episode(record: EpisodeRecord) -> dict[str, Any]:
+    """Return the metrics of an episode.
+
+    Per robot: `ate_aligned_m`, `ate_start_m` and the same of dead reckoning; `dead_reckoning_end_percent`, the error of
+    its last position over the length of the path; `path_m`; the map's `map_error`, `map_rmse_m`, `map_recall`,
+    `map_precision`, as the environment's infos give them; `map_rmse_start_m`, which is `map_rmse_m` again, and
+    `map_rmse_aligned_m`, that after the best SE(2) fit of the matched landmarks, NaN if these are fewer than two.
+    `team` holds the means over robots that have the figure.
+
+    All but the aligned figures are of each robot's own start frame, moved by its true start pose without any fitting.
+    (In a replay, `map_rmse_m`, `map_recall` and `map_precision` are those after the fit.) Robots count from 0.
+    """
+    robots = [_score_robot(record, robot) for robot in range(len(record.infos))]
+    return {
+        "robots": robots,
+        "team": {key: _mean([robot[key] for robot in robots]) for key in robots[0] if key != "robot"},
+        "merges": [
+            merge_row(
+                merge.tick,
+                merge.time,
+                merge.robots_a,
+                merge.robots_b,
+                merge.landmarks,
+                merge.error_m,
+                merge.error_deg,
+                merge.undone,
+            )
+            for merge in record.merges
+        ],
+        "attempts": record.attempts,
+        "refusals": pair_rows(record.pairs, record.groups),
+        "groups": record.groups,
+        "coverage": float(record.coverage[-1]),
+        "duration_s": float(record.times[-1]),
+        "complete": record.complete,
+        "consistency": consistency_rows(range(len(robots)), record.consistency),
+    }
+
+
+def merge_row(
+    step: int,
+    time: float,
+    robots_a: Sequence[int],
+    robots_b: Sequence[int],
+    landmarks: int,
+    error_m: float,
+    error_deg: float,
+    undone: float | None,
+) -> dict[str, Any]:
+    """Return one entry of `merges`, the same for runs and replays.
+
+    `step` counts the steps of the filters, which are the ticks of a run; `landmarks` is how many were shared; `false`
+    is None where the errors are NaN, `undone_s` where the merge is in force.
+    """
+    return {
+        "step": step,
+        "time_s": round(time, 3),
+        "robots_a": list(robots_a),
+        "robots_b": list(robots_b),
+        "landmarks": landmarks,
+        "error_m": error_m,
+        "error_deg": error_deg,
+        "false": is_false_merge(error_m, error_deg) if np.isfinite(error_m) else None,
+        "undone_s": None if undone is None else round(undone, 3),
+    }
+
+
+def _mean(values: list[float]) -> float:
+    """Return the mean of those that are finite, NaN if none is."""
+    known = [value for value in values if np.isfinite(value)]
+    return float(np.mean(known)) if known else float("nan")
+
+
+def _aligned_rmse(record: EpisodeRecord, robot: int) -> float:
+    """Return the RMS error [m] of a map's matched landmarks after the best SE(2) fit of these."""
+    means, truths = record.maps[robot].moved(record.true_poses[robot, 0]).means, record.true_landmarks
+    claims = record.map_claims[robot]
+    estimates, matches = map_rmse(means, truths, claims=claims).matched.T
+    if len(estimates) < 2:
+        return float("nan")
+    fit = align_se2(truths[matches, :2], means[estimates, :2])
+    return float(np.sqrt(np.mean(np.sum((transform_points(fit, means[estimates]) - truths[matches]) ** 2, axis=1))))
+
+
+def _score_robot(record: EpisodeRecord, robot: int) -> dict[str, float]:
+    """Return the figures of one robot."""
+    truth, info = record.true_poses[robot], record.infos[robot]
+    estimated, reckoned = (compose(truth[0], path[robot]) for path in (record.estimated, record.reckoned))
+    own, odometry = ate(estimated, truth), ate(reckoned, truth)
+    length = float(info["distance"])
+    end_error = float(np.hypot(*(reckoned[-1] - truth[-1])[:2]))
+    return {
+        "robot": robot,
+        "ate_aligned_m": own.aligned,
+        "ate_start_m": own.start,
+        "dead_reckoning_ate_aligned_m": odometry.aligned,
+        "dead_reckoning_ate_start_m": odometry.start,
+        "dead_reckoning_end_percent": 100.0 * end_error / length if length > 0.0 else 0.0,
+        "path_m": length,
+        "map_rmse_m": float(info["map_rmse"]),
+        "map_rmse_start_m": float(info["map_rmse"]),
+        "map_rmse_aligned_m": _aligned_rmse(record, robot),
+        "map_recall": float(info["map_recall"]),
+        "map_precision": float(info["map_precision"]),
+        "map_error": float(info["map_error"]),
+    }

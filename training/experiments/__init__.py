@@ -1,0 +1,1 @@
+"""Tools that all experiments share: configuration, run folders, kept trials, statistics, tables, plots."""

@@ -1,0 +1,180 @@
+"""The paper's Fig. 2: how far off each method's motion between two maps is, against the size of the maps."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from slam_backend.alignment import RIVAL_ANGLE, RIVAL_DISTANCE, align_maps, propose_motion
+from slam_backend.errors import FloatArray, check_float, check_int
+from slam_backend.geometry import wrap_angle
+from training.bench.accuracy.runs import STEP
+from training.experiments.config import PlainConfig
+from training.experiments.tables import csv_text
+from training.paper.map_pairs import map_alone, simulate_pair, true_motion
+
+COMMAND = "paper fig2"
+TRIALS_FILE = "runs.jsonl"
+PAPER_METHODS = ("svd", "icp", "impicp", "ransac")
+OURS = "ours"  # ransac with refinement and refusals
+METHODS = (*PAPER_METHODS, OURS)
+ENOUGH_SHARED = 12  # landmarks that both maps hold; with fewer there is nothing to align
+BIN = 50  # landmarks
+# What "practically zero" is taken for: medians over the runs, in each bin.
+PRACTICALLY_ZERO = {"translation_m": 0.2, "rotation_deg": 1.0}
+LABELS = {"translation_m": "translation [m]", "rotation_deg": "rotation [°]"}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Fig2Config(PlainConfig):
+    """All that decides the figure.
+
+    Attributes:
+        length: That each of the two robots drives [m].
+        every: Between two alignments [m].
+        landmarks: N of the office.
+        particles: M of each robot's filter.
+        seeds: How many runs.
+        seed: The first one.
+    """
+
+    length: float = 80.0
+    every: float = 5.0
+    landmarks: int = 300
+    particles: int = 100
+    seeds: int = 20
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        check_float("every", self.every, "Maps can be aligned after each step.", at_least=STEP)
+        check_float("length", self.length, "Give metres, at least one stage of them.", at_least=self.every)
+        check_int("landmarks", self.landmarks, 1, "An office without landmarks shows nothing.")
+        check_int("particles", self.particles, 1, "Use at least one particle.")
+        check_int("seeds", self.seeds, 1, "Run at least one seed.")
+        check_int("seed", self.seed, 0, "Use 0 or a positive number.")
+
+    def trials(self) -> list["Fig2Trial"]:
+        """Return one trial for each seed."""
+        return [
+            Fig2Trial(
+                length=float(self.length), every=float(self.every), landmarks=self.landmarks, particles=self.particles,
+                seed=seed,
+            )
+            for seed in range(self.seed, self.seed + self.seeds)
+        ]  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Fig2Trial:
+    """One run of two robots; fields as in `Fig2Config`."""
+
+    length: float
+    every: float
+    landmarks: int
+    particles: int
+    seed: int
+
+
+def play(trial: Fig2Trial) -> dict[str, Any]:
+    """Let two robots map, and align their maps along the way.
+
+    Returns:
+        The trial's fields and `stages`: rows of `length`, `size` (mean number of landmarks of both maps), `shared` true
+        landmarks, and for each method `translation_m` and `rotation_deg`, None where it finds or accepts none.
+    """
+    run = simulate_pair(trial.seed, trial.length, trial.landmarks)
+    truth = true_motion(run)
+    stages = []
+    for stage in map_alone(run, trial.particles, trial.seed, trial.every):
+        row: dict[str, Any] = {
+            "length": stage.length, "size": 0.5 * (len(stage.maps[0]) + len(stage.maps[1])), "shared": stage.shared,
+        }  # fmt: skip
+        for method in PAPER_METHODS:
+            row[method] = _error(propose_motion(*stage.maps, method, np.random.default_rng(trial.seed)), truth)
+        found = align_maps(*stage.maps, rng=np.random.default_rng(trial.seed))
+        row[OURS] = _error(found.transform, truth) if found.success else None
+        stages.append(row)
+    return asdict(trial) | {"stages": stages}
+
+
+def _error(motion: FloatArray | None, truth: FloatArray) -> dict[str, float] | None:
+    """Return how far off a motion is."""
+    if motion is None:
+        return None
+    turned = abs(float(np.rad2deg(wrap_angle(motion[2] - truth[2]))))
+    return {"translation_m": float(np.hypot(*(motion - truth)[:2])), "rotation_deg": turned}
+
+
+def summarise(rows: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Return a line for each bin of map sizes and each method, over the stages at which maps share enough.
+
+    Returns:
+        Lines of `size` (middle of the bin), `method`, `stages`, `found` (share of them), and `_median`, `_mean` and
+        `_p90` of `translation_m` and `rotation_deg` where a motion was found; None where none was.
+    """
+    bins: dict[int, list[Mapping[str, Any]]] = {}
+    for row in rows:
+        for stage in row["stages"]:
+            if stage["shared"] >= ENOUGH_SHARED:
+                bins.setdefault(int(stage["size"] // BIN), []).append(stage)
+    lines = []
+    for place, stages in sorted(bins.items()):
+        for method in METHODS:
+            found = [stage[method] for stage in stages if stage[method] is not None]
+            line: dict[str, Any] = {
+                "size": (place + 0.5) * BIN, "method": method, "stages": len(stages), "found": len(found) / len(stages),
+            }  # fmt: skip
+            for name in PRACTICALLY_ZERO:
+                values = np.array([error[name] for error in found])
+                figures = (np.median(values), values.mean(), np.quantile(values, 0.9)) if found else (None,) * 3
+                line |= dict(zip((f"{name}_{kind}" for kind in ("median", "mean", "p90")), figures, strict=True))
+            lines.append(line)
+    return lines
+
+
+def refusals(rows: Iterable[Mapping[str, Any]]) -> dict[str, int]:
+    """Return at how many stages maps that share too little were met, and how many of them ours accepted wrongly."""
+    poor = [stage for row in rows for stage in row["stages"] if stage["shared"] < ENOUGH_SHARED]
+    false = [
+        stage for row in rows for stage in row["stages"]
+        if stage[OURS] is not None
+        and (stage[OURS]["translation_m"] > RIVAL_DISTANCE or stage[OURS]["rotation_deg"] > np.rad2deg(RIVAL_ANGLE))
+    ]  # fmt: skip
+    return {"share_too_little": len(poor), "false": len(false)}
+
+
+def check_claims(lines: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Ask the paper's statement of the data: RANSAC is best, and practically zero whatever the size of the maps.
+
+    Returns:
+        Rows of `claim`, `measured`, `at_most` and `holds`; means are over all sizes alike.
+    """
+    claims: list[dict[str, Any]] = []
+    sizes = sorted({line["size"] for line in lines})
+    at = {(line["size"], line["method"]): line for line in lines}
+
+    def figure(size: float, method: str, name: str) -> float:
+        value = at[size, method][name]
+        return float("inf") if value is None else float(value)
+
+    for name, limit in PRACTICALLY_ZERO.items():
+        worst = max((figure(size, "ransac", f"{name}_median") for size in sizes), default=float("inf"))
+        claims.append({"claim": f"RANSAC, median {LABELS[name]}, worst size", "measured": worst, "at_most": limit})
+        for other in ("svd", "icp", "impicp"):
+            ours, theirs = (sum(figure(size, m, f"{name}_mean") for size in sizes) for m in ("ransac", other))
+            ratio = ours / theirs if sizes else float("inf")
+            claims.append({"claim": f"RANSAC over {other}, mean {LABELS[name]}", "measured": ratio, "at_most": 1.0})
+    return [claim | {"holds": bool(claim["measured"] <= claim["at_most"])} for claim in claims]
+
+
+def to_csv(rows: Iterable[Mapping[str, Any]]) -> str:
+    """Return every stage and method as text with commas between."""
+    headings = ["seed", "length_m", "size", "shared", "method", *PRACTICALLY_ZERO]
+    lines = []
+    for row in rows:
+        for stage in row["stages"]:
+            for method in METHODS:
+                error = stage[method] or dict.fromkeys(PRACTICALLY_ZERO)
+                lines.append([row["seed"], stage["length"], stage["size"], stage["shared"], method, *error.values()])
+    return csv_text(headings, lines)

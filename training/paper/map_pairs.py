@@ -1,0 +1,96 @@
+"""Two robots that do not know of each other map one office: what they hold along the way, and what is true of it."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from slam_backend.errors import FloatArray, IntArray
+from slam_backend.filter import FastSlam
+from slam_backend.geometry import between
+from slam_backend.landmark_map import LandmarkMap
+from training.bench.accuracy.runs import FALSE_POINT, STEP, RunSpec, StereoRun, simulate_run
+
+ROBOTS = 2
+MEASUREMENTS = 16  # in a step, of both together
+# As in the simulation's unknown association: landmarks that look alike in threes, false points, wrong descriptors.
+LOOK_ALIKES = 3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Stage:
+    """What both robots hold after some way.
+
+    Attributes:
+        length: That each has driven [m].
+        maps: Of either robot, own start frame; covariances of the mixture, the path's uncertainty included.
+        names: Per robot (N,) int64. The true landmark behind each of its map; `FALSE_POINT`: none.
+    """
+
+    length: float
+    maps: tuple[LandmarkMap, LandmarkMap]
+    names: tuple[IntArray, IntArray]
+
+    @property
+    def shared(self) -> int:
+        """How many true landmarks both maps hold."""
+        held = [set(own[own != FALSE_POINT].tolist()) for own in self.names]
+        return len(held[0] & held[1])
+
+
+def simulate_pair(seed: int, length: float, landmarks: int) -> StereoRun:
+    """Draw an office and two robots' ways through it, from crossings of their own.
+
+    Args:
+        seed: An int >= 0.
+        length: Of each robot's way [m].
+        landmarks: N of the office.
+    """
+    return simulate_run(
+        RunSpec(
+            robots=ROBOTS, length=length, measurements=MEASUREMENTS, landmarks=landmarks, association="unknown",
+            look_alikes=LOOK_ALIKES,
+        ),
+        seed,
+    )  # fmt: skip
+
+
+def true_motion(run: StereoRun) -> FloatArray:
+    """Return the motion (3,) from the second robot's start frame to the first one's [m, m, rad]."""
+    return between(run.true_paths[0, 0], run.true_paths[1, 0])
+
+
+def map_alone(run: StereoRun, particles: int, seed: int, every: float) -> Iterator[Stage]:
+    """Let each robot map by itself, from a start that it takes for the origin.
+
+    Args:
+        run: What the robots do and read.
+        particles: Of each filter.
+        seed: Of the filters' draws.
+        every: Metres between two stages.
+
+    Yields:
+        Stages, the last at the end of the run.
+    """
+    noise = run.spec.noise
+    streams = np.random.SeedSequence(seed).spawn(ROBOTS)
+    filters = [
+        FastSlam(1, num_particles=particles, camera=noise.camera, motion=noise.motion, seed=stream)
+        for stream in streams
+    ]
+    behind: list[dict[int, int]] = [{} for _ in range(ROBOTS)]
+    stride = max(round(every / STEP), 1)
+    for step, (frames, names) in enumerate(zip(run.frames, run.names, strict=True)):
+        for robot, slam in enumerate(filters):
+            odometry = run.odometry[step, robot] if step else None
+            created = slam.step([odometry], [frames[robot]]).created[0]
+            made = created >= 0
+            behind[robot].update(zip(created[made].tolist(), names[robot][made].tolist(), strict=True))
+        last = step == run.num_steps - 1
+        if last or (step and step % stride == 0):
+            maps = [slam.map("mixture") for slam in filters]
+            own = [
+                np.array([behind[robot].get(name, FALSE_POINT) for name in held.ids.tolist()], dtype=np.int64)
+                for robot, held in enumerate(maps)
+            ]
+            yield Stage(step * STEP, (maps[0], maps[1]), (own[0], own[1]))

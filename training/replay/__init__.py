@@ -1,0 +1,1 @@
+"""Replays of real logs: runners, metrics and figures."""

@@ -1,0 +1,207 @@
+"""Two local visual maps of one room, each of a single stereo pair, are aligned in space: the EuRoC pairs."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from slam_backend.camera import ROBOT_FROM_CAMERA, StereoCamera
+from slam_backend.errors import FloatArray, bad_argument, check_choice, check_float, check_int
+from slam_backend.frontend import DESCRIPTORS, KINDS, CornerOptions, FrontEndOptions, StereoFrame, StereoFrontEnd
+from slam_backend.frontend.images import Image
+from slam_backend.frontend.odometry import CameraMotion, camera_motion
+from slam_backend.landmark_map import LandmarkMap
+from slam_backend.readers.calibration import Rectified, Rectifier
+from slam_backend.readers.kitti_images import read_grey
+from slam_backend.readers.stereo_files import StereoFiles, find_pairs, load_rig, truth_file
+from slam_backend.rigid import rotation_angle
+from training.experiments.config import PlainConfig
+
+FILES = StereoFiles()
+POSES_FILE = "poses_dev.txt"
+PAIRS = 2  # places
+CORNERS = 1500
+SIGMA_PX, SIGMA_DISPARITY_PX = 0.5, 0.3
+ITERATIONS = 2000
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PairsConfig(PlainConfig):
+    """All that decides the alignment of two pairs.
+
+    Attributes:
+        path: Folder of the images.
+        left: Images of the left eye, as `StereoFiles` has it; so are the next three.
+        right: Images of the right eye.
+        calibration: Calibration of the rig.
+        truth: File of the two true poses; None: `poses_dev.txt`, if it is there.
+        seed: Of RANSAC's samples.
+        descriptor: "usurf", "sift" or "orb".
+        max_range: Points farther than this are dropped [m].
+    """
+
+    path: str
+    left: str = FILES.left
+    right: str = FILES.right
+    calibration: str = FILES.calibration
+    truth: str | None = None
+    seed: int = 0
+    descriptor: Literal["usurf", "sift", "orb"] = "usurf"
+    max_range: float = 12.0
+
+    def __post_init__(self) -> None:
+        check_int("seed", self.seed, 0, "Use 0 or a positive number.")
+        check_choice("descriptor", self.descriptor, DESCRIPTORS)
+        check_float("max_range", self.max_range, "Give metres.", above=0.0)
+
+    @property
+    def files(self) -> StereoFiles:
+        """The names of the files."""
+        return StereoFiles(left=self.left, right=self.right, calibration=self.calibration, truth=self.truth)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RoomPairs:
+    """Two stereo pairs of one room.
+
+    Attributes:
+        images: Per place the left and right image, as they were taken.
+        rectifier: Of the rig.
+        poses: Per place (4, 4) float64 [m], the body in the world; None where not known.
+    """
+
+    images: tuple[tuple[Image, Image], tuple[Image, Image]]
+    rectifier: Rectifier | Rectified
+    poses: tuple[FloatArray, FloatArray] | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PairsResult:
+    """How two local maps fit together.
+
+    Attributes:
+        images: Per place the rectified left image.
+        frames: Per place its points.
+        motion: From the second camera to the first; None if no motion was found.
+        error_m: Of the translation [m]; NaN where not known.
+        error_deg: Of the rotation [degrees]; likewise.
+        true_m: Distance between the places [m]; likewise.
+        true_deg: Angle between them [degrees]; likewise.
+        maps: Per place the map of its points: x ahead of the left camera, y to the left, z up.
+    """
+
+    images: tuple[Image, Image]
+    frames: tuple[StereoFrame, StereoFrame]
+    motion: CameraMotion | None
+    error_m: float
+    error_deg: float
+    true_m: float
+    true_deg: float
+    maps: tuple[LandmarkMap, LandmarkMap]
+
+
+def load_pairs(path: str | Path, files: StereoFiles = FILES) -> RoomPairs:
+    """Read two pairs, their calibration and, if they are there, their poses.
+
+    Args:
+        path: Folder of the images.
+        files: Names within it. `truth` has two rows of an image, a quaternion w x y z and a position, or of a 3 x 4
+            matrix; None: `poses_dev.txt`, if it is there.
+
+    Raises:
+        ValueError: If a file is missing or ill-formed, or there are other than two pairs; the text names it.
+    """
+    left, right = find_pairs(path, files)
+    if len(left) != PAIRS:
+        got = f"a folder with {len(left)}"
+        raise bad_argument("path", "two stereo pairs", got, "Replay a drive with `vslam replay stereo`.")
+    images = [(read_grey(one), read_grey(other)) for one, other in zip(left, right, strict=True)]
+    height, width = images[0][0].shape
+    file, usual = truth_file(path, files), Path(path) / POSES_FILE
+    file = usual if file is None and usual.is_file() else file
+    return RoomPairs(
+        images=(images[0], images[1]),
+        rectifier=load_rig(path, files.calibration, (width, height)),
+        poses=None if file is None else _read_poses(file),
+    )
+
+
+def align_pairs(log: RoomPairs, config: PairsConfig) -> PairsResult:
+    """Measure both pairs, match their points by appearance, and find the motion between the cameras."""
+    rectifier = log.rectifier
+    size = rectifier.camera
+    camera = rectifier.pair.camera(
+        size.width,
+        size.height,
+        max_range=config.max_range,
+        sigma_px=SIGMA_PX,
+        sigma_disparity_px=SIGMA_DISPARITY_PX,
+    )
+    seen = FrontEndOptions(descriptor=config.descriptor, corners=CornerOptions(most=CORNERS))
+    eye = StereoFrontEnd(camera, seen, rectifier.pair.centre_px)
+    rectified = [rectifier.rectify(*pair) for pair in log.images]
+    first, second = (eye.measure(*pair) for pair in rectified)
+    rng = np.random.default_rng(config.seed)
+    gate = 2.0 * KINDS[config.descriptor].gate  # places far apart look less alike; RANSAC tells
+    motion = camera_motion(first.measurements, second.measurements, camera, gate, rng, ITERATIONS)
+    nan = float("nan")
+    error_m, error_deg, true_m, true_deg = nan, nan, nan, nan
+    if log.poses is not None:
+        world = [pose @ rectifier.body_from_camera for pose in log.poses]
+        true: FloatArray = np.asarray(np.linalg.solve(world[0], world[1]), dtype=np.float64)
+        true_m, true_deg = float(np.linalg.norm(true[:3, 3])), float(np.degrees(rotation_angle(true[:3, :3])))
+        if motion is not None:
+            error_m = float(np.linalg.norm(motion.translation - true[:3, 3]))
+            error_deg = float(np.degrees(rotation_angle(motion.rotation.T @ true[:3, :3])))
+    images = (rectified[0][0], rectified[1][0])
+    maps = _map_of(first, camera), _map_of(second, camera)
+    return PairsResult(images, (first, second), motion, error_m, error_deg, true_m, true_deg, maps)
+
+
+def _map_of(frame: StereoFrame, camera: StereoCamera) -> LandmarkMap:
+    """Return the points of a pair as a map in the axes of a robot at the left camera."""
+    points, turn = frame.measurements.points, ROBOT_FROM_CAMERA
+    return LandmarkMap(points @ turn.T, turn @ camera.covariance(points) @ turn.T, frame.measurements.descriptors)
+
+
+def summarise_pairs(results: Mapping[str, PairsResult]) -> dict[str, Any]:
+    """Return the content of `metrics.json`: a row for each descriptor."""
+    rows = {}
+    for name, result in results.items():
+        motion = result.motion
+        rows[name] = {
+            "points": [len(frame.measurements) for frame in result.frames],
+            "matches": 0 if motion is None else len(motion.pairs),
+            "inliers": 0 if motion is None else int(motion.inliers.sum()),
+            "error_m": result.error_m,
+            "error_deg": result.error_deg,
+            "true_m": result.true_m,
+            "true_deg": result.true_deg,
+        }
+    return {"alignments": rows, "robots": [], "merges": [], "groups": [], "coverage": float("nan")}
+
+
+def _read_poses(file: Path) -> tuple[FloatArray, FloatArray]:
+    """Read two poses: image, quaternion w x y z, position x y z; or a 3 x 4 matrix, perhaps after a time."""
+    rows = [line.split() for line in file.read_text("utf-8").splitlines() if line and not line.startswith("#")]
+    try:
+        values = np.array(rows, dtype=np.float64)
+    except ValueError:
+        values = np.empty(0)
+    if values.shape not in ((2, 8), (2, 12), (2, 13)) or not np.isfinite(values).all():
+        expected = f"{file.name} with two rows of 8 numbers, or of 12"
+        raise bad_argument("path", expected, "a different one", f"Correct {str(file)!r}.")
+    poses = []
+    for row in values:
+        pose = np.eye(4)
+        if len(row) > 8:
+            pose[:3] = row[-12:].reshape(3, 4)
+            poses.append(pose)
+            continue
+        pose[:3, :3] = Rotation.from_quat(row[[2, 3, 4, 1]]).as_matrix()
+        pose[:3, 3] = row[5:]
+        poses.append(pose)
+    return poses[0], poses[1]

@@ -1,0 +1,1 @@
+"""Reinforcement learning: trainer, network, checkpoints, workers and evaluation."""

@@ -1,0 +1,205 @@
+"""A training: MaskablePPO built from a configuration, run, saved, and gone on with as if it had never stopped."""
+
+import random
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from sb3_contrib import MaskablePPO
+from stable_baselines3.common.logger import configure
+
+from agents.trained import MODEL_FILE, save_model
+from slam_backend.errors import bad_argument
+from slam_backend.state_checks import check_generator
+from training.experiments.run_folder import installed_versions
+from training.rl.callbacks import Row, TrainingWatch
+from training.rl.checkpoint import CHECKPOINT_FILE, read_checkpoint, write_checkpoint
+from training.rl.config import SPLIT_TRAIN, SPLIT_TRY, TrainConfig
+from training.rl.network import GoalPolicy
+from training.vec_env import make_vec_env
+
+BOARD = "tensorboard"
+
+
+class Training:
+    """A training in a folder of its own.
+
+    All sums run on one thread: two trainings of one configuration give the same weights, be they interrupted or not,
+    in one process or several, as long as machine and packages are the same.
+
+    Args:
+        config: What is trained, and how.
+        folder: Where checkpoint, model and TensorBoard curves go.
+        workers: Processes that step the environments; 0: this one.
+        device: `"cpu"`, `"cuda"` or one of several, as torch names them.
+
+    Attributes:
+        model: The learner.
+        watch: What tells of it, and stops it.
+
+    Raises:
+        ValueError: If there is no such device, or the environment cannot be built.
+    """
+
+    def __init__(self, config: TrainConfig, folder: Path, workers: int = 0, device: str = "cpu") -> None:
+        check_device(device)
+        torch.set_num_threads(1)
+        self.config, self._folder = config, folder
+        self.env = make_vec_env(config.make_env_config(SPLIT_TRAIN), config.envs, workers)
+        self.model = MaskablePPO(
+            GoalPolicy,
+            self.env,
+            learning_rate=lambda left: left * config.learning_rate,
+            n_steps=config.max_cycles,
+            batch_size=config.batch,
+            n_epochs=config.epochs,
+            gamma=config.gamma,
+            gae_lambda=config.gae_lambda,
+            clip_range=config.clip,
+            ent_coef=config.entropy,
+            seed=config.seed,
+            device=device,
+        )
+        self.watch = TrainingWatch(self.env, self.save, config.checkpoint_updates)
+
+    @property
+    def rows(self) -> list[Row]:
+        """One row per rollout so far."""
+        return self.watch.rows
+
+    def run(self) -> bool:
+        """Train to the end, or until `watch` is told to stop; save a checkpoint and the model.
+
+        Returns:
+            Whether the training is complete.
+        """
+        left = self.config.updates * self.config.rollout - self.model.num_timesteps
+        if left > 0:
+            self.model.set_logger(configure(str(self._folder / BOARD), [BOARD]))
+            self.model.learn(left, callback=self.watch, reset_num_timesteps=self.model._last_obs is None)
+            self.model.logger.close()
+            if not self.watch.stopped:
+                self.save()
+        return not self.watch.stopped
+
+    def save(self) -> None:
+        """Write the checkpoint, and the model as it is now."""
+        model = self.model
+        content = {
+            "config": self.config.to_mapping(),
+            "seed": self.config.seed,
+            "policy": as_arrays(model.policy.state_dict()),
+            "optimizer": as_arrays(model.policy.optimizer.state_dict()),
+            "counts": (model.num_timesteps, model._n_updates, model._current_progress_remaining),
+            "last": (model._last_obs, model._last_episode_starts),
+            "environments": self.env.get_state(),
+            "watch": self.watch.get_state(),
+            "draws": {
+                "python": random.getstate(),
+                "numpy": np.random.get_state(legacy=False),  # noqa: NPY002   # the learner draws from the global one
+                "torch": as_arrays(torch.get_rng_state()),
+                "cuda": as_arrays(_cuda_state()),
+            },
+        }
+        write_checkpoint(self._folder / CHECKPOINT_FILE, content)
+        self.save_model(self._folder / MODEL_FILE)
+
+    def save_model(self, file: Path) -> None:
+        """Write the model that `agents.trained` plays."""
+        about = {
+            "version": installed_versions()["vslam-env"],
+            "environment": self.config.make_env_config(SPLIT_TRY).to_toml(),
+            "steps": int(self.model.num_timesteps),
+            "seed": self.config.seed,
+            "config": self.config.to_mapping(),
+        }
+        save_model(file, self.model.policy.actor_weights(), about)
+
+    def restore(self, kept: Mapping[str, Any]) -> None:
+        """Go on from what `kept_of` read.
+
+        Raises:
+            ValueError: If a part of it is none that `save` wrote; train again, or read another.
+        """
+        try:
+            self._go_on_from(kept)
+        except Exception as error:  # whatever torch says of parts that are none of this model's
+            cure = f"Copy the checkpoint again, or train again. It says: {error}."
+            raise bad_argument("resume", "the parts that a training saved", "'others'", cure) from error
+
+    def _go_on_from(self, kept: Mapping[str, Any]) -> None:
+        """Take over the parts of a checkpoint."""
+        model, draws = self.model, kept["draws"]
+        model.policy.load_state_dict(as_tensors(kept["policy"]))
+        model.policy.optimizer.load_state_dict(as_tensors(kept["optimizer"]))
+        model.num_timesteps, model._n_updates, model._current_progress_remaining = kept["counts"]
+        model._last_obs, model._last_episode_starts = kept["last"]
+        self.env.set_state(kept["environments"])
+        self.watch.set_state(kept["watch"])
+        random.setstate(draws["python"])
+        check_generator("draws", draws["numpy"])
+        np.random.set_state(draws["numpy"])  # noqa: NPY002
+        torch.set_rng_state(as_tensors(draws["torch"]))
+        if draws["cuda"] is not None and torch.cuda.is_available():
+            torch.cuda.set_rng_state_all(as_tensors(draws["cuda"]))
+
+    def close(self) -> None:
+        """Close the environments and their processes."""
+        self.env.close()
+
+
+def kept_of(folder: Path, config: TrainConfig) -> dict[str, Any]:
+    """Return the checkpoint of a training's folder.
+
+    Raises:
+        ValueError: If there is none, it is damaged, or of another configuration or version.
+    """
+    kept = read_checkpoint(folder / CHECKPOINT_FILE)
+    if (kept["config"], kept["seed"]) != (config.to_mapping(), config.seed):
+        cure = "Give back the folder its own config.toml, or train anew."
+        raise bad_argument("resume", "a checkpoint of the folder's configuration", "a checkpoint of another", cure)
+    return kept
+
+
+def check_device(device: str) -> str:
+    """Return a device that torch has here.
+
+    Raises:
+        ValueError: If it is no device, or this machine has none of its kind.
+    """
+    try:
+        kind = torch.device(device).type
+    except RuntimeError as error:
+        raise bad_argument("device", "cpu, cuda or cuda:0", device, "Leave it out to use the processor.") from error
+    if kind not in ("cpu", "cuda"):
+        raise bad_argument("device", "cpu, cuda or cuda:0", device, "Leave it out to use the processor.")
+    if kind == "cuda":
+        found = torch.cuda.device_count() if torch.cuda.is_available() else 0
+        if (torch.device(device).index or 0) >= found:
+            cure = "Leave --device out to use the processor, or install a torch that finds the GPU."
+            raise bad_argument("device", "a GPU that torch can use", f"a machine with {found} of them", cure)
+    return device
+
+
+def as_arrays(value: Any) -> Any:
+    """Return nested dicts, lists and tuples with arrays in place of tensors, as checkpoints hold them."""
+    if isinstance(value, torch.Tensor):
+        return value.detach().cpu().numpy().copy()
+    if isinstance(value, Mapping):
+        return {key: as_arrays(entry) for key, entry in value.items()}
+    return type(value)(map(as_arrays, value)) if isinstance(value, (list, tuple)) else value
+
+
+def as_tensors(value: Any) -> Any:
+    """Return what `as_arrays` was given, on the processor."""
+    if isinstance(value, np.ndarray):
+        return torch.from_numpy(value.copy())
+    if isinstance(value, Mapping):
+        return {key: as_tensors(entry) for key, entry in value.items()}
+    return type(value)(map(as_tensors, value)) if isinstance(value, (list, tuple)) else value
+
+
+def _cuda_state() -> Any:
+    return torch.cuda.get_rng_state_all() if torch.cuda.is_available() else None
