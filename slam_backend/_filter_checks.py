@@ -11,10 +11,9 @@ from slam_backend._jit import in_place, jit
 from slam_backend._kernels import LANES
 from slam_backend._particle_maps import MAPS_KEPT
 from slam_backend._rejuvenation_step import SCHEDULE
-from slam_backend._turns import assumed
 from slam_backend.consistency import LISTS, RENEWED, SIGN_OF, SIGNS, SUMS, WEIGHTS
 from slam_backend.errors import FloatArray, IntArray, bad_argument
-from slam_backend.filter_options import MOST_ROBOTS, FilterOptions
+from slam_backend.filter_options import MOST_ROBOTS, FilterOptions, assumed
 from slam_backend.landmark_map import LandmarkMap
 from slam_backend.log_arrays import EXACT, REJECTED, STOOD, LogArrays, has_been_checked, note_checked
 from slam_backend.measurements import LARGEST_DESCRIPTOR

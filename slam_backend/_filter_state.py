@@ -16,10 +16,9 @@ from slam_backend._mixtures import pose_mixtures
 from slam_backend._particle_maps import ParticleMaps
 from slam_backend._rejuvenated_maps import write_maps
 from slam_backend._rejuvenation_step import RejuvenationStep
-from slam_backend._turns import assumed, spans_of
 from slam_backend.consistency import ConsistencyTest
 from slam_backend.errors import IntArray, bad_argument, check_int, check_seed
-from slam_backend.filter_options import MOST_ROBOTS, FilterOptions
+from slam_backend.filter_options import MOST_ROBOTS, FilterOptions, assumed, spans_of
 from slam_backend.reports import PoseEstimates
 from slam_backend.run_log import RobotLog
 from slam_backend.smoothing.rejuvenation import Particles

@@ -1,9 +1,6 @@
 """The turns of a step: what each robot did and saw goes into all particles, and what became of it is summed up."""
 
-from dataclasses import astuple
 from typing import TYPE_CHECKING
-
-import numpy as np
 
 from slam_backend import _kernels
 from slam_backend._filter_arrays import FilterArrays
@@ -11,7 +8,6 @@ from slam_backend._journal import LONGEST
 from slam_backend._kernels import IDLE, PLACED
 from slam_backend._kernels.layout import CREATED
 from slam_backend.errors import FloatArray, IntArray
-from slam_backend.filter_options import FilterOptions
 from slam_backend.geometry import compose
 from slam_backend.input_log import Seats, StepInput
 
@@ -20,33 +16,6 @@ if TYPE_CHECKING:
 
 # The most probable particle, how many landmarks not seen for long it matched, and seven numbers of a `StepReport`.
 Summary = tuple[int, int, int, int, int, int, float, float, bool]
-
-
-def assumed(options: FilterOptions) -> FloatArray:
-    """Return what a filter assumes, (28,) float64, as `_kernels.layout` names the numbers.
-
-    The noise of the odometry (6,), see `OdometryModel`; of the camera (7,) the focal length [px], the baseline [m], the
-    sigmas of image coordinates and of the disparity [px], and the mount [m]; the sigmas (3,) [m, m, rad] of the prior
-    of a lost pose; then one number each.
-    """
-    camera = options.camera
-    return np.array([
-        *astuple(options.motion),
-        camera.focal_px, camera.baseline, camera.sigma_px, camera.sigma_disparity_px, *camera.mount,
-        options.recovery_position, options.recovery_position, options.recovery_heading,
-        options.descriptor_gate**2, options.descriptor_sigma**2, options.position_gate, options.dead_zone,
-        options.dead_radius, options.ambiguity,
-        np.log(options.new_landmark_density), options.landmark_walk,
-        options.proposal == "fastslam2", options.one_to_one,
-        options.smoothing.closure_after, options.resample_threshold,
-    ], np.float64)  # fmt: skip
-
-
-def spans_of(num_robots: int, one_by_one: bool) -> tuple[tuple[int, int, bool], ...]:
-    """Return whose turns are taken in each call of a step, from which robot to before which, and if it is over then."""
-    if one_by_one:
-        return (*((robot, robot + 1, False) for robot in range(num_robots)), (num_robots, num_robots, True))
-    return ((0, num_robots, True),)
 
 
 def place(arrays: FilterArrays, robot: int, exact: FloatArray) -> None:

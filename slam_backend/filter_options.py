@@ -1,10 +1,12 @@
 """What a `FastSlam` assumes and how it decides: one frozen, validated record."""
 
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field
 from typing import Literal
 
+import numpy as np
+
 from slam_backend.camera import StereoCamera
-from slam_backend.errors import MOST, bad_argument, check_choice, check_float, check_int, known_names
+from slam_backend.errors import MOST, FloatArray, bad_argument, check_choice, check_float, check_int, known_names
 from slam_backend.existence import ExistenceModel
 from slam_backend.measurements import LARGEST_DESCRIPTOR
 from slam_backend.motion import LARGEST_SIGMA, OdometryModel
@@ -118,3 +120,30 @@ class FilterOptions:
         if self.landmark_noise is None:
             return 0.0 if self.rejuvenate_every is None else CALIBRATED_NOISE**2
         return float(self.landmark_noise) ** 2
+
+
+def assumed(options: FilterOptions) -> FloatArray:
+    """Return what a filter assumes, (28,) float64, as `_kernels.layout` names the numbers.
+
+    The noise of the odometry (6,), see `OdometryModel`; of the camera (7,) the focal length [px], the baseline [m], the
+    sigmas of image coordinates and of the disparity [px], and the mount [m]; the sigmas (3,) [m, m, rad] of the prior
+    of a lost pose; then one number each.
+    """
+    camera = options.camera
+    return np.array([
+        *astuple(options.motion),
+        camera.focal_px, camera.baseline, camera.sigma_px, camera.sigma_disparity_px, *camera.mount,
+        options.recovery_position, options.recovery_position, options.recovery_heading,
+        options.descriptor_gate**2, options.descriptor_sigma**2, options.position_gate, options.dead_zone,
+        options.dead_radius, options.ambiguity,
+        np.log(options.new_landmark_density), options.landmark_walk,
+        options.proposal == "fastslam2", options.one_to_one,
+        options.smoothing.closure_after, options.resample_threshold,
+    ], np.float64)  # fmt: skip
+
+
+def spans_of(num_robots: int, one_by_one: bool) -> tuple[tuple[int, int, bool], ...]:
+    """Return whose turns are taken in each call of a step, from which robot to before which, and if it is over then."""
+    if one_by_one:
+        return (*((robot, robot + 1, False) for robot in range(num_robots)), (num_robots, num_robots, True))
+    return ((0, num_robots, True),)
