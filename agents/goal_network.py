@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend.errors import Float32Array
+from slam_backend.core.validation import Float32Array
 
 Weights = Mapping[str, Float32Array]
 

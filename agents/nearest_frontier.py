@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend.errors import FloatArray
+from slam_backend.core.validation import FloatArray
 from vslam_env.belief import Belief
 from vslam_env.navigation import centre_of, distance_map, follow_path, plan_path
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from agents.policy import Policy
-from slam_backend.errors import bad_argument, check_choice, is_built_in
+from slam_backend.core.validation import bad_argument, check_choice, is_built_in
 
 ACTION_TYPES = ("continuous", "discrete", "goal")
 EXPECTED = "MODULE:NAME of a policy"

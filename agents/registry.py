@@ -8,7 +8,7 @@ from agents.policy import Policy
 from agents.random_goals import RandomGoals
 from agents.random_walk import RandomWalk
 from agents.trained import SUFFIX, TrainedGoals, load_model
-from slam_backend.errors import bad_argument, check_choice
+from slam_backend.core.validation import bad_argument, check_choice
 
 POLICIES = {  # and the types of action that each knows, that with which policies are compared first
     "frontier": ("goal", "continuous", "discrete"),

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.goal_network import NAMES, SHAPES, Weights, logits
-from slam_backend.array_files import read_arrays
-from slam_backend.errors import bad_argument
-from slam_backend.files import write_file
+from slam_backend.core.array_files import read_arrays
+from slam_backend.core.files import write_file
+from slam_backend.core.validation import bad_argument
 from vslam_env.belief import Belief
 
 FORMAT = 1  # raised when the network, or what observations mean, changes

@@ -15,16 +15,16 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from slam_backend.alignment import AlignmentOptions
-from slam_backend.attempts import AttemptOptions
-from slam_backend.errors import BoolArray, FloatArray, IntArray
-from slam_backend.filter import FastSlam
+from slam_backend.core.validation import BoolArray, FloatArray, IntArray
+from slam_backend.fastslam.filter import FastSlam
 from slam_backend.geometry import between, compose, wrap_angle
-from slam_backend.measurements import Measurements
+from slam_backend.maps.alignment import AlignmentOptions
 from slam_backend.metrics import align_se2
-from slam_backend.readers.mrclam_steps import SightingNoise
-from slam_backend.readers.polar import points_from_polar
-from slam_backend.team import TeamSlam
+from slam_backend.models.measurements import Measurements
+from slam_backend.readers.conversions import points_from_polar
+from slam_backend.readers.mrclam import SightingNoise
+from slam_backend.team.merge_scheduler import AttemptOptions
+from slam_backend.team.team import TeamSlam
 from training.replay.mrclam import GATES, MAX_SIGMA_HEADING, MOTION, PARTICLES_PER_ROBOT, POSITION_FLOOR
 
 DT = 0.25  # [s]

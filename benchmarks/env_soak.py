@@ -26,7 +26,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from slam_backend.errors import check_int
+from slam_backend.core.validation import check_int
 from vslam_env import EnvConfig, ExplorationEnv, load_state, preset_config, save_state, vslam_v0
 from vslam_env.world import WORLD_FAMILIES
 from vslam_env.world.clearance import distances_to_walls

@@ -32,7 +32,7 @@ from rich.table import Table
 
 from agents import make_policy
 from agents.policy import Policy
-from slam_backend.errors import FloatArray, check_int
+from slam_backend.core.validation import FloatArray, check_int
 from training.episodes.runner import Progress, run_episode
 from training.experiments.statistics import mean_of, shown
 from training.experiments.tables import markdown_table

@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend.errors import FloatArray
+from slam_backend.core.validation import FloatArray
+from slam_backend.fastslam.reports import MergeEvent
 from slam_backend.geometry import between
-from slam_backend.reports import MergeEvent
-from slam_backend.team import TeamSlam
-from slam_backend.watching import moved_share
+from slam_backend.team.merge_monitor import moved_share
+from slam_backend.team.team import TeamSlam
 from training.episodes.runner import is_false_merge
 from vslam_env.errors_of_maps import FALSE, ClaimLedger
 

@@ -36,14 +36,14 @@ from merge_fates import Delay, Fates, Follower, MergeFate, RunEnd, fates, summar
 from rich.console import Console
 
 from agents.registry import make_policy
-from slam_backend.alignment import Alignment
-from slam_backend.attempts import AttemptOptions
-from slam_backend.errors import FloatArray, IntArray, bad_argument, check_choice, check_int
-from slam_backend.files import check_writable, write_file
+from slam_backend.core.files import check_writable, write_file
+from slam_backend.core.validation import FloatArray, IntArray, bad_argument, check_choice, check_int
 from slam_backend.geometry import between, rotation
-from slam_backend.landmark_map import LandmarkMap
-from slam_backend.merge_options import MergeOptions
-from slam_backend.team import TeamSlam
+from slam_backend.maps.alignment import Alignment
+from slam_backend.maps.landmark_map import LandmarkMap
+from slam_backend.team.merge_scheduler import AttemptOptions
+from slam_backend.team.options import MergeOptions
+from slam_backend.team.team import TeamSlam
 from training.bench.accuracy.runs import STEP, RunSpec, simulate_run
 from training.episodes.config import RunConfig
 from training.episodes.metrics import score_episode

@@ -15,7 +15,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from slam_backend.errors import FloatArray, bad_argument, check_int
+from slam_backend.core.validation import FloatArray, bad_argument, check_int
 from training.episodes.runner import is_false_merge
 
 FAR = 0.3  # [m]

@@ -19,7 +19,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from slam_backend.errors import FloatArray, bad_argument, check_int
+from slam_backend.core.validation import FloatArray, bad_argument, check_int
 
 BURST = 20  # steps
 WARM_UP = 60  # steps of each episode that do not count

@@ -18,7 +18,7 @@ import typer
 from matplotlib.figure import Figure
 
 from slam_backend import FastSlam, OdometryModel, Trajectory
-from slam_backend.errors import FloatArray
+from slam_backend.core.validation import FloatArray
 from slam_backend.geometry import compose, inverse, transform_points
 from slam_backend.metrics import AteResult, ate
 from slam_backend.readers import integrate_commands, range_bearing_steps, read_csv

@@ -3,25 +3,32 @@
 `FastSlam` is the filter, `TeamSlam` a team of them that merges maps; `align_maps` and `fuse_maps` work on any two maps.
 """
 
-from slam_backend.alignment import Alignment, AlignmentOptions, align_maps
-from slam_backend.attempts import AttemptOptions
-from slam_backend.camera import StereoCamera
-from slam_backend.compilation import log_compilation
-from slam_backend.consistency import Consistency
-from slam_backend.existence import ExistenceModel
-from slam_backend.filter import FastSlam
-from slam_backend.filter_options import FilterOptions
-from slam_backend.findings import Findings
-from slam_backend.fusion import fuse_landmarks, fuse_maps
-from slam_backend.landmark_map import LandmarkMap
-from slam_backend.measurements import Measurements
-from slam_backend.merge_options import MergeOptions
-from slam_backend.motion import OdometryModel
-from slam_backend.reports import MergeEvent, PoseEstimate, RejuvenationReport, Renaming, StepReport, TeamReport
-from slam_backend.smoothing.options import SmoothingOptions
-from slam_backend.team import TeamSlam
+from slam_backend.core.compilation import log_compilation
+from slam_backend.fastslam.consistency import Consistency
+from slam_backend.fastslam.existence import ExistenceModel
+from slam_backend.fastslam.filter import FastSlam
+from slam_backend.fastslam.options import FilterOptions
+from slam_backend.fastslam.reports import (
+    Findings,
+    MergeEvent,
+    PoseEstimate,
+    RejuvenationReport,
+    Renaming,
+    StepReport,
+    TeamReport,
+)
+from slam_backend.maps.alignment import Alignment, AlignmentOptions, align_maps
+from slam_backend.maps.fusion import fuse_landmarks, fuse_maps
+from slam_backend.maps.landmark_map import LandmarkMap
+from slam_backend.models.camera import StereoCamera
+from slam_backend.models.measurements import Measurements
+from slam_backend.models.odometry import OdometryModel
+from slam_backend.smoother.options import SmoothingOptions
+from slam_backend.team.merge_scheduler import AttemptOptions
+from slam_backend.team.options import MergeOptions
+from slam_backend.team.team import TeamSlam
 from slam_backend.trajectory import Trajectory
-from slam_backend.warming import warm_up
+from slam_backend.warm_up import warm_up
 
 __all__ = [
     "Alignment",

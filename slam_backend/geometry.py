@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from slam_backend._jit import jit
-from slam_backend.errors import FloatArray
+from slam_backend.core.jit import jit
+from slam_backend.core.validation import FloatArray
 
 ONE = (3,)  # shape of a single pose
 

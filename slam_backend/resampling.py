@@ -9,8 +9,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from slam_backend._jit import in_place
-from slam_backend.errors import FloatArray, IntArray
+from slam_backend.core.jit import in_place
+from slam_backend.core.validation import FloatArray, IntArray
 
 
 def effective_sample_size(weights: FloatArray) -> float:

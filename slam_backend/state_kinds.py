@@ -2,20 +2,11 @@
 
 from typing import Any
 
-from slam_backend.alignment_types import Alignment, AlignmentOptions
-from slam_backend.attempts import AttemptOptions, AttemptRecord, Straightening
-from slam_backend.branches import ReplayedStep
-from slam_backend.camera import StereoCamera
-from slam_backend.existence import ExistenceModel
-from slam_backend.filter_options import FilterOptions
-from slam_backend.findings import Findings
-from slam_backend.input_log import StepInput
-from slam_backend.landmark_map import FIELDS, LandmarkMap
-from slam_backend.log_arrays import LogArrays
-from slam_backend.measurements import Measurements, TeamMeasurements
-from slam_backend.merge_options import MergeOptions
-from slam_backend.motion import OdometryModel
-from slam_backend.reports import (
+from slam_backend.core.state_codec import SEEDS, Kind, Kinds
+from slam_backend.fastslam.existence import ExistenceModel
+from slam_backend.fastslam.options import FilterOptions
+from slam_backend.fastslam.reports import (
+    Findings,
     LandmarksCreated,
     MapCopied,
     MapDropped,
@@ -26,10 +17,19 @@ from slam_backend.reports import (
     Renaming,
     StepReport,
 )
-from slam_backend.smoothing.options import SmoothingOptions
-from slam_backend.smoothing.reassociation import Refused
-from slam_backend.state_codec import SEEDS, Kind, Kinds
-from slam_backend.watching import Side, Watch
+from slam_backend.fastslam.step_input import StepInput
+from slam_backend.maps.alignment_types import Alignment, AlignmentOptions
+from slam_backend.maps.landmark_map import FIELDS, LandmarkMap
+from slam_backend.models.camera import StereoCamera
+from slam_backend.models.measurements import Measurements, TeamMeasurements
+from slam_backend.models.odometry import OdometryModel
+from slam_backend.smoother.log_arrays import LogArrays
+from slam_backend.smoother.options import SmoothingOptions
+from slam_backend.smoother.reassociation import Refused
+from slam_backend.team.branches import ReplayedStep
+from slam_backend.team.merge_monitor import Side, Watch
+from slam_backend.team.merge_scheduler import AttemptOptions, AttemptRecord, Straightening
+from slam_backend.team.options import MergeOptions
 
 CONFIGURATIONS = (
     AlignmentOptions, AttemptOptions, ExistenceModel, FilterOptions, MergeOptions, OdometryModel,

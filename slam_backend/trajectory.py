@@ -7,8 +7,8 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from slam_backend.errors import FloatArray, bad_argument, check_array
-from slam_backend.files import checked_path, write_file
+from slam_backend.core.files import checked_path, write_file
+from slam_backend.core.validation import FloatArray, bad_argument, check_array
 from slam_backend.geometry import wrap_angle
 
 PLANAR_TOLERANCE = 1e-6

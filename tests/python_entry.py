@@ -6,7 +6,7 @@ from typing import Any
 
 import numba
 
-from slam_backend._jit import DeviceKernel
+from slam_backend.core.jit import DeviceKernel
 
 
 @cache

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
-from slam_backend.errors import BoolArray, FloatArray, bad_argument, check_int
+from slam_backend.core.validation import BoolArray, FloatArray, bad_argument, check_int
 from training.experiments.compilation import prepare
 from training.rl.slots import MASK, WHOLE, MakeEnv, SlotBatch, Stepped
 from training.rl.workers import SlotWorkers

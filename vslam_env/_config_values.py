@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
-from slam_backend.errors import bad_argument
+from slam_backend.core.validation import bad_argument
 
 T = TypeVar("T")
 

@@ -5,14 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend._filter_checks import MOST_LANDMARKS
-from slam_backend._kernels.layout import COUNT
-from slam_backend._team_checks import TeamCheck
-from slam_backend.errors import FloatArray
-from slam_backend.frontend import StereoFrame
-from slam_backend.measurements import LARGEST_DESCRIPTOR, Measurements, TeamMeasurements
-from slam_backend.reports import LandmarksCreated, Renaming
-from slam_backend.state_checks import (
+from slam_backend.core.state_checks import (
     BOOL,
     FARTHEST,
     FLOAT32,
@@ -34,6 +27,13 @@ from slam_backend.state_checks import (
     check_wholes,
     refuse,
 )
+from slam_backend.core.validation import FloatArray
+from slam_backend.fastslam._kernels.layout import COUNT
+from slam_backend.fastslam.reports import LandmarksCreated, Renaming
+from slam_backend.fastslam.state_checks import MOST_LANDMARKS
+from slam_backend.frontend import StereoFrame
+from slam_backend.models.measurements import LARGEST_DESCRIPTOR, Measurements, TeamMeasurements
+from slam_backend.team.state_checks import TeamCheck
 from vslam_env.belief import assumed_of_merges
 from vslam_env.config import EnvConfig
 from vslam_env.coverage import CoverageMeter

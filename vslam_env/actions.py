@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from slam_backend.errors import FloatArray, bad_argument, check_array
+from slam_backend.core.validation import FloatArray, bad_argument, check_array
 from vslam_env.observation import NUM_ACTIONS
 
 MAX_SPEED, MAX_REVERSE, MAX_TURN = 1.0, 0.3, 1.5  # [m/s], [m/s], [rad/s]

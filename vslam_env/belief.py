@@ -7,18 +7,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend.alignment import Alignment
-from slam_backend.attempts import AttemptOptions
-from slam_backend.consistency import Consistency
-from slam_backend.errors import FloatArray, bad_argument
-from slam_backend.filter_options import FilterOptions
+from slam_backend.core.validation import FloatArray, bad_argument
+from slam_backend.fastslam.consistency import Consistency
+from slam_backend.fastslam.options import FilterOptions
+from slam_backend.fastslam.relative_poses import Standpoints
+from slam_backend.fastslam.reports import MergeEvent, Renaming, TeamReport
+from slam_backend.fastslam.step_input import StepInput
 from slam_backend.geometry import rotate_covariances
-from slam_backend.input_log import StepInput
-from slam_backend.landmark_map import LandmarkMap, TeamOutlines
-from slam_backend.merge_options import MergeOptions
-from slam_backend.reports import MergeEvent, Renaming, TeamReport
-from slam_backend.standpoints import Standpoints
-from slam_backend.team import TeamSlam
+from slam_backend.maps.alignment import Alignment
+from slam_backend.maps.landmark_map import LandmarkMap, TeamOutlines
+from slam_backend.team.merge_scheduler import AttemptOptions
+from slam_backend.team.options import MergeOptions
+from slam_backend.team.team import TeamSlam
 from vslam_env.navigation import TeamSlots
 from vslam_env.readings import Readings, TeamReadings
 from vslam_env.robot_belief import Belief, BeliefConfig, Body, Candidates, Teammate, View

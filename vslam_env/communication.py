@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from slam_backend.errors import BoolArray, FloatArray
+from slam_backend.core.validation import BoolArray, FloatArray
 
 
 def contacts(

@@ -9,7 +9,7 @@ from typing import Any, Literal, Self
 import tomli_w
 from pydantic import ConfigDict
 
-from slam_backend.errors import bad_argument, check_choice, check_float, check_int
+from slam_backend.core.validation import bad_argument, check_choice, check_float, check_int
 from vslam_env import _config_values as nested
 from vslam_env.robot_belief import BeliefConfig
 from vslam_env.sensors import LandmarkSensorConfig, ScanConfig, StereoSensorConfig

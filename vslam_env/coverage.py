@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend._jit import device, in_place
-from slam_backend.errors import FloatArray
+from slam_backend.core.jit import device, in_place
+from slam_backend.core.validation import FloatArray
 from slam_backend.geometry import inverse, transform_points
 from vslam_env.navigation import FREE, GRID_SIZE, TeamGrids, cell_of
 

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend.errors import FloatArray
+from slam_backend.core.validation import FloatArray
 from vslam_env.actions import MAX_SPEED, MAX_TURN
 from vslam_env.config import EnvConfig
 from vslam_env.episode import Episode

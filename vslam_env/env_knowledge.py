@@ -7,8 +7,8 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
-from slam_backend.errors import FloatArray, bad_argument, check_int
-from slam_backend.reports import MergeEvent
+from slam_backend.core.validation import FloatArray, bad_argument, check_int
+from slam_backend.fastslam.reports import MergeEvent
 from vslam_env.belief import Belief
 from vslam_env.episode import Episode, Recorder, Tap
 from vslam_env.readings import Readings

@@ -9,8 +9,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from slam_backend.errors import bad_argument, check_choice, check_int
-from slam_backend.state_checks import refusing
+from slam_backend.core.state_checks import refusing
+from slam_backend.core.validation import bad_argument, check_choice, check_int
 from vslam_env.actions import action_space, checked_actions
 from vslam_env.config import EnvConfig
 from vslam_env.driving import Drivers

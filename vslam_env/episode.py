@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend.contacts import reach
-from slam_backend.errors import BoolArray, FloatArray, IntArray
+from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from slam_backend.geometry import between, compose
+from slam_backend.team.communication import reach
 from vslam_env.belief import Body, TeamBelief
 from vslam_env.communication import contacts
 from vslam_env.config import TICK, EnvConfig

@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend._jit import in_place
-from slam_backend.errors import FloatArray, IntArray, check_float
-from slam_backend.landmark_map import TeamOutlines
-from slam_backend.reports import LandmarksCreated, MapCopied, MapDropped, Renaming, TeamReport
-from slam_backend.standpoints import Standpoints
+from slam_backend.core.jit import in_place
+from slam_backend.core.validation import FloatArray, IntArray, check_float
+from slam_backend.fastslam.relative_poses import Standpoints
+from slam_backend.fastslam.reports import LandmarksCreated, MapCopied, MapDropped, Renaming, TeamReport
+from slam_backend.maps.landmark_map import TeamOutlines
 from vslam_env.scoring import FALSE, UNCOUNTED, score_team
 
 UNUSED = -3  # an id that no landmark has had so far

@@ -22,7 +22,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from slam_backend.errors import FloatArray
+from slam_backend.core.validation import FloatArray
 from vslam_env._observation_kernels import (
     CHANNELS,
     FAR,

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from slam_backend.alignment import Alignment
-from slam_backend.errors import FloatArray, IntArray
+from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.geometry import between
+from slam_backend.maps.alignment import Alignment
 
 MIN_SHARED = 3
 SIGMA = 1e-4  # [m, rad] what stands for certainty where a covariance is needed

@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend.errors import BoolArray, FloatArray, IntArray, bad_argument, check_array
-from slam_backend.measurements import Measurements, TeamMeasurements
+from slam_backend.core.validation import BoolArray, FloatArray, IntArray, bad_argument, check_array
+from slam_backend.models.measurements import Measurements, TeamMeasurements
 
 
 class Readings(NamedTuple):

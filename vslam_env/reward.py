@@ -14,7 +14,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from slam_backend.errors import bad_argument, check_array, check_float
+from slam_backend.core.validation import bad_argument, check_array, check_float
 from vslam_env.standing import (
     COLLISIONS,
     DISTANCES,

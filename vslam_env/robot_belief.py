@@ -8,16 +8,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend.alignment import AlignmentOptions
-from slam_backend.attempts import AttemptOptions
-from slam_backend.camera import StereoCamera
-from slam_backend.errors import MOST, BoolArray, FloatArray, IntArray, check_int
-from slam_backend.filter_options import FilterOptions
-from slam_backend.landmark_map import LandmarkMap, TeamOutlines
-from slam_backend.merge_options import MergeOptions
-from slam_backend.read_only import as_read_only
-from slam_backend.smoothing.options import SmoothingOptions
-from slam_backend.standpoints import Standpoints
+from slam_backend.core.read_only import as_read_only
+from slam_backend.core.validation import MOST, BoolArray, FloatArray, IntArray, check_int
+from slam_backend.fastslam.options import FilterOptions
+from slam_backend.fastslam.relative_poses import Standpoints
+from slam_backend.maps.alignment import AlignmentOptions
+from slam_backend.maps.landmark_map import LandmarkMap, TeamOutlines
+from slam_backend.models.camera import StereoCamera
+from slam_backend.smoother.options import SmoothingOptions
+from slam_backend.team.merge_scheduler import AttemptOptions
+from slam_backend.team.options import MergeOptions
 from vslam_env.navigation import SeenGrid
 
 

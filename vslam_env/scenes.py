@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from slam_backend.errors import FloatArray
+from slam_backend.core.validation import FloatArray
 from slam_backend.geometry import compose
 from vslam_env.config import TICK
 from vslam_env.episode import Episode

@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend._jit import in_place, inlined
-from slam_backend.errors import FloatArray, IntArray
-from slam_backend.standpoints import OWN, SIGMAS, START
+from slam_backend.core.jit import in_place, inlined
+from slam_backend.core.validation import FloatArray, IntArray
+from slam_backend.fastslam.relative_poses import OWN, SIGMAS, START
 
 FALSE, UNCOUNTED = -1, -2  # claims of landmarks that are no true one, or one that does not matter
 PLACED = 0.5  # [m] a landmark held nearer than this is well placed

@@ -5,23 +5,15 @@ from typing import Any, Self
 
 import numpy as np
 
-from slam_backend.errors import FloatArray, bad_argument
-from slam_backend.read_only import as_read_only
+from slam_backend.core.read_only import as_read_only
+from slam_backend.core.validation import FloatArray, bad_argument
 from vslam_env.config import EnvConfig
 from vslam_env.coverage import CoverageMeter
 from vslam_env.errors_of_maps import ClaimLedger
 from vslam_env.sensors import LandmarkSensor, Scan, ScanConfig, StereoSensor, StereoSensorConfig
 from vslam_env.sensors.stereo_textures import check_textures
 from vslam_env.sensors.stereo_truth import TextureCorners
-from vslam_env.world import (
-    FreeSpace,
-    World,
-    WorldSource,
-    draw_bias,
-    draw_world_seed,
-    make_world,
-    place_landmarks,
-)
+from vslam_env.world import FreeSpace, World, WorldSource, draw_bias, draw_world_seed, make_world, place_landmarks
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

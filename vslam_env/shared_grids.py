@@ -7,10 +7,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from slam_backend.errors import BoolArray, FloatArray
+from slam_backend.core.validation import BoolArray, FloatArray
+from slam_backend.fastslam.relative_poses import Standpoints
+from slam_backend.fastslam.reports import MapDropped, MergeUndone, Renaming, TeamReport
 from slam_backend.geometry import compose, inverse
-from slam_backend.reports import MapDropped, MergeUndone, Renaming, TeamReport
-from slam_backend.standpoints import Standpoints
 from vslam_env.navigation import SeenGrid, TeamGrids, ray_directions
 from vslam_env.robot_belief import Body
 from vslam_env.strokes import Strokes, Telling, caught_up, separated

@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend.errors import bad_argument
-from slam_backend.files import refusing, write_file
-from slam_backend.state_checks import check_kind, check_whole, refuse
-from slam_backend.state_codec import ForeignObjectError, decoded, encoded, read_file, sequence_of
+from slam_backend.core.files import refusing, write_file
+from slam_backend.core.state_checks import check_kind, check_whole, refuse
+from slam_backend.core.state_codec import ForeignObjectError, decoded, encoded, read_file, sequence_of
+from slam_backend.core.validation import bad_argument
 from vslam_env._state_checks import EpisodeCheck, check_drivers, check_standing
 from vslam_env.config import EnvConfig
 from vslam_env.episode import Episode

@@ -6,8 +6,8 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend.errors import bad_argument, check_int
-from slam_backend.reports import MergeEvent
+from slam_backend.core.validation import bad_argument, check_int
+from slam_backend.fastslam.reports import MergeEvent
 from vslam_env.belief import Belief
 from vslam_env.config import EnvConfig
 from vslam_env.environment import ExplorationEnv

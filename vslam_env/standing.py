@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from slam_backend.errors import FloatArray, IntArray
+from slam_backend.core.validation import FloatArray, IntArray
 
 NUM_FIGURES = 11
 MAP_ERRORS, PLACED_RECALLS, POSE_SIGMAS, FOUND, DISTANCES, ERROR_INTEGRALS = 0, 4, 7, 8, 9, 10  # rows of figures

@@ -1,19 +1,13 @@
 """Of which classes objects may stand in states of environments that are kept in files."""
 
+from slam_backend.core.state_codec import Kind, Kinds
 from slam_backend.frontend import CornerOptions, FrontEndOptions, StereoFrame
 from slam_backend.frontend.stereo import StereoMatches
-from slam_backend.state_codec import Kind, Kinds
 from slam_backend.state_kinds import BACKEND_KINDS
 from vslam_env.config import EnvConfig
 from vslam_env.readings import TeamReadings
 from vslam_env.robot_belief import BeliefConfig
-from vslam_env.sensors import (
-    EyeFrames,
-    Frames,
-    LandmarkSensorConfig,
-    ScanConfig,
-    StereoSensorConfig,
-)
+from vslam_env.sensors import EyeFrames, Frames, LandmarkSensorConfig, ScanConfig, StereoSensorConfig
 from vslam_env.sensors.stereo_camera import ImagingConfig
 from vslam_env.sensors.stereo_textures import TextureConfig, WallTextures
 from vslam_env.setting import Setting

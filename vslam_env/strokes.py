@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from slam_backend.errors import BoolArray, FloatArray, IntArray
+from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from slam_backend.geometry import compose
 
 

@@ -8,7 +8,7 @@ from pettingzoo import AECEnv
 from pettingzoo.utils.conversions import parallel_to_aec
 from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 
-from slam_backend.errors import bad_argument
+from slam_backend.core.validation import bad_argument
 from vslam_env.config import EnvConfig
 from vslam_env.environment import ExplorationEnv
 from vslam_env.presets import preset_config

@@ -3,7 +3,7 @@
 import numpy as np
 
 import slam_backend
-from slam_backend.compilation import watch_compilation
+from slam_backend.core.compilation import watch_compilation
 from vslam_env.config import EnvConfig
 from vslam_env.environment import ExplorationEnv
 from vslam_env.sensors import LandmarkSensorConfig

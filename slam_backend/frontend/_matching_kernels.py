@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from slam_backend._jit import device, fused, jit, lanes
-from slam_backend.errors import BoolArray, Float32Array, FloatArray, IntArray
+from slam_backend.core.jit import device, fused, jit, lanes
+from slam_backend.core.validation import BoolArray, Float32Array, FloatArray, IntArray
 from slam_backend.frontend.images import Image
 
 LARGEST_PATCH = 31  # px; side of a patch

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from slam_backend._jit import jit
-from slam_backend.errors import MOST, Float32Array, FloatArray, IntArray, check_float, check_int, known_names
+from slam_backend.core.jit import jit
+from slam_backend.core.validation import MOST, Float32Array, FloatArray, IntArray, check_float, check_int, known_names
 from slam_backend.frontend.images import Image, check_image
 
 LARGEST_WINDOW = 1000  # [px]

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from slam_backend.errors import Float32Array, FloatArray, IntArray
+from slam_backend.core.validation import Float32Array, FloatArray, IntArray
 from slam_backend.frontend.images import Image
 from slam_backend.frontend.usurf import SIZE, describe, integral_of
 

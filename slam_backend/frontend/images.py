@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend.errors import bad_argument
+from slam_backend.core.validation import bad_argument
 
 Image = NDArray[np.uint8]
 

@@ -6,11 +6,11 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from slam_backend.camera import StereoCamera
-from slam_backend.errors import BoolArray, FloatArray, IntArray
+from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from slam_backend.frontend.descriptors import nearest
-from slam_backend.measurements import Measurements
-from slam_backend.rigid import ransac_rigid
+from slam_backend.geometry3d import ransac_rigid
+from slam_backend.models.camera import StereoCamera
+from slam_backend.models.measurements import Measurements
 
 AGREE = 3.0  # standard deviations within which two points agree
 HUBER = 1.5  # standard deviations beyond which a residual counts less

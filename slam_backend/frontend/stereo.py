@@ -14,8 +14,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from slam_backend.camera import StereoCamera
-from slam_backend.errors import (
+from slam_backend.core.validation import (
     MOST,
     BoolArray,
     Float32Array,
@@ -31,7 +30,8 @@ from slam_backend.frontend._matching_kernels import LARGEST_PATCH, match_rows, r
 from slam_backend.frontend.corners import CornerOptions, Corners, find_corners, spread_order
 from slam_backend.frontend.descriptors import DESCRIPTORS, KINDS, describe_points
 from slam_backend.frontend.images import Image, check_image
-from slam_backend.measurements import Measurements, TeamMeasurements
+from slam_backend.models.camera import StereoCamera
+from slam_backend.models.measurements import Measurements, TeamMeasurements
 
 GUARDS = ("mutual", "patch", "rows", "back", "range")
 LEAST_SCALE, LARGEST_SCALE = 1.0, 8.0  # px; of windows of constant physical size

@@ -17,8 +17,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend._jit import fused
-from slam_backend.errors import Float32Array, FloatArray, bad_argument, check_array
+from slam_backend.core.jit import fused
+from slam_backend.core.validation import Float32Array, FloatArray, bad_argument, check_array
 from slam_backend.frontend.images import Image, check_image
 
 SIZE = 64

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
-from slam_backend.errors import FloatArray, bad_argument, check_array
+from slam_backend.core.validation import FloatArray, bad_argument, check_array
 
 
 def nees(errors: ArrayLike, covariances: ArrayLike) -> FloatArray:

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import linear_sum_assignment
 
-from slam_backend._jit import jit
-from slam_backend.errors import FloatArray, IntArray, bad_argument, check_array, check_float
+from slam_backend.core.jit import jit
+from slam_backend.core.validation import FloatArray, IntArray, bad_argument, check_array, check_float
 
 FALSE, UNCOUNTED = -1, -2
 

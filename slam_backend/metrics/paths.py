@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from slam_backend.errors import FloatArray, bad_argument, check_array, check_int
+from slam_backend.core.validation import FloatArray, bad_argument, check_array, check_int
 from slam_backend.geometry import between, rotation, transform_points
 
 

@@ -4,10 +4,9 @@ For a log of your own: `read_csv` reads columns by their names, and `range_beari
 bearings into steps of a filter. `integrate_commands` and `points_from_polar` are what that is made of.
 """
 
-from slam_backend.readers.polar import points_from_polar
+from slam_backend.readers.conversions import integrate_commands, points_from_polar
 from slam_backend.readers.range_bearing import RangeBearingSteps, range_bearing_steps
 from slam_backend.readers.tables import CsvTable, read_csv
-from slam_backend.readers.velocities import integrate_commands
 
 __all__ = [
     "CsvTable",

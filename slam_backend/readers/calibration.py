@@ -8,9 +8,9 @@ from typing import Any
 import cv2
 import numpy as np
 
-from slam_backend.camera import StereoCamera
-from slam_backend.errors import Float32Array, FloatArray, bad_argument, check_array, check_float
+from slam_backend.core.validation import Float32Array, FloatArray, bad_argument, check_array, check_float
 from slam_backend.frontend.images import Image, check_image
+from slam_backend.models.camera import StereoCamera
 
 SMOOTH_ROTATION = 1e-4  # largest deviation of a rotation matrix from orthogonality
 

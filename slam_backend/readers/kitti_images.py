@@ -6,8 +6,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from slam_backend.errors import FloatArray, bad_argument, check_float
-from slam_backend.files import checked_path
+from slam_backend.core.files import checked_path
+from slam_backend.core.validation import FloatArray, bad_argument, check_float
 from slam_backend.frontend.images import Image
 from slam_backend.readers.calibration import Rectified, RectifiedPair, Rectifier, load_kitti_calibration
 from slam_backend.readers.kitti import read_truth

@@ -8,12 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from slam_backend.errors import FloatArray, IntArray, bad_argument, check_array, check_float
+from slam_backend.core.validation import FloatArray, IntArray, bad_argument, check_array, check_float
 from slam_backend.geometry import between
-from slam_backend.measurements import Measurements
-from slam_backend.readers.polar import points_from_polar
-from slam_backend.readers.time_order import MOST_JITTER, sorted_note, steps_back, time_order
-from slam_backend.readers.velocities import HOLD, integrate_commands
+from slam_backend.models.measurements import Measurements
+from slam_backend.readers.conversions import HOLD, integrate_commands, points_from_polar
+from slam_backend.readers.tables import MOST_JITTER, sorted_note, steps_back, time_order
 
 MAX_STEPS = 1_000_000
 

@@ -6,13 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from slam_backend.errors import bad_argument, check_float
-from slam_backend.readers.calibration import (
-    Rectified,
-    Rectifier,
-    load_euroc_calibration,
-    load_kitti_calibration,
-)
+from slam_backend.core.validation import bad_argument, check_float
+from slam_backend.readers.calibration import Rectified, Rectifier, load_euroc_calibration, load_kitti_calibration
 from slam_backend.readers.kitti import read_truth
 from slam_backend.readers.kitti_images import KittiImages, read_grey, read_times
 

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend.errors import FloatArray
+from slam_backend.core.validation import FloatArray
 
 
 def draw_boxes(

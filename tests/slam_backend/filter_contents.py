@@ -4,10 +4,10 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend._kernels import LANES
-from slam_backend._particle_maps import ParticleMaps
-from slam_backend.errors import FloatArray
-from slam_backend.filter import FastSlam
+from slam_backend.core.validation import FloatArray
+from slam_backend.fastslam._kernels import LANES
+from slam_backend.fastslam.filter import FastSlam
+from slam_backend.fastslam.particle_maps import ParticleMaps
 
 
 def contents(slam: FastSlam) -> dict[str, Any]:

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slam_backend.camera import ROBOT_FROM_CAMERA, StereoCamera
-from slam_backend.errors import FloatArray
+from slam_backend.core.validation import FloatArray
 from slam_backend.geometry import compose
-from slam_backend.measurements import Measurements
-from slam_backend.motion import OdometryModel
+from slam_backend.models.camera import ROBOT_FROM_CAMERA, StereoCamera
+from slam_backend.models.measurements import Measurements
+from slam_backend.models.odometry import OdometryModel
 
 CAMERA = StereoCamera(mount=(0.1, -0.05, 0.2))
 MOTION = OdometryModel(

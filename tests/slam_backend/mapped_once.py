@@ -3,13 +3,13 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend.alignment import Alignment
-from slam_backend.camera import ROBOT_FROM_CAMERA
-from slam_backend.errors import FloatArray, IntArray
-from slam_backend.filter import FastSlam
+from slam_backend.core.validation import FloatArray, IntArray
+from slam_backend.fastslam.filter import FastSlam
 from slam_backend.geometry import compose, inverse, transform_points
-from slam_backend.measurements import Measurements
-from slam_backend.motion import OdometryModel
+from slam_backend.maps.alignment import Alignment
+from slam_backend.models.camera import ROBOT_FROM_CAMERA
+from slam_backend.models.measurements import Measurements
+from slam_backend.models.odometry import OdometryModel
 
 A_FROM_B = np.array([4.0, 3.0, 2.0])  # where b starts, seen from where a starts
 LANDMARKS = np.array(  # in a's start frame

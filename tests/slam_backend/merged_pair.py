@@ -3,11 +3,11 @@
 import numpy as np
 from simulated_team import SimulatedTeam
 
-from slam_backend.alignment import Alignment
-from slam_backend.attempts import AttemptOptions
-from slam_backend.errors import BoolArray, FloatArray
+from slam_backend.core.validation import BoolArray, FloatArray
 from slam_backend.geometry import compose
-from slam_backend.team import TeamSlam
+from slam_backend.maps.alignment import Alignment
+from slam_backend.team.merge_scheduler import AttemptOptions
+from slam_backend.team.team import TeamSlam
 
 NEVER = AttemptOptions(enabled=False)
 NO_PAIRS = np.empty((0, 2), np.int64)

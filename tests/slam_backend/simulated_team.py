@@ -4,13 +4,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from slam_backend.camera import StereoCamera
-from slam_backend.errors import FloatArray
+from slam_backend.core.validation import FloatArray
+from slam_backend.fastslam.reports import TeamReport
 from slam_backend.geometry import compose, inverse, transform_points
-from slam_backend.measurements import Measurements
-from slam_backend.motion import OdometryModel
-from slam_backend.reports import TeamReport
-from slam_backend.team import TeamSlam
+from slam_backend.models.camera import StereoCamera
+from slam_backend.models.measurements import Measurements
+from slam_backend.models.odometry import OdometryModel
+from slam_backend.team.team import TeamSlam
 
 TRUE_CAMERA = StereoCamera()
 ASSUMED_CAMERA = StereoCamera(sigma_px=0.4, sigma_disparity_px=0.2)  # twice the true noise

@@ -4,11 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slam_backend.camera import StereoCamera
-from slam_backend.errors import FloatArray, IntArray
+from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.geometry import between, compose, inverse, transform_points
-from slam_backend.measurements import Measurements
-from slam_backend.motion import OdometryModel
+from slam_backend.models.camera import StereoCamera
+from slam_backend.models.measurements import Measurements
+from slam_backend.models.odometry import OdometryModel
 
 LOOK_SIZE = 5
 

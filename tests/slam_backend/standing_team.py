@@ -3,9 +3,9 @@
 import numpy as np
 from mapped_once import LANDMARKS, frame_of
 
-from slam_backend.alignment import Alignment
 from slam_backend.geometry import between, inverse, transform_points
-from slam_backend.team import TeamSlam
+from slam_backend.maps.alignment import Alignment
+from slam_backend.team.team import TeamSlam
 
 STARTS = np.array([[0.5, -1.0, 0.3], [4.0, 3.0, 2.0], [9.0, 1.0, -2.5], [2.0, 6.0, -1.2]])  # world
 COMMON = np.arange(5)  # names of the landmarks that all robots see first, so that these have ids 0 to 4 in every map

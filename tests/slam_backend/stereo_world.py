@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from slam_backend.camera import StereoCamera
-from slam_backend.errors import FloatArray, IntArray
+from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.geometry import inverse, transform_points
-from slam_backend.measurements import Measurements
-from slam_backend.motion import OdometryModel
+from slam_backend.models.camera import StereoCamera
+from slam_backend.models.measurements import Measurements
+from slam_backend.models.odometry import OdometryModel
 
 EXACT_MOTION = OdometryModel(
     sigma_along=0.0, sigma_across=0.0, sigma_heading=0.0, sigma_turn=0.0, floor_position=0.0, floor_heading=0.0

@@ -7,9 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from slam_backend._candidates import may_suffice
-from slam_backend._matching import mutual_nearest
-from slam_backend.alignment import (
+from slam_backend.geometry import between, inverse, rotate_covariances, transform_points, wrap_angle
+from slam_backend.maps.alignment import (
     METHODS,
     REASONS,
     RIVAL_ANGLE,
@@ -19,9 +18,9 @@ from slam_backend.alignment import (
     align_maps,
     candidate_matches,
 )
-from slam_backend.fusion import alignment_jacobian
-from slam_backend.geometry import between, inverse, rotate_covariances, transform_points, wrap_angle
-from slam_backend.landmark_map import LandmarkMap
+from slam_backend.maps.correspondences import may_suffice, mutual_nearest
+from slam_backend.maps.fusion import alignment_jacobian
+from slam_backend.maps.landmark_map import LandmarkMap
 
 D = 32
 SQUARE = 30.0  # [m]

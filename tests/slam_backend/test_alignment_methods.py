@@ -6,13 +6,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 from python_entry import python_entry
 
-from slam_backend import _alignment_kernels as kernels
-from slam_backend import _clique_kernels as cliques
-from slam_backend import _proposals as proposals
-from slam_backend._matching import look_alikes, num_alike
-from slam_backend.alignment import METHODS, REASONS, AlignmentOptions, align_maps, candidate_matches, propose_motion
 from slam_backend.geometry import between, inverse, transform_points
-from slam_backend.landmark_map import LandmarkMap
+from slam_backend.maps import _kernels as kernels
+from slam_backend.maps import initial_estimates as proposals
+from slam_backend.maps._kernels import max_clique as cliques
+from slam_backend.maps.alignment import (
+    METHODS,
+    REASONS,
+    AlignmentOptions,
+    align_maps,
+    candidate_matches,
+    propose_motion,
+)
+from slam_backend.maps.correspondences import look_alikes, num_alike
+from slam_backend.maps.landmark_map import LandmarkMap
 
 D = 32
 TURNED = np.array([4.0, -3.0, 2.0])

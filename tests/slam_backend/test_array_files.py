@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from slam_backend.array_files import UnreadableArchiveError, read_arrays
-from slam_backend.landmark_map import LandmarkMap
+from slam_backend.core.array_files import UnreadableArchiveError, read_arrays
+from slam_backend.maps.landmark_map import LandmarkMap
 
 
 class Trap:

@@ -3,10 +3,10 @@ import pytest
 from mapped_once import looks
 from simulated_team import SimulatedTeam
 
-from slam_backend.alignment import Alignment, AlignmentOptions
-from slam_backend.attempts import AttemptOptions, AttemptSchedule, PairKey, Straightening
-from slam_backend.landmark_map import LandmarkMap
-from slam_backend.team import TeamSlam
+from slam_backend.maps.alignment import Alignment, AlignmentOptions
+from slam_backend.maps.landmark_map import LandmarkMap
+from slam_backend.team.merge_scheduler import AttemptOptions, AttemptSchedule, PairKey, Straightening
+from slam_backend.team.team import TeamSlam
 
 FIRST: PairKey = ((0,), (1, 3))
 SECOND: PairKey = ((0,), (2,))

@@ -5,8 +5,8 @@ import pytest
 from gappy_filter import filter_after_some_steps
 
 from slam_backend import FastSlam, Measurements
-from slam_backend._best_map import best_map, write_outline
-from slam_backend.landmark_map import OutlineRows
+from slam_backend.fastslam.particle_maps import best_map, write_outline
+from slam_backend.maps.landmark_map import OutlineRows
 
 UNPACK = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from slam_backend.camera import ROBOT_FROM_CAMERA, StereoCamera
+from slam_backend.models.camera import ROBOT_FROM_CAMERA, StereoCamera
 
 CAMERA = StereoCamera(
     focal_px=300.0, baseline=0.15, width=400, height=200, max_range=7.0, mount=(0.2, -0.1, 0.6), sigma_px=0.3

@@ -8,10 +8,10 @@ import pytest
 from merged_pair import NEVER, links, merged_team
 from simulated_team import MOTION, SimulatedTeam
 
-from slam_backend.consistency import FALSE_ALARMS, LOW_ESS, NIS_BOUNDS, USUAL, ConsistencyTest
-from slam_backend.errors import FloatArray
-from slam_backend.filter import FastSlam
-from slam_backend.motion import OdometryModel
+from slam_backend.core.validation import FloatArray
+from slam_backend.fastslam.consistency import FALSE_ALARMS, LOW_ESS, NIS_BOUNDS, USUAL, ConsistencyTest
+from slam_backend.fastslam.filter import FastSlam
+from slam_backend.models.odometry import OdometryModel
 
 
 def tell(answers: Any, share: FloatArray) -> bool:

@@ -9,15 +9,15 @@ from damage import damaged, with_part
 from simulated_team import SimulatedTeam
 from test_undo import true_alignment
 
-from slam_backend.attempts import AttemptOptions
-from slam_backend.existence import ExistenceModel
-from slam_backend.filter import FastSlam
-from slam_backend.merge_options import MergeOptions
-from slam_backend.smoothing.options import SmoothingOptions
-from slam_backend.state_codec import ForeignObjectError, decoded, encoded
+from slam_backend.core.state_codec import ForeignObjectError, decoded, encoded
+from slam_backend.fastslam.existence import ExistenceModel
+from slam_backend.fastslam.filter import FastSlam
+from slam_backend.smoother.options import SmoothingOptions
 from slam_backend.state_kinds import BACKEND_KINDS
-from slam_backend.team import TeamSlam
-from slam_backend.undoing import Undoing
+from slam_backend.team.merge_rollback import Undoing
+from slam_backend.team.merge_scheduler import AttemptOptions
+from slam_backend.team.options import MergeOptions
+from slam_backend.team.team import TeamSlam
 
 pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")  # overflows of what is out of place do no harm
 

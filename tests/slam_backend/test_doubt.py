@@ -6,11 +6,11 @@ import numpy as np
 from merged_pair import NEVER, false_alignment
 from simulated_team import SimulatedTeam
 
-from slam_backend.alignment import RIVAL_ANGLE, RIVAL_DISTANCE
 from slam_backend.geometry import compose
-from slam_backend.group_changes import MergePlan, doubt_about
-from slam_backend.merge_options import MergeOptions
-from slam_backend.merging import motion_covariance
+from slam_backend.maps.alignment import RIVAL_ANGLE, RIVAL_DISTANCE
+from slam_backend.team.filter_merging.merging import motion_covariance
+from slam_backend.team.group_merging import MergePlan, doubt_about
+from slam_backend.team.options import MergeOptions
 
 
 def test_what_held_frames_leave_open_is_doubted_as_well() -> None:

@@ -4,7 +4,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from slam_backend.errors import bad_argument, check_array, check_choice, check_float, check_int
+from slam_backend.core.validation import bad_argument, check_array, check_choice, check_float, check_int
 
 CURE = "Do otherwise."
 

@@ -2,11 +2,10 @@ import numpy as np
 from mapped_once import looks
 from simulated_team import SIZE, SimulatedTeam
 
-from slam_backend.exchange import LANDMARK_BYTES, POSE_BYTES, ExchangeLedger
-from slam_backend.findings import Findings
-from slam_backend.landmark_map import LandmarkMap
-from slam_backend.merge_options import MergeOptions
-from slam_backend.reports import StepReport
+from slam_backend.fastslam.reports import Findings, StepReport
+from slam_backend.maps.landmark_map import LandmarkMap
+from slam_backend.team.communication import LANDMARK_BYTES, POSE_BYTES, ExchangeLedger
+from slam_backend.team.options import MergeOptions
 
 LOOK = 4 * 13  # bytes of a descriptor of `looks`
 

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from python_entry import python_entry
 from scipy import stats
 
-from slam_backend._existence_kernels import in_view, updated_log_odds
-from slam_backend.camera import StereoCamera
-from slam_backend.errors import FloatArray
-from slam_backend.existence import ExistenceModel
+from slam_backend.core.validation import FloatArray
+from slam_backend.fastslam._kernels.existence import in_view, updated_log_odds
+from slam_backend.fastslam.existence import ExistenceModel
+from slam_backend.models.camera import StereoCamera
 
 in_view, updated_log_odds = map(python_entry, (in_view, updated_log_odds))
 

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from slam_backend import files
-from slam_backend.files import append_text, check_writable, move_file, write_file
+from slam_backend.core import files
+from slam_backend.core.files import append_text, check_writable, move_file, write_file
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="devices, FIFOs and modes are POSIX")
 
@@ -131,7 +131,7 @@ def test_descriptors_go_on_where_they_are(redirection: str, name: str, tmp_path:
     """What a command writes to its own output by name stands between what it prints before and after."""
     (tmp_path / "link").symlink_to("/proc/self/fd/1")
     code = (
-        "import sys; from slam_backend.files import check_writable, write_file\n"
+        "import sys; from slam_backend.core.files import check_writable, write_file\n"
         f"print('before', flush=True); check_writable({name!r}, 'json'); write_file({name!r}, 'in\\n'); print('after')"
     )
     shell = {

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from same_bits import assert_same
 
-from slam_backend.camera import StereoCamera
-from slam_backend.filter import FastSlam
-from slam_backend.measurements import Measurements
+from slam_backend.fastslam.filter import FastSlam
+from slam_backend.models.camera import StereoCamera
+from slam_backend.models.measurements import Measurements
 
 FRAME = Measurements([[0.0, 0.0, 2.0], [0.5, 0.1, 3.0]], np.eye(2, 5))
 MOVE = [0.1, 0.0, 0.02]

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from stereo_world import StereoWorld
 
-from slam_backend.camera import StereoCamera
-from slam_backend.filter import FastSlam
+from slam_backend.fastslam.filter import FastSlam
 from slam_backend.geometry import compose
-from slam_backend.measurements import Measurements
-from slam_backend.motion import OdometryModel
+from slam_backend.models.camera import StereoCamera
+from slam_backend.models.measurements import Measurements
+from slam_backend.models.odometry import OdometryModel
 from slam_backend.resampling import RESAMPLING
 
 MOVE = np.array([0.25, 0.02, 0.3])

@@ -9,14 +9,14 @@ from same_bits import assert_same
 from scipy import stats
 from stereo_world import EXACT_MOTION, StereoWorld
 
-from slam_backend.alignment import Alignment
-from slam_backend.errors import FloatArray
-from slam_backend.existence import ExistenceModel
-from slam_backend.filter import FastSlam
+from slam_backend.core.validation import FloatArray
+from slam_backend.fastslam.existence import ExistenceModel
+from slam_backend.fastslam.filter import FastSlam
 from slam_backend.geometry import compose
-from slam_backend.measurements import Measurements
-from slam_backend.merging import merge_filters
-from slam_backend.team import TeamSlam
+from slam_backend.maps.alignment import Alignment
+from slam_backend.models.measurements import Measurements
+from slam_backend.team.filter_merging.merging import merge_filters
+from slam_backend.team.team import TeamSlam
 
 PROPOSALS = pytest.mark.parametrize("proposal", ["fastslam2", "fastslam1"])
 MOVE = np.array([0.25, 0.02, 0.3])

@@ -7,14 +7,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from slam_backend.camera import ROBOT_FROM_CAMERA, StereoCamera
-from slam_backend.errors import FloatArray
-from slam_backend.filter import FastSlam
+from slam_backend.core.validation import FloatArray
+from slam_backend.fastslam.filter import FastSlam
 from slam_backend.geometry import compose, inverse, transform_points
-from slam_backend.measurements import Measurements
-from slam_backend.motion import OdometryModel
-from slam_backend.plain.frame import Frame
-from slam_backend.plain.pose_belief import turn_about_vertical
+from slam_backend.models.camera import ROBOT_FROM_CAMERA, StereoCamera
+from slam_backend.models.measurements import Measurements
+from slam_backend.models.odometry import OdometryModel
+from slam_backend.reference.measurement_model import Frame
+from slam_backend.reference.pose_gaussian import turn_about_vertical
 
 CAMERA = StereoCamera(mount=(0.3, -0.2, 0.5))
 NOISES = np.diag([CAMERA.sigma_px**2, CAMERA.sigma_px**2, CAMERA.sigma_disparity_px**2])

@@ -7,13 +7,13 @@ import pytest
 from linear_world import CAMERA, measure, turn
 from stereo_world import EXACT_MOTION, StereoWorld
 
-from slam_backend._kernels import YOUNG
-from slam_backend.camera import ROBOT_FROM_CAMERA
-from slam_backend.errors import FloatArray
-from slam_backend.filter import FastSlam
-from slam_backend.filter_options import CALIBRATED_NOISE
+from slam_backend.core.validation import FloatArray
+from slam_backend.fastslam._kernels import YOUNG
+from slam_backend.fastslam.filter import FastSlam
+from slam_backend.fastslam.options import CALIBRATED_NOISE
 from slam_backend.geometry import compose
-from slam_backend.measurements import Measurements
+from slam_backend.models.camera import ROBOT_FROM_CAMERA
+from slam_backend.models.measurements import Measurements
 
 PROPOSALS = pytest.mark.parametrize("proposal", ["fastslam2", "fastslam1"])
 

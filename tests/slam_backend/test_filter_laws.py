@@ -7,13 +7,13 @@ import pytest
 from scipy import stats
 from stereo_world import EXACT_MOTION, StereoWorld
 
-from slam_backend.camera import ROBOT_FROM_CAMERA, StereoCamera
-from slam_backend.errors import FloatArray
-from slam_backend.filter import FastSlam
+from slam_backend.core.validation import FloatArray
+from slam_backend.fastslam.filter import FastSlam
+from slam_backend.fastslam.reports import StepReport
 from slam_backend.geometry import compose, transform_points
-from slam_backend.landmark_map import LandmarkMap
-from slam_backend.measurements import Measurements
-from slam_backend.reports import StepReport
+from slam_backend.maps.landmark_map import LandmarkMap
+from slam_backend.models.camera import ROBOT_FROM_CAMERA, StereoCamera
+from slam_backend.models.measurements import Measurements
 
 PROPOSALS = pytest.mark.parametrize("proposal", ["fastslam2", "fastslam1"])
 LOOK = np.eye(1, 3, dtype=np.float32)

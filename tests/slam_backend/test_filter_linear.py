@@ -10,7 +10,7 @@ import pytest
 from linear_world import CAMERA, LANDMARKS, MOTION, LinearRun, kalman_filter, measure, simulate, turn
 from scipy import stats
 
-from slam_backend.filter import FastSlam
+from slam_backend.fastslam.filter import FastSlam
 from slam_backend.metrics import nees
 
 PROPOSALS = pytest.mark.parametrize("proposal", ["fastslam2", "fastslam1"])

@@ -8,17 +8,17 @@ import pytest
 from small_world import SmallWorld
 from stereo_world import EXACT_MOTION
 
-from slam_backend.errors import FloatArray, IntArray
-from slam_backend.existence import ExistenceModel
-from slam_backend.filter import FastSlam
-from slam_backend.filter_options import FilterOptions
+from slam_backend.core.validation import FloatArray, IntArray
+from slam_backend.fastslam.existence import ExistenceModel
+from slam_backend.fastslam.filter import FastSlam
+from slam_backend.fastslam.options import FilterOptions
+from slam_backend.fastslam.reports import StepReport
 from slam_backend.geometry import wrap_angle
-from slam_backend.landmark_map import LandmarkMap
-from slam_backend.measurements import Measurements
-from slam_backend.motion import OdometryModel
-from slam_backend.plain import PlainFastSlam, fastslam2
-from slam_backend.plain import filter as plain_filter
-from slam_backend.reports import StepReport
+from slam_backend.maps.landmark_map import LandmarkMap
+from slam_backend.models.measurements import Measurements
+from slam_backend.models.odometry import OdometryModel
+from slam_backend.reference import PlainFastSlam, fastslam2
+from slam_backend.reference import filter as plain_filter
 from slam_backend.resampling import RESAMPLING
 
 CLOSE = {"rtol": 1e-8, "atol": 1e-8}  # ill-conditioned updates amplify the rounding of either

@@ -11,10 +11,10 @@ from filter_contents import arrays_of, contents, load_landmarks, map_of
 from same_bits import assert_same
 from stereo_world import StereoWorld
 
-from slam_backend.errors import IntArray
-from slam_backend.filter import FastSlam
+from slam_backend.core.validation import IntArray
+from slam_backend.fastslam.filter import FastSlam
 from slam_backend.geometry import compose
-from slam_backend.measurements import Measurements
+from slam_backend.models.measurements import Measurements
 from slam_backend.resampling import RESAMPLING
 
 MOVE = np.array([0.25, 0.02, 0.3])

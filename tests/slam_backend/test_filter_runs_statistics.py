@@ -8,11 +8,11 @@ import pytest
 from scipy import stats
 from stereo_world import StereoWorld
 
-from slam_backend.errors import FloatArray
-from slam_backend.filter import FastSlam
+from slam_backend.core.validation import FloatArray
+from slam_backend.fastslam.filter import FastSlam
 from slam_backend.geometry import compose, wrap_angle
-from slam_backend.measurements import Measurements
 from slam_backend.metrics import nees
+from slam_backend.models.measurements import Measurements
 from slam_backend.resampling import RESAMPLING
 
 MOVE = np.array([0.25, 0.02, 0.3])  # 21 steps are one turn

@@ -11,14 +11,14 @@ from linear_world import CAMERA, LANDMARKS, turn
 from scipy import stats
 from stereo_world import EXACT_MOTION, StereoWorld
 
-from slam_backend.camera import StereoCamera
-from slam_backend.errors import FloatArray
-from slam_backend.filter import FastSlam
+from slam_backend.core.validation import FloatArray
+from slam_backend.fastslam.filter import FastSlam
 from slam_backend.geometry import compose, transform_points, wrap_angle
-from slam_backend.landmark_map import LandmarkMap
-from slam_backend.measurements import Measurements
+from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.metrics import nees
-from slam_backend.motion import OdometryModel
+from slam_backend.models.camera import StereoCamera
+from slam_backend.models.measurements import Measurements
+from slam_backend.models.odometry import OdometryModel
 
 PROPOSALS = pytest.mark.parametrize("proposal", ["fastslam2", "fastslam1"])
 FALSE_ALARM = 1e-3

@@ -6,11 +6,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from test_step_input import checked, reading
 
-from slam_backend.filter import FastSlam
-from slam_backend.findings import Findings
-from slam_backend.measurements import Measurements
-from slam_backend.reports import StepReport
-from slam_backend.team import TeamSlam
+from slam_backend.fastslam.filter import FastSlam
+from slam_backend.fastslam.reports import Findings, StepReport
+from slam_backend.models.measurements import Measurements
+from slam_backend.team.team import TeamSlam
 
 rows_of_ids = st.lists(st.lists(st.integers(-1, 9), max_size=4), min_size=1, max_size=4)
 

@@ -12,14 +12,13 @@ from same_bits import assert_same
 from scipy import stats
 from simulated_team import SIZE, SimulatedTeam
 
-from slam_backend.branches import MOST_REPLAYED
-from slam_backend.contacts import reach
-from slam_backend.exchange import LANDMARK_BYTES, POINT_BYTES, POSE_BYTES
-from slam_backend.existence import ExistenceModel
+from slam_backend.fastslam.existence import ExistenceModel
+from slam_backend.fastslam.reports import LandmarksCreated
 from slam_backend.geometry import between, wrap_angle
-from slam_backend.merge_options import MergeOptions
-from slam_backend.reports import LandmarksCreated
-from slam_backend.team import TeamSlam
+from slam_backend.team.branches import MOST_REPLAYED
+from slam_backend.team.communication import LANDMARK_BYTES, POINT_BYTES, POSE_BYTES, reach
+from slam_backend.team.options import MergeOptions
+from slam_backend.team.team import TeamSlam
 
 FINAL = MergeOptions(watch_steps=0)
 

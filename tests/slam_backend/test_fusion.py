@@ -5,10 +5,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from slam_backend import fusion
-from slam_backend.alignment import Alignment, align_maps
 from slam_backend.geometry import compose, inverse, rotation, transform_points
-from slam_backend.landmark_map import FIELDS, LandmarkMap
+from slam_backend.maps import fusion
+from slam_backend.maps.alignment import Alignment, align_maps
+from slam_backend.maps.landmark_map import FIELDS, LandmarkMap
 from slam_backend.metrics import anees, nees
 
 RUNS = 20_000

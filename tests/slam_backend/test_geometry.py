@@ -2,15 +2,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from slam_backend.geometry import (
-    between,
-    compose,
-    inverse,
-    rotate_covariances,
-    rotation,
-    transform_points,
-    wrap_angle,
-)
+from slam_backend.geometry import between, compose, inverse, rotate_covariances, rotation, transform_points, wrap_angle
 
 coordinates = st.floats(-50.0, 50.0)
 angles = st.floats(-np.pi, np.pi, exclude_max=True)

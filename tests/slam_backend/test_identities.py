@@ -9,17 +9,17 @@ from hypothesis import strategies as st
 from mapped_once import names_of
 from merged_pair import NEVER, links
 
-from slam_backend.alignment import Alignment, AlignmentOptions
-from slam_backend.camera import StereoCamera
-from slam_backend.existence import ExistenceModel
-from slam_backend.filter import FastSlam
-from slam_backend.filter_options import FilterOptions
+from slam_backend.fastslam.existence import ExistenceModel
+from slam_backend.fastslam.filter import FastSlam
+from slam_backend.fastslam.options import FilterOptions
 from slam_backend.geometry import compose, inverse, transform_points
-from slam_backend.measurements import Measurements
-from slam_backend.merge_options import MergeOptions
-from slam_backend.motion import OdometryModel
-from slam_backend.plain import PlainFastSlam
-from slam_backend.team import TeamSlam
+from slam_backend.maps.alignment import Alignment, AlignmentOptions
+from slam_backend.models.camera import StereoCamera
+from slam_backend.models.measurements import Measurements
+from slam_backend.models.odometry import OdometryModel
+from slam_backend.reference import PlainFastSlam
+from slam_backend.team.options import MergeOptions
+from slam_backend.team.team import TeamSlam
 
 CAMERA = StereoCamera()
 COVARIANCE = np.diag([0.05, 0.05, 0.05]) ** 2

@@ -6,8 +6,8 @@ import pytest
 from numba.core.errors import NumbaError
 from python_entry import python_entry
 
-from slam_backend import _jit
-from slam_backend._kernel_cache import CheckedFile
+from slam_backend.core import jit as _jit
+from slam_backend.core.kernel_cache import CheckedFile
 
 
 def test_this_version_of_numba_can_leave_references_uncounted() -> None:

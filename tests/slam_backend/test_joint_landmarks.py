@@ -5,11 +5,11 @@ import pytest
 from filter_contents import load_landmarks
 from gappy_filter import filter_with_gaps
 
-from slam_backend._joint_landmarks import Landmarks, joint_counts, write_joint
-from slam_backend._kernels import LANES
-from slam_backend._particle_maps import ParticleMaps
-from slam_backend.errors import FloatArray, IntArray
-from slam_backend.fusion import fuse_landmarks
+from slam_backend.core.validation import FloatArray, IntArray
+from slam_backend.fastslam._kernels import LANES
+from slam_backend.fastslam.particle_maps import ParticleMaps
+from slam_backend.maps.fusion import fuse_landmarks
+from slam_backend.team.filter_merging.landmarks import Landmarks, joint_counts, write_joint
 
 UPPER = np.triu_indices(3)
 UNPACK = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])

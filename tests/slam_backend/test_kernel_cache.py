@@ -11,7 +11,7 @@ import numba
 import numpy as np
 import pytest
 
-from slam_backend.compilation import watch_compilation
+from slam_backend.core.compilation import watch_compilation
 
 KERNEL = """
 from slam_backend._jit import jit

@@ -4,10 +4,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from slam_backend.camera import ROBOT_FROM_CAMERA
 from slam_backend.geometry import compose
-from slam_backend.readers.kitti import ABSENT, load_kitti
-from slam_backend.readers.kitti_steps import make_camera, motion_noise, planar_motion, steps, track_descriptors
+from slam_backend.models.camera import ROBOT_FROM_CAMERA
+from slam_backend.readers.kitti import (
+    ABSENT,
+    load_kitti,
+    make_camera,
+    motion_noise,
+    planar_motion,
+    steps,
+    track_descriptors,
+)
 from slam_backend.trajectory import dead_reckoning
 
 FOCAL, CENTRE, BASELINE, MOUNT = 700.0, (600.0, 180.0), 0.5, (1.1, -0.3, 0.7)

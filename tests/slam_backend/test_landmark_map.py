@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from slam_backend.geometry import compose, inverse
-from slam_backend.landmark_map import FIELDS, LandmarkMap
+from slam_backend.maps.landmark_map import FIELDS, LandmarkMap
 
 N, D = 5, 7
 

@@ -4,11 +4,11 @@ import numpy as np
 from merged_pair import NEVER, false_alignment, links, true_alignment
 from simulated_team import SimulatedTeam
 
-from slam_backend.branches import Branch
-from slam_backend.lineup import Lineup
-from slam_backend.merge_options import MergeOptions
-from slam_backend.reports import TeamReport
-from slam_backend.team import TeamSlam
+from slam_backend.fastslam.reports import TeamReport
+from slam_backend.team.branches import Branch
+from slam_backend.team.groups import Lineup
+from slam_backend.team.options import MergeOptions
+from slam_backend.team.team import TeamSlam
 
 
 def oldest_unknown(branch: Branch, now: int) -> int:

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from slam_backend.measurements import Measurements, TeamMeasurements
+from slam_backend.models.measurements import Measurements, TeamMeasurements
 
 POINTS = [[0.0, 0.1, 2.0], [1.0, 0.0, 3.0]]
 LOOKS = np.eye(2, 5, dtype=np.float32)

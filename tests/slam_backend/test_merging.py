@@ -22,16 +22,16 @@ from mapped_once import (
 )
 from same_bits import assert_same
 
-from slam_backend import _map_store
-from slam_backend._packed import UNPACK
-from slam_backend.alignment import Alignment
-from slam_backend.errors import IntArray
-from slam_backend.filter import FastSlam
-from slam_backend.fusion import fuse_landmarks
+from slam_backend.core.packed_symmetric import UNPACK
+from slam_backend.core.validation import IntArray
+from slam_backend.fastslam import particle_maps as _map_store
+from slam_backend.fastslam.filter import FastSlam
 from slam_backend.geometry import compose, inverse, rotate_covariances, rotation, transform_points, wrap_angle
-from slam_backend.measurements import Measurements
-from slam_backend.merging import inverse_alignment, merge_filters
-from slam_backend.motion import OdometryModel
+from slam_backend.maps.alignment import Alignment
+from slam_backend.maps.fusion import fuse_landmarks
+from slam_backend.models.measurements import Measurements
+from slam_backend.models.odometry import OdometryModel
+from slam_backend.team.filter_merging.merging import inverse_alignment, merge_filters
 
 NO_PAIRS = np.empty((0, 2), np.int64)
 

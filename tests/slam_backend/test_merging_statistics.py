@@ -16,13 +16,13 @@ from mapped_once import (
 )
 from scipy import integrate, optimize, stats
 
-from slam_backend.alignment import Alignment
-from slam_backend.errors import FloatArray, IntArray
-from slam_backend.filter import FastSlam
-from slam_backend.fusion import alignment_jacobian, fuse_maps
+from slam_backend.core.validation import FloatArray, IntArray
+from slam_backend.fastslam.filter import FastSlam
 from slam_backend.geometry import rotate_covariances, transform_points, wrap_angle
-from slam_backend.landmark_map import LandmarkMap
-from slam_backend.merging import merge_filters
+from slam_backend.maps.alignment import Alignment
+from slam_backend.maps.fusion import alignment_jacobian, fuse_maps
+from slam_backend.maps.landmark_map import LandmarkMap
+from slam_backend.team.filter_merging.merging import merge_filters
 
 SIGMA = 0.05
 OWN_OF_B = [7, 8]  # names of the landmarks that b alone has seen

@@ -4,10 +4,10 @@ import numpy as np
 from gappy_filter import filter_with_gaps
 
 from slam_backend import FastSlam
-from slam_backend._kernels import LANES
-from slam_backend._kernels.layout import ROW_OF
-from slam_backend._mixtures import map_mixture
-from slam_backend.landmark_map import LandmarkMap
+from slam_backend.fastslam._kernels import LANES
+from slam_backend.fastslam._kernels.layout import ROW_OF
+from slam_backend.fastslam.estimates import map_mixture
+from slam_backend.maps.landmark_map import LandmarkMap
 
 UNPACK = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 SCATTER = np.array([[3e-2, 1e-3, 2e-3], [1e-3, 2e-2, -1e-3], [2e-3, -1e-3, 5e-3]])  # of the frame [m, m, rad]

@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 from python_entry import python_entry
 from scipy import stats
 
-from slam_backend import _kernels
+from slam_backend.fastslam import _kernels
 from slam_backend.geometry import compose, wrap_angle
-from slam_backend.motion import OdometryModel
+from slam_backend.models.odometry import OdometryModel
 
 MODEL = OdometryModel(
     sigma_along=0.1, sigma_across=0.03, sigma_heading=0.05, sigma_turn=0.2, floor_position=0.01, floor_heading=0.02

@@ -6,12 +6,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from slam_backend.camera import StereoCamera
 from slam_backend.geometry import between, compose
 from slam_backend.metrics import ate
-from slam_backend.readers.mrclam import MrclamLog, RobotLog, load_mrclam
-from slam_backend.readers.mrclam_steps import SightingNoise, steps
-from slam_backend.readers.velocities import HOLD, integrate_commands
+from slam_backend.models.camera import StereoCamera
+from slam_backend.readers.conversions import HOLD, integrate_commands
+from slam_backend.readers.mrclam import MrclamLog, RobotLog, SightingNoise, load_mrclam, steps
 from slam_backend.trajectory import dead_reckoning
 
 FILES = {

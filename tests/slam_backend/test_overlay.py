@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from slam_backend.alignment import AlignmentOptions
-from slam_backend.errors import FloatArray
+from slam_backend.core.validation import FloatArray
 from slam_backend.geometry import rotate_covariances, rotation, transform_points
-from slam_backend.landmark_map import LandmarkMap
-from slam_backend.watching import moved_share
+from slam_backend.maps.alignment import AlignmentOptions
+from slam_backend.maps.landmark_map import LandmarkMap
+from slam_backend.team.merge_monitor import moved_share
 
 FITS = 10
 

@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from slam_backend._pair_kernels import MIN_PAIRS, WIDTH, fit, unexplained
-from slam_backend.errors import BoolArray, FloatArray, IntArray
+from slam_backend.core.validation import BoolArray, FloatArray, IntArray
+from slam_backend.team.filter_merging._kernels.pairing import MIN_PAIRS, WIDTH, fit, unexplained
 
 UPPER = np.triu_indices(3)
 UNPACK = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])

@@ -10,17 +10,17 @@ from hypothesis.extra.numpy import arrays
 from scipy import stats
 from stereo_world import StereoWorld
 
-from slam_backend.camera import StereoCamera
-from slam_backend.errors import FloatArray
-from slam_backend.filter_options import FilterOptions
+from slam_backend.core.validation import FloatArray
+from slam_backend.fastslam.options import FilterOptions
 from slam_backend.geometry import compose, wrap_angle
-from slam_backend.measurements import Measurements
-from slam_backend.motion import OdometryModel
-from slam_backend.plain import PlainFastSlam
-from slam_backend.plain.fastslam2 import pose_given, refine
-from slam_backend.plain.frame import Frame, Landmark
-from slam_backend.plain.particles import settled
-from slam_backend.plain.pose_belief import PoseBelief, WhitenedPose, lower_root, turn_about_vertical
+from slam_backend.models.camera import StereoCamera
+from slam_backend.models.measurements import Measurements
+from slam_backend.models.odometry import OdometryModel
+from slam_backend.reference import PlainFastSlam
+from slam_backend.reference.fastslam2 import pose_given, refine
+from slam_backend.reference.measurement_model import Frame, Landmark
+from slam_backend.reference.particles import settled
+from slam_backend.reference.pose_gaussian import PoseBelief, WhitenedPose, lower_root, turn_about_vertical
 
 CAMERA = StereoCamera(mount=(0.3, -0.2, 0.5))
 MOVE = np.array([0.25, 0.02, 0.3])

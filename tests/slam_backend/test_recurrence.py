@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from slam_backend._recurrence import recurs
-from slam_backend.alignment import AlignmentOptions, align_maps
 from slam_backend.geometry import inverse, transform_points
-from slam_backend.landmark_map import LandmarkMap
+from slam_backend.maps.alignment import AlignmentOptions, align_maps
+from slam_backend.maps.landmark_map import LandmarkMap
+from slam_backend.maps.verification import recurs
 
 SHARED, OTHERS = 24, 80
 DOUBLE = np.array([9.0, -4.0, 1.2])  # where a constellation hangs a second time

@@ -3,13 +3,12 @@
 import numpy as np
 import pytest
 
-from slam_backend.alignment import REASONS, Alignment, AlignmentOptions, align_maps
-from slam_backend.alignment_types import BOUNDS, HINTS
-from slam_backend.attempts import AttemptOptions
-from slam_backend.landmark_map import LandmarkMap
-from slam_backend.merge_options import MergeOptions
-from slam_backend.refusals import count_attempts, refusals_of
-from slam_backend.reports import MergeEvent
+from slam_backend.fastslam.reports import MergeEvent
+from slam_backend.maps.alignment import REASONS, Alignment, AlignmentOptions, align_maps
+from slam_backend.maps.alignment_types import BOUNDS, HINTS, count_attempts, refusals_of
+from slam_backend.maps.landmark_map import LandmarkMap
+from slam_backend.team.merge_scheduler import AttemptOptions
+from slam_backend.team.options import MergeOptions
 from tests.slam_backend.simulated_team import SimulatedTeam
 
 FOUND = Alignment(True, "", 1.0, 2.0, 0.1, 1e-3 * np.eye(3), np.zeros((1, 2), np.int64), 0.0)

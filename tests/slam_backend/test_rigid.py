@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from slam_backend.rigid import fit_rigid, ransac_rigid, rotation_angle
+from slam_backend.geometry3d import fit_rigid, ransac_rigid, rotation_angle
 
 
 def _motion(seed: int) -> tuple[np.ndarray, np.ndarray]:

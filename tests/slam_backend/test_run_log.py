@@ -11,16 +11,16 @@ from hypothesis import strategies as st
 from python_entry import python_entry
 from same_bits import assert_same
 
-from slam_backend._journal import LONGEST, ROOM
-from slam_backend._kernels import IDLE, MOVED, PLACED
-from slam_backend._kernels import STOOD as STOOD_STILL
-from slam_backend._kernels.journals import note_turns
-from slam_backend._kernels.layout import DID, LOGGED, MOTION, NAME, NUM_MEASURED, NUM_NOTED, THOUGHT
-from slam_backend._log_kernels import write_guesses
-from slam_backend.filter import FastSlam
-from slam_backend.log_arrays import EXACT, ODOMETRY, STOOD
-from slam_backend.measurements import Measurements
-from slam_backend.run_log import MEASUREMENTS, ROWS, RobotLog
+from slam_backend.fastslam._kernels import IDLE, MOVED, PLACED
+from slam_backend.fastslam._kernels import STOOD as STOOD_STILL
+from slam_backend.fastslam._kernels.layout import DID, LOGGED, MOTION, NAME, NUM_MEASURED, NUM_NOTED, THOUGHT
+from slam_backend.fastslam._kernels.run_log import write_guesses
+from slam_backend.fastslam._kernels.step import note_turns
+from slam_backend.fastslam.filter import FastSlam
+from slam_backend.fastslam.run_log import MEASUREMENTS, ROWS, RobotLog
+from slam_backend.fastslam.state import LONGEST, ROOM
+from slam_backend.models.measurements import Measurements
+from slam_backend.smoother.log_arrays import EXACT, ODOMETRY, STOOD
 
 note_turns = python_entry(note_turns)
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from slam_backend.standpoints import SIGMAS, Standpoints, members_of
+from slam_backend.fastslam.relative_poses import SIGMAS, Standpoints, members_of
 
 
 @pytest.mark.parametrize(("rows", "robots"), [(3, None), (1, 4)])

@@ -1,14 +1,14 @@
 import numpy as np
 from python_entry import python_entry
 
-from slam_backend._kernels import LANES
-from slam_backend._kernels.start_frames import AT_ORIGIN, KNOWN, SPREAD, see_from_starts, stand, start_kind
-from slam_backend._mixtures import pose_mixtures
-from slam_backend._packed import UNPACK
-from slam_backend.filter import FastSlam
+from slam_backend.core.packed_symmetric import UNPACK
+from slam_backend.fastslam._kernels import LANES
+from slam_backend.fastslam._kernels.relative_poses import AT_ORIGIN, KNOWN, SPREAD, see_from_starts, stand, start_kind
+from slam_backend.fastslam.estimates import pose_mixtures
+from slam_backend.fastslam.filter import FastSlam
+from slam_backend.fastslam.relative_poses import Standpoints
 from slam_backend.geometry import between, compose, inverse, rotate_covariances, rotation, wrap_angle
-from slam_backend.measurements import Measurements
-from slam_backend.standpoints import Standpoints
+from slam_backend.models.measurements import Measurements
 
 see_from_starts, start_kind = map(python_entry, (see_from_starts, start_kind))
 

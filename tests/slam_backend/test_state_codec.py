@@ -12,10 +12,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from slam_backend.filter import FastSlam
-from slam_backend.state_codec import SEEDS, ForeignObjectError, Kinds, decoded, encoded, read_file
+from slam_backend.core.state_codec import SEEDS, ForeignObjectError, Kinds, decoded, encoded, read_file
+from slam_backend.fastslam.filter import FastSlam
 from slam_backend.state_kinds import BACKEND_KINDS
-from slam_backend.team import TeamSlam
+from slam_backend.team.team import TeamSlam
 
 
 class Colour(Enum):

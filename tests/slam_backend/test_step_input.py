@@ -12,14 +12,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from same_bits import assert_same
 
-from slam_backend._kernels import IDLE, MOVED, PLACED, STOOD
-from slam_backend._step_input import check_step
-from slam_backend.camera import ROBOT_FROM_CAMERA, StereoCamera
-from slam_backend.filter import FastSlam
-from slam_backend.findings import Findings
-from slam_backend.input_log import StepInput, seats_of
-from slam_backend.measurements import Measurements, TeamMeasurements
-from slam_backend.reports import StepReport
+from slam_backend.fastslam._kernels import IDLE, MOVED, PLACED, STOOD
+from slam_backend.fastslam.filter import FastSlam
+from slam_backend.fastslam.reports import Findings, StepReport
+from slam_backend.fastslam.step_input import StepInput, check_step, seats_of
+from slam_backend.models.camera import ROBOT_FROM_CAMERA, StereoCamera
+from slam_backend.models.measurements import Measurements, TeamMeasurements
 
 SIZE = 3  # of descriptors
 Reading = tuple[Any, Any, Any, Any]  # odometry, frame, names, pose

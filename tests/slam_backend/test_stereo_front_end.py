@@ -7,8 +7,7 @@ import pytest
 from box_pairs import draw_boxes
 from scipy.ndimage import map_coordinates
 
-from slam_backend.camera import StereoCamera
-from slam_backend.compilation import watch_compilation
+from slam_backend.core.compilation import watch_compilation
 from slam_backend.frontend import (
     KINDS,
     CornerOptions,
@@ -18,6 +17,7 @@ from slam_backend.frontend import (
     usurf_descriptors,
 )
 from slam_backend.frontend._matching_kernels import match_rows, refine
+from slam_backend.models.camera import StereoCamera
 
 CAMERA = StereoCamera(focal_px=300.0, baseline=0.1, width=320, height=240, max_range=8.0)
 DISPARITY = 17.3

@@ -9,18 +9,18 @@ from merged_pair import NEVER
 from same_bits import assert_same
 from simulated_team import SimulatedTeam
 
-from slam_backend import trying
-from slam_backend.alignment import AlignmentOptions, align_maps
-from slam_backend.attempts import AttemptOptions
-from slam_backend.branches import restored_filter
-from slam_backend.exchange import LANDMARK_BYTES
-from slam_backend.filter import FastSlam
+from slam_backend.fastslam.filter import FastSlam
 from slam_backend.geometry import between
-from slam_backend.groups import Group
-from slam_backend.landmark_map import LandmarkMap
-from slam_backend.merge_options import MergeOptions
-from slam_backend.merging import merge_filters, motion_covariance, paired
-from slam_backend.team import TeamSlam
+from slam_backend.maps.alignment import AlignmentOptions, align_maps
+from slam_backend.maps.landmark_map import LandmarkMap
+from slam_backend.team import merge_attempt as trying
+from slam_backend.team.branches import restored_filter
+from slam_backend.team.communication import LANDMARK_BYTES
+from slam_backend.team.filter_merging.merging import merge_filters, motion_covariance, paired
+from slam_backend.team.groups import Group
+from slam_backend.team.merge_scheduler import AttemptOptions
+from slam_backend.team.options import MergeOptions
+from slam_backend.team.team import TeamSlam
 
 STEPS = 80
 AT_LAST = AttemptOptions(every=STEPS)  # the only attempt comes with the last step

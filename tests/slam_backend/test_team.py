@@ -8,13 +8,13 @@ from same_bits import assert_same
 from simulated_team import ASSUMED_CAMERA, MOTION, SimulatedTeam
 from standing_team import SIGMA, STARTS, hand_made, standing_team
 
-from slam_backend.alignment import align_maps
-from slam_backend.attempts import AttemptOptions
-from slam_backend.filter import FastSlam
-from slam_backend.filter_options import FilterOptions
+from slam_backend.fastslam.filter import FastSlam
+from slam_backend.fastslam.options import FilterOptions
+from slam_backend.fastslam.reports import PoseEstimate
 from slam_backend.geometry import between, compose, inverse, transform_points, wrap_angle
-from slam_backend.reports import PoseEstimate
-from slam_backend.team import TeamSlam
+from slam_backend.maps.alignment import align_maps
+from slam_backend.team.merge_scheduler import AttemptOptions
+from slam_backend.team.team import TeamSlam
 
 ALONE = np.eye(3, dtype=bool)
 

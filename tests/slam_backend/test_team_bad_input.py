@@ -9,10 +9,10 @@ from same_bits import assert_same
 from simulated_team import SimulatedTeam
 from standing_team import hand_made, standing_team
 
-from slam_backend.alignment import Alignment
-from slam_backend.measurements import Measurements, TeamMeasurements
-from slam_backend.merge_options import MergeOptions
-from slam_backend.team import TeamSlam
+from slam_backend.maps.alignment import Alignment
+from slam_backend.models.measurements import Measurements, TeamMeasurements
+from slam_backend.team.options import MergeOptions
+from slam_backend.team.team import TeamSlam
 
 GOOD = Measurements(np.array([[0.1, 0.2, 2.0]]), np.eye(1, 13))
 STILL = [None] * 3

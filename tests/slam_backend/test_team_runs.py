@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from simulated_team import SimulatedTeam
 
-from slam_backend.alignment_types import REASONS
+from slam_backend.fastslam.reports import TeamReport
 from slam_backend.geometry import wrap_angle
-from slam_backend.reports import TeamReport
-from slam_backend.team import TeamSlam
+from slam_backend.maps.alignment_types import REASONS
+from slam_backend.team.team import TeamSlam
 
 STEPS = 160
 

@@ -7,9 +7,9 @@ import pytest
 from same_bits import assert_same
 from simulated_team import SimulatedTeam
 
-from slam_backend.alignment import AlignmentOptions
-from slam_backend.attempts import AttemptOptions
-from slam_backend.team import TeamSlam
+from slam_backend.maps.alignment import AlignmentOptions
+from slam_backend.team.merge_scheduler import AttemptOptions
+from slam_backend.team.team import TeamSlam
 
 
 @pytest.mark.parametrize("steps_before", [40, 70])

@@ -9,13 +9,13 @@ from merged_pair import NEVER
 from same_bits import assert_same
 from simulated_team import SimulatedTeam
 
-from slam_backend import group_changes
-from slam_backend.alignment import AlignmentOptions, align_maps
-from slam_backend.attempts import AttemptOptions
-from slam_backend.group_changes import MergePlan
-from slam_backend.merge_options import MergeOptions
-from slam_backend.smoothing.graph import mean_pose
-from slam_backend.team import TeamSlam
+from slam_backend.maps.alignment import AlignmentOptions, align_maps
+from slam_backend.smoother.graph import mean_pose
+from slam_backend.team import group_merging as group_changes
+from slam_backend.team.group_merging import MergePlan
+from slam_backend.team.merge_scheduler import AttemptOptions
+from slam_backend.team.options import MergeOptions
+from slam_backend.team.team import TeamSlam
 
 STEPS = 60
 NEVER_SURE = 1e4  # deviations: 0.05 mm

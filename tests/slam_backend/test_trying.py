@@ -9,11 +9,11 @@ from merged_pair import links
 from same_bits import assert_same
 from simulated_team import SimulatedTeam
 
-from slam_backend.alignment import align_maps
-from slam_backend.attempts import AttemptOptions
-from slam_backend.smoothing.options import SmoothingOptions
-from slam_backend.team import TeamSlam
-from slam_backend.trying import MOST_STEPS
+from slam_backend.maps.alignment import align_maps
+from slam_backend.smoother.options import SmoothingOptions
+from slam_backend.team.merge_attempt import MOST_STEPS
+from slam_backend.team.merge_scheduler import AttemptOptions
+from slam_backend.team.team import TeamSlam
 
 STEPS = 80
 AT_LAST = AttemptOptions(every=STEPS)  # the first attempt comes with the last step

@@ -11,17 +11,17 @@ from merged_pair import NEVER, false_alignment, links, true_alignment
 from same_bits import assert_same
 from simulated_team import SimulatedTeam
 
-from slam_backend import undoing
-from slam_backend.alignment import AlignmentOptions, align_maps
-from slam_backend.attempts import AttemptOptions
-from slam_backend.branches import MOST_REPLAYED
+from slam_backend.fastslam.reports import MapDropped, MergeUndone, TeamReport
 from slam_backend.geometry import inverse
-from slam_backend.landmark_map import LandmarkMap
-from slam_backend.merge_options import MergeOptions
-from slam_backend.reports import MapDropped, MergeUndone, TeamReport
-from slam_backend.team import TeamSlam
-from slam_backend.undoing import Undoing
-from slam_backend.watching import moved_share
+from slam_backend.maps.alignment import AlignmentOptions, align_maps
+from slam_backend.maps.landmark_map import LandmarkMap
+from slam_backend.team import merge_rollback as undoing
+from slam_backend.team.branches import MOST_REPLAYED
+from slam_backend.team.merge_monitor import moved_share
+from slam_backend.team.merge_rollback import Undoing
+from slam_backend.team.merge_scheduler import AttemptOptions
+from slam_backend.team.options import MergeOptions
+from slam_backend.team.team import TeamSlam
 
 METRE = np.array([1.0, 0.0, 0.0])
 FAR = np.array([3.0, -2.0, 0.5])

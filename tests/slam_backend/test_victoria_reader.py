@@ -5,11 +5,10 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from slam_backend.camera import StereoCamera
 from slam_backend.geometry import compose
-from slam_backend.readers.velocities import integrate_commands
-from slam_backend.readers.victoria import load_victoria
-from slam_backend.readers.victoria_steps import ENCODER, SENSOR, WHEELBASE, TreeNoise, axle_velocities, steps
+from slam_backend.models.camera import StereoCamera
+from slam_backend.readers.conversions import integrate_commands
+from slam_backend.readers.victoria import ENCODER, SENSOR, WHEELBASE, TreeNoise, axle_velocities, load_victoria, steps
 
 SCANS = [[[4.0, 7.0], [np.pi / 2, 0.5], [0.3, 0.4]], [], [[2.0], [3.0], [0.2]]]  # ranges, bearings, diameters
 

@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from slam_backend.camera import StereoCamera
 from slam_backend.frontend.odometry import camera_motion, match_frames
-from slam_backend.measurements import Measurements
-from slam_backend.rigid import fit_rigid
+from slam_backend.geometry3d import fit_rigid
+from slam_backend.models.camera import StereoCamera
+from slam_backend.models.measurements import Measurements
 
 CAMERA = StereoCamera(focal_px=300.0, baseline=0.2, sigma_px=0.3, sigma_disparity_px=0.2)
 

@@ -9,9 +9,9 @@ import numba
 import pytest
 from python_entry import python_entry
 
-from slam_backend import _jit
-from slam_backend.compilation import MESSAGE, watch_compilation
-from slam_backend.warming import warm_up
+from slam_backend.core import jit as _jit
+from slam_backend.core.compilation import MESSAGE, watch_compilation
+from slam_backend.warm_up import warm_up
 
 # What a process asks of the backend after it has warmed up; each line of output is a kernel compiled or loaded late.
 VARIED_USE = """
@@ -139,13 +139,13 @@ def test_an_edit_of_a_kernel_is_noticed_by_kernels_of_its_folder_that_call_it(na
     folder = tmp_path / name
     folder.mkdir()
     (folder / "caller.py").write_text(
-        f"from slam_backend._jit import jit\n\nfrom {name}.callee import answer\n\n\n"
+        f"from slam_backend.core.jit import jit\n\nfrom {name}.callee import answer\n\n\n"
         "@jit\ndef ask(x):\n    return answer(x)\n"
     )
     answers = []
     for number in (1.0, 2.0):
         (folder / "callee.py").write_text(
-            f"from slam_backend._jit import inlined\n\n\n@inlined\ndef answer(x):\n    return x + {number}\n"
+            f"from slam_backend.core.jit import inlined\n\n\n@inlined\ndef answer(x):\n    return x + {number}\n"
         )
         code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); from {name}.caller import ask; print(ask(0.0))"
         answers.append(float(subprocess.run([sys.executable, "-c", code], capture_output=True, check=True).stdout))

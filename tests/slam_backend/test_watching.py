@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from mapped_once import looks
 
-from slam_backend.alignment import Alignment, AlignmentOptions
-from slam_backend.landmark_map import LandmarkMap
-from slam_backend.merge_options import MergeOptions
-from slam_backend.watching import Watch
+from slam_backend.maps.alignment import Alignment, AlignmentOptions
+from slam_backend.maps.landmark_map import LandmarkMap
+from slam_backend.team.merge_monitor import Watch
+from slam_backend.team.options import MergeOptions
 
 TWICE = 12  # landmarks that the joint map holds a second time, a metre away
 

@@ -11,14 +11,14 @@ import pytest
 
 import slam_backend
 from slam_backend import FastSlam, FilterOptions, LandmarkMap, TeamSlam, Trajectory, fuse_maps
-from slam_backend.errors import is_built_in, known_names
+from slam_backend.core.validation import is_built_in, known_names
 from slam_backend.frontend import CornerOptions, FrontEndOptions
-from slam_backend.fusion import fuse_landmarks
-from slam_backend.plain.filter import PlainFastSlam
+from slam_backend.maps.fusion import fuse_landmarks
 from slam_backend.readers.kitti import load_kitti
 from slam_backend.readers.kitti_images import load_kitti_images
 from slam_backend.readers.mrclam import load_mrclam
 from slam_backend.readers.victoria import load_victoria
+from slam_backend.reference.filter import PlainFastSlam
 
 OFFERED = [getattr(slam_backend, name) for name in slam_backend.__all__]
 # All classes that can be made without arguments are options, models or filters.

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend.errors import FloatArray
+from slam_backend.core.validation import FloatArray
 from training.bench.accuracy.batch_problem import BatchProblem, Estimate
 
 

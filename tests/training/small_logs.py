@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 from scipy.io import savemat
 
-from slam_backend.camera import ROBOT_FROM_CAMERA
 from slam_backend.geometry import compose, inverse, transform_points
+from slam_backend.models.camera import ROBOT_FROM_CAMERA
+from slam_backend.readers.conversions import integrate_commands
 from slam_backend.readers.kitti import ABSENT
-from slam_backend.readers.velocities import integrate_commands
-from slam_backend.readers.victoria_steps import SENSOR, axle_velocities
+from slam_backend.readers.victoria import SENSOR, axle_velocities
 
 ANGLES, RADII = np.random.default_rng(11).uniform([[0.0], [2.8]], [[2.0 * np.pi], [4.2]], (2, 14))
 LANDMARKS = np.column_stack([RADII * np.cos(ANGLES), RADII * np.sin(ANGLES)])  # a ring around both robots

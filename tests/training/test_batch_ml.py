@@ -7,9 +7,9 @@ import pytest
 from gtsam_problem import solve_with_gtsam
 from scipy import stats
 
-from slam_backend.errors import FloatArray
+from slam_backend.core.validation import FloatArray
 from slam_backend.geometry import between, inverse, transform_points, wrap_angle
-from slam_backend.measurements import Measurements
+from slam_backend.models.measurements import Measurements
 from training.bench.accuracy.batch_ml import BatchEstimate, batch_ml
 from training.bench.accuracy.batch_problem import BatchProblem, Estimate
 from training.bench.accuracy.online_bound import ideal_online

@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from slam_backend.alignment import AlignmentOptions, align_maps, candidate_matches
 from slam_backend.geometry import transform_points
+from slam_backend.maps.alignment import AlignmentOptions, align_maps, candidate_matches
 from training.bench.alignment.bench import COMMAND, GRID, AlignmentBenchConfig
 from training.bench.alignment.map_pairs import (
     IDENTIFIABLE,

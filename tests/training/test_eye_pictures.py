@@ -3,7 +3,7 @@ from pathlib import Path
 import numpy as np
 from typer.testing import CliRunner
 
-from slam_backend.camera import StereoCamera
+from slam_backend.models.camera import StereoCamera
 from training.cli import app
 from training.episodes.camera_overlay import beside_the_map, draw_eye
 from vslam_env.sensors import EyeFrame, StereoSensor, StereoSensorConfig

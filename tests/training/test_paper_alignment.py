@@ -10,16 +10,7 @@ import pytest
 
 from slam_backend.geometry import transform_points
 from training.bench.accuracy.runs import FALSE_POINT
-from training.paper.fig2 import (
-    ENOUGH_SHARED,
-    METHODS,
-    OURS,
-    Fig2Config,
-    check_claims,
-    play,
-    refusals,
-    summarise,
-)
+from training.paper.fig2 import ENOUGH_SHARED, METHODS, OURS, Fig2Config, check_claims, play, refusals, summarise
 from training.paper.fig3 import AlignedPair, PairConfig, align_pair, fuse_pair
 from training.paper.map_pairs import map_alone, simulate_pair, true_motion
 

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from small_logs import write_drive, write_log, write_park
 
-from slam_backend import _rejuvenation_step
+from slam_backend.fastslam import rejuvenation as _rejuvenation_step
 from training.episodes.config import RunConfig
 from training.replay.kitti import KittiConfig
 from training.replay.mrclam import ReplayConfig

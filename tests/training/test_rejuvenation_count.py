@@ -1,6 +1,6 @@
 """How replays count what came of drawing particles anew, and how they tell it."""
 
-from slam_backend.reports import RejuvenationReport
+from slam_backend.fastslam.reports import RejuvenationReport
 from training.replay.rejuvenation_counts import RejuvenationCount, sentence_of
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from slam_backend.landmark_map import LandmarkMap
+from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.readers.kitti_images import holds_images, load_kitti_images
 from slam_backend.readers.stereo_files import StereoFiles, load_stereo_images
 from slam_backend.trajectory import Trajectory

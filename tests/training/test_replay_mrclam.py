@@ -8,11 +8,10 @@ import pytest
 from small_logs import LANDMARKS, write_log
 
 from slam_backend.geometry import compose, inverse, transform_points
-from slam_backend.landmark_map import LandmarkMap
+from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.metrics import align_se2
-from slam_backend.motion import OdometryModel
-from slam_backend.readers.mrclam import load_mrclam
-from slam_backend.readers.mrclam_steps import Drive, SightingNoise
+from slam_backend.models.odometry import OdometryModel
+from slam_backend.readers.mrclam import Drive, SightingNoise, load_mrclam
 from slam_backend.trajectory import Trajectory
 from training.replay.metrics import align_to_truth, score_path, summarise
 from training.replay.mrclam import MOTION, ReplayConfig, replay

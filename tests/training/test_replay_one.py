@@ -7,11 +7,10 @@ import pytest
 from small_logs import EAST, TREES, write_drive, write_park
 
 from slam_backend.geometry import compose, transform_points
-from slam_backend.landmark_map import LandmarkMap
+from slam_backend.maps.landmark_map import LandmarkMap
+from slam_backend.readers.conversions import integrate_commands
 from slam_backend.readers.kitti import load_kitti
-from slam_backend.readers.velocities import integrate_commands
-from slam_backend.readers.victoria import load_victoria
-from slam_backend.readers.victoria_steps import axle_velocities, steps
+from slam_backend.readers.victoria import axle_velocities, load_victoria, steps
 from slam_backend.trajectory import Trajectory
 from training.commands.replay_one import drift_told
 from training.replay.kitti import KittiConfig, find_loop, mean_drift

@@ -8,8 +8,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
-from slam_backend.camera import ROBOT_FROM_CAMERA, StereoCamera
-from slam_backend.landmark_map import LandmarkMap
+from slam_backend.maps.landmark_map import LandmarkMap
+from slam_backend.models.camera import ROBOT_FROM_CAMERA, StereoCamera
 from training.bench.stereo.scenes import WALL, Scene, wall_pose
 from training.cli import app
 from training.replay.stereo_pairs import PairsConfig, align_pairs, load_pairs

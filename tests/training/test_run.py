@@ -10,7 +10,7 @@ import pytest
 from rich.console import Console
 
 from slam_backend.geometry import between, compose
-from slam_backend.landmark_map import LandmarkMap
+from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.trajectory import Trajectory
 from training.episodes.config import EPISODE_S, RunConfig
 from training.episodes.figures import draw_errors, draw_maps

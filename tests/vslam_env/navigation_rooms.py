@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from slam_backend.errors import FloatArray
+from slam_backend.core.validation import FloatArray
 from slam_backend.geometry import between, compose
 
 ANGLES = np.deg2rad(np.linspace(-26.5, 26.5, 32))

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from slam_backend.errors import FloatArray
-from slam_backend.landmark_map import TeamOutlines
-from slam_backend.standpoints import Standpoints
+from slam_backend.core.validation import FloatArray
+from slam_backend.fastslam.relative_poses import Standpoints
+from slam_backend.maps.landmark_map import TeamOutlines
 from vslam_env.errors_of_maps import ClaimLedger
 from vslam_env.standing import NUM_FIGURES, Standing
 

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend.errors import FloatArray
+from slam_backend.core.validation import FloatArray
 from vslam_env import ExplorationEnv, World, vslam_v0
 
 WALLS = np.array(

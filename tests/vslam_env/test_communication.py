@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from small_env import MEETING, WALLS, small_env, turning, wander
 
-from slam_backend.alignment import Alignment
+from slam_backend.fastslam.reports import MergeEvent
 from slam_backend.geometry import between
-from slam_backend.reports import MergeEvent
+from slam_backend.maps.alignment import Alignment
 from vslam_env import ExplorationEnv
 from vslam_env.belief import TeamBelief
 from vslam_env.communication import contacts, crosses_wall

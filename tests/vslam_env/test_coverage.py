@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from slam_backend.errors import FloatArray
+from slam_backend.core.validation import FloatArray
 from tests.vslam_env.small_env import small_env
 from vslam_env.coverage import SEERS, Coverage, CoverageMeter
 from vslam_env.navigation import TeamGrids

@@ -12,7 +12,7 @@ from damage import damaged, replaced
 from digests import digest
 from small_env import MEETING, small_env, wander
 
-from slam_backend.state_codec import ForeignObjectError, decoded, encoded
+from slam_backend.core.state_codec import ForeignObjectError, decoded, encoded
 from vslam_env import ExplorationEnv, load_state, save_state
 from vslam_env.snapshots import state_version
 from vslam_env.state_kinds import ENV_KINDS

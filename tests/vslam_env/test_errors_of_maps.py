@@ -5,12 +5,11 @@ import numpy as np
 from scored import scored, standing_at
 from small_env import MEETING, small_env, turning
 
-from slam_backend.errors import IntArray
-from slam_backend.findings import Findings
+from slam_backend.core.validation import IntArray
+from slam_backend.fastslam.reports import Findings, LandmarksCreated, MapCopied, MapDropped, Renaming, TeamReport
 from slam_backend.geometry import compose, inverse, transform_points, wrap_angle
-from slam_backend.landmark_map import LandmarkMap, TeamOutlines
+from slam_backend.maps.landmark_map import LandmarkMap, TeamOutlines
 from slam_backend.metrics import gospa, map_error, map_rmse
-from slam_backend.reports import LandmarksCreated, MapCopied, MapDropped, Renaming, TeamReport
 from vslam_env.coverage import Coverage, CoverageMeter
 from vslam_env.errors_of_maps import ClaimLedger
 from vslam_env.navigation import FREE, SeenGrid, TeamGrids, cell_of

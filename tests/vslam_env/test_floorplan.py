@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from slam_backend.camera import StereoCamera
+from slam_backend.models.camera import StereoCamera
 from vslam_env.world import (
     FreeSpace,
     World,

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from slam_backend.camera import StereoCamera
+from slam_backend.models.camera import StereoCamera
 from vslam_env.sensors import LandmarkSensor, LandmarkSensorConfig
 from vslam_env.world import FreeSpace, Landmarks, World, make_world, place_landmarks
 from vslam_env.world.clearance import distances_to_walls

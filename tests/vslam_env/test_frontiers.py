@@ -3,7 +3,7 @@ import pytest
 from navigation_rooms import ANGLES, building, clearance, drive, in_start_frame, scan
 from python_entry import python_entry
 
-from slam_backend.errors import FloatArray
+from slam_backend.core.validation import FloatArray
 from slam_backend.geometry import inverse, transform_points
 from vslam_env.navigation import (
     CELL,

@@ -10,7 +10,7 @@ from numba.core.dispatcher import Dispatcher
 
 import slam_backend
 import vslam_env
-from slam_backend.warming import warm_up
+from slam_backend.warm_up import warm_up
 from vslam_env.vslam_v0 import parallel_env
 
 # Steps of a filter, a team and an environment; then how many arrays numba has made for them and how many it has freed.

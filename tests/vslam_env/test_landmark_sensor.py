@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from python_entry import python_entry
 
 from slam_backend import FastSlam
-from slam_backend._kernels import MIN_DEPTH
-from slam_backend.camera import StereoCamera
+from slam_backend.fastslam._kernels import MIN_DEPTH
 from slam_backend.geometry import compose
+from slam_backend.models.camera import StereoCamera
 from vslam_env.sensors import LandmarkSensor, LandmarkSensorConfig
 from vslam_env.sensors._landmark_kernels import NEAREST, make_up, measure, mix_in
 from vslam_env.world import FreeSpace, Landmarks, World, make_world, place_landmarks

@@ -8,10 +8,9 @@ from scored import scored, standing_at
 from small_env import MEETING, small_env, turning, wander
 
 from agents import make_policy
-from slam_backend.alignment import Alignment
-from slam_backend.findings import Findings
-from slam_backend.landmark_map import LandmarkMap, TeamOutlines
-from slam_backend.reports import LandmarksCreated, TeamReport
+from slam_backend.fastslam.reports import Findings, LandmarksCreated, TeamReport
+from slam_backend.maps.alignment import Alignment
+from slam_backend.maps.landmark_map import LandmarkMap, TeamOutlines
 from vslam_env import ExplorationEnv, vslam_v0
 from vslam_env.config import TICK
 from vslam_env.errors_of_maps import ClaimLedger

@@ -5,10 +5,9 @@ import pytest
 from navigation_rooms import ANGLES, MAX_RANGE, building, cast
 from small_env import MEETING, small_env, turning
 
-from slam_backend.findings import Findings
+from slam_backend.fastslam.relative_poses import Standpoints
+from slam_backend.fastslam.reports import Findings, MergeUndone, Renaming, TeamReport
 from slam_backend.geometry import between, compose, inverse
-from slam_backend.reports import MergeUndone, Renaming, TeamReport
-from slam_backend.standpoints import Standpoints
 from vslam_env.navigation import OCCUPIED, UNKNOWN
 from vslam_env.robot_belief import Body
 from vslam_env.shared_grids import LONGEST_ABSENCE, SharedGrids

@@ -14,7 +14,7 @@ import pytest
 from digests import digest
 from small_env import MEETING, small_env, wander
 
-from slam_backend.state_codec import encoded
+from slam_backend.core.state_codec import encoded
 from vslam_env import ExplorationEnv, load_state, save_state, vslam_v0
 from vslam_env.snapshots import STATE_FORMAT, check_state, state_version
 from vslam_env.state_kinds import ENV_KINDS

@@ -7,7 +7,7 @@ import pytest
 from digests import digest
 from small_env import MEETING, small_env, turning
 
-from slam_backend.camera import StereoCamera
+from slam_backend.models.camera import StereoCamera
 from vslam_env import EnvConfig, ExplorationEnv
 from vslam_env.presets import preset_config, stereo_belief
 from vslam_env.sensors import EyeFrame, StereoSensor

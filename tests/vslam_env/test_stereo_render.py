@@ -5,8 +5,8 @@ import cv2
 import numpy as np
 import pytest
 
-from slam_backend.camera import StereoCamera
 from slam_backend.frontend import StereoFrontEnd
+from slam_backend.models.camera import StereoCamera
 from vslam_env.sensors.stereo_camera import ImagingConfig, StereoEye
 from vslam_env.sensors.stereo_textures import STYLES, TextureConfig, draw_textures
 

@@ -3,10 +3,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from slam_backend.camera import StereoCamera
 from slam_backend.frontend import FrontEndOptions
 from slam_backend.geometry import transform_points
 from slam_backend.metrics import gospa, map_error
+from slam_backend.models.camera import StereoCamera
 from vslam_env.sensors.stereo_sensor import EyeFrame, StereoSensor, StereoSensorConfig
 from vslam_env.world import FreeSpace, World
 

@@ -28,7 +28,7 @@ def write_json(json: Path, text: str) -> None:
     Raises:
         ValueError: If it cannot be written.
     """
-    from slam_backend.files import refusing, write_file
+    from slam_backend.core.files import refusing, write_file
 
     if json != STDOUT:
         write_file(json, text, "json")

@@ -60,7 +60,7 @@ def numbers(name: str, text: str | None, kind: type[int] | type[float] = int) ->
     Raises:
         ValueError: If one is no number; the message names the option.
     """
-    from slam_backend.errors import bad_argument
+    from slam_backend.core.validation import bad_argument
 
     if text is None:
         return None

@@ -59,7 +59,7 @@ def gather(
     log: tuple[Path, str] | None = None,
 ) -> dict[str, Any]:
     """Return the plain values of which `choose` makes a configuration; arguments and errors as there."""
-    from slam_backend.files import check_writable
+    from slam_backend.core.files import check_writable
     from training.experiments.run_folder import read_config
     from training.replay.paths import find_log
 

@@ -45,7 +45,7 @@ def bench_accuracy(
     Options in the singular take several values with commas between; all combinations are tried. Ctrl-C finishes the
     trial under way and sums up what there is; the same command with --out FOLDER goes on from there.
     """
-    from slam_backend.errors import check_int
+    from slam_backend.core.validation import check_int
     from training.bench.accuracy.bench import COMMAND, TRIALS_FILE, AccuracyConfig
     from training.bench.accuracy.figures import draw_accuracy
     from training.bench.accuracy.summary import summarise

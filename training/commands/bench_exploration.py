@@ -67,7 +67,7 @@ def bench_exploration(
     """
     from functools import partial
 
-    from slam_backend.errors import check_int
+    from slam_backend.core.validation import check_int
     from training.bench.exploration.bench import COMMAND, TRIALS_FILE, ExplorationBenchConfig, ExplorationTrial
     from training.bench.exploration.figures import draw_exploration
     from training.bench.exploration.summary import compare_oracles, compare_policies, curves, summarise

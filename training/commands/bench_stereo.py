@@ -69,7 +69,7 @@ def bench_stereo(
 
 def _parts(data: Path, descriptors: Sequence[str], real: Path | None) -> "list[RealPart]":
     """Return what is to be measured of real images, and refuse a folder that was named and holds none."""
-    from slam_backend.errors import bad_argument
+    from slam_backend.core.validation import bad_argument
     from training.bench.stereo.real_images import EXPECTED, find_parts
 
     if not data.is_dir():

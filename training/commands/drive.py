@@ -22,7 +22,7 @@ def drive_by_hand(
     from contextlib import ExitStack
 
     from agents import make_policy
-    from slam_backend.errors import bad_argument
+    from slam_backend.core.validation import bad_argument
     from training.episodes.teleoperation import KEYS, drive
     from training.episodes.video import VideoWriter
     from training.experiments.interrupt import interrupt_flag

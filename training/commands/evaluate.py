@@ -46,7 +46,7 @@ def evaluate(
     """
     from functools import partial
 
-    from slam_backend.errors import bad_argument, check_int
+    from slam_backend.core.validation import bad_argument, check_int
     from training.experiments.run_folder import plain
     from training.rl.evaluation import COMMAND, EvaluateConfig, EvaluateTrial, play
     from training.rl.evaluation_summary import leads, print_evaluation, summarise

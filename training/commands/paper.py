@@ -4,18 +4,7 @@ from typing import Annotated
 
 import typer
 
-from training.commands._options import (
-    Check,
-    Config,
-    FirstSeed,
-    Json,
-    Out,
-    OutToGoOn,
-    Processes,
-    Seed,
-    numbers,
-    words,
-)
+from training.commands._options import Check, Config, FirstSeed, Json, Out, OutToGoOn, Processes, Seed, numbers, words
 from training.commands._progress import KeptPart, play_kept
 from training.commands._run_folder import begin, choose, finish
 
@@ -50,7 +39,7 @@ def fig6(
     claims are asked of the data. Ctrl-C finishes the trial under way and sums up what there is; the same command with
     --out FOLDER goes on from there.
     """
-    from slam_backend.errors import check_int
+    from slam_backend.core.validation import check_int
     from training.experiments.run_folder import plain
     from training.paper.fig6.claims import check_claims, robots_ratios
     from training.paper.fig6.config import COMMAND, ERRORS_FILE, QUICK, TIMES_FILE, Fig6Config, cost

@@ -17,7 +17,7 @@ from training.experiments.tables import console_table, number
 from training.replay.rejuvenation_counts import sentence_of
 
 if TYPE_CHECKING:  # what computes is imported when the command runs, so that --help answers at once
-    from slam_backend.errors import FloatArray
+    from slam_backend.core.validation import FloatArray
     from slam_backend.trajectory import Trajectory
     from training.experiments.run_folder import RunFolder
     from training.replay.single_robot import OneReplay, PositionScore

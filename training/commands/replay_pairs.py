@@ -65,7 +65,7 @@ def replay_stereo(
 
     File names are looked up in the folder, unless they are whole paths.
     """
-    from slam_backend.errors import bad_argument
+    from slam_backend.core.validation import bad_argument
     from slam_backend.readers.stereo_files import StereoFiles, find_pairs
     from training.commands.replay_images import replay_folder_of_images
 

@@ -50,7 +50,7 @@ def train(
     at once. --resume FOLDER then goes on from the last checkpoint and ends with
     the same weights as a training that never stopped, even if it was killed.
     """
-    from slam_backend.errors import bad_argument, check_int
+    from slam_backend.core.validation import bad_argument, check_int
     from training.experiments.run_folder import RunFolder, installed_versions, read_config
     from training.rl.config import SPLIT_TRAIN, TrainConfig
     from training.rl.require_extra import need_learner

@@ -22,7 +22,7 @@ def list_worlds(
     """Name the families of worlds with their usual size."""
     from rich.table import Table
 
-    from slam_backend.errors import check_int
+    from slam_backend.core.validation import check_int
     from training.episodes.world_survey import survey
     from vslam_env.world import SPLITS, WORLD_FAMILIES
 
@@ -57,8 +57,8 @@ def preview(
     """Draw worlds of some seeds, with landmarks and start poses, into one picture."""
     import imageio.v3 as imageio
 
-    from slam_backend.errors import bad_argument
-    from slam_backend.files import check_writable, write_file
+    from slam_backend.core.files import check_writable, write_file
+    from slam_backend.core.validation import bad_argument
     from training.episodes.world_survey import contact_sheet
     from training.experiments.compilation import compilation_shown
 
@@ -81,7 +81,7 @@ def validate(
     """Build worlds of some seeds and start robots in them; a world in which that fails ends with exit status 2."""
     from rich.table import Table
 
-    from slam_backend.errors import check_int
+    from slam_backend.core.validation import check_int
     from training.episodes.world_survey import survey_all
 
     check_int("seeds", seeds, 1, "Check one world or more.")
@@ -110,7 +110,7 @@ def import_world(
     tolerance_px: Annotated[float, typer.Option(help="Outlines are straightened by less than this.")] = 1.0,
 ) -> None:
     """Trace the walls of a map and write them as .json, which can be edited."""
-    from slam_backend.errors import bad_argument
+    from slam_backend.core.validation import bad_argument
     from vslam_env.world import FreeSpace, load_floorplan, load_ros_map, save_walls_json
 
     if plan.suffix.lower() in (".yaml", ".yml"):

@@ -8,7 +8,7 @@ from rich.console import Console
 from training.experiments.tables import console_table
 
 if TYPE_CHECKING:  # what computes is imported when the command runs, so that --help answers at once
-    from slam_backend.refusals import PairAttempts
+    from slam_backend.maps.alignment_types import PairAttempts
 
 MISSED = {
     "translation": "The standard deviation of the translation was beyond its bound.",
@@ -67,7 +67,7 @@ def print_refusals(console: Console, rows: Sequence[Mapping[str, Any]]) -> None:
         console: Where to.
         rows: As `pair_rows` returns them.
     """
-    from slam_backend.alignment_types import HINTS
+    from slam_backend.maps.alignment_types import HINTS
 
     told = [row for row in rows if row["refused"] or not row["attempts"]]
     if not told:

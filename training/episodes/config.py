@@ -7,7 +7,7 @@ from typing import Any
 from agents.policy import Policy
 from agents.registry import is_model, make_policy
 from agents.trained import load_model
-from slam_backend.errors import check_choice, check_int
+from slam_backend.core.validation import check_choice, check_int
 from training.experiments.config import PlainConfig
 from vslam_env import vslam_v0
 from vslam_env.config import ACTION_TYPES, GOAL_DECISION_TICKS, SENSORS, TICK, EnvConfig

@@ -8,7 +8,7 @@ from rich.console import Console
 from training.experiments.tables import console_table, number
 
 if TYPE_CHECKING:  # what computes is imported when the command runs, so that --help answers at once
-    from slam_backend.consistency import Consistency
+    from slam_backend.fastslam.consistency import Consistency
 
 COLUMNS = ("robot", "mean NIS", "NIS beyond 95 %", "few particles", "mostly rejected", "verdict")
 CAUTIOUS = 1.0  # mean NIS below which covariances are at least twice as large as they need be, even in the plane

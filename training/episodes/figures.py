@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import EllipseCollection, LineCollection
 from matplotlib.figure import Figure
 
-from slam_backend.errors import FloatArray
+from slam_backend.core.validation import FloatArray
 from slam_backend.geometry import compose, rotate_covariances, transform_points
 from training.episodes.runner import EpisodeRecord
 from training.experiments.plotting import save_png

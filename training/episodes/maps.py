@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:  # what computes is imported when a command runs, so that --help answers at once
-    from slam_backend.landmark_map import LandmarkMap
+    from slam_backend.maps.landmark_map import LandmarkMap
     from training.experiments.run_folder import RunFolder
 
 UPPER = ("xx", "xy", "xz", "yy", "yz", "zz")

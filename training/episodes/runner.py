@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 
 from agents.policy import Policy
-from slam_backend.consistency import Consistency
-from slam_backend.errors import FloatArray, IntArray, bad_argument
+from slam_backend.core.validation import FloatArray, IntArray, bad_argument
+from slam_backend.fastslam.consistency import Consistency
+from slam_backend.fastslam.reports import MergeEvent
 from slam_backend.geometry import between
-from slam_backend.landmark_map import LandmarkMap
-from slam_backend.refusals import PairAttempts, count_attempts
-from slam_backend.reports import MergeEvent
+from slam_backend.maps.alignment_types import PairAttempts, count_attempts
+from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.trajectory import dead_reckoning
 from vslam_env.config import TICK
 from vslam_env.environment import ExplorationEnv

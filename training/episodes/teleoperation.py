@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.policy import Policy
-from slam_backend.errors import FloatArray
+from slam_backend.core.validation import FloatArray
 from vslam_env.config import TICK
 from vslam_env.environment import ExplorationEnv
 from vslam_env.rendering import draw_frame

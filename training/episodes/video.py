@@ -11,9 +11,9 @@ import imageio_ffmpeg
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend.errors import bad_argument, check_float, check_int
-from slam_backend.files import check_writable, move_file, resolved
-from slam_backend.reports import MergeEvent
+from slam_backend.core.files import check_writable, move_file, resolved
+from slam_backend.core.validation import bad_argument, check_float, check_int
+from slam_backend.fastslam.reports import MergeEvent
 from vslam_env.rendering import MergeFlash, Scene
 from vslam_env.rendering.flash import FLASH_TICKS
 

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend.errors import check_int
+from slam_backend.core.validation import check_int
 from vslam_env import vslam_v0
 from vslam_env.config import EnvConfig
 from vslam_env.rendering import draw_frame

@@ -18,7 +18,7 @@ def compilation_shown(console: Console) -> Iterator[None]:
     Args:
         console: Where to; one on stderr leaves the output of a command alone.
     """
-    from slam_backend.compilation import MESSAGE, watch_compilation
+    from slam_backend.core.compilation import MESSAGE, watch_compilation
 
     with ExitStack() as stack:
         shown: list[str] = []
@@ -43,7 +43,7 @@ def prepare(*first_steps: Callable[[], object]) -> None:
     Args:
         first_steps: Of the command, called in turn; what is wrong with its input shows before the long wait.
     """
-    from slam_backend.warming import warm_up
+    from slam_backend.warm_up import warm_up
 
     with compilation_shown(Console(stderr=True)):
         for step in (*first_steps, warm_up):

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import Field, asdict, fields, is_dataclass
 from typing import Any, ClassVar, Self
 
-from slam_backend.errors import bad_argument
+from slam_backend.core.validation import bad_argument
 
 
 class PlainConfig:

@@ -6,7 +6,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 from PIL import Image
 
-from slam_backend.files import write_file
+from slam_backend.core.files import write_file
 
 COLOURS = 256  # lines, points and edges of letters need no more; a file is then a quarter as large
 

@@ -14,8 +14,8 @@ from typing import Any, Self
 import numpy as np
 import tomli_w
 
-from slam_backend.errors import bad_argument, check_int
-from slam_backend.files import write_file
+from slam_backend.core.files import write_file
+from slam_backend.core.validation import bad_argument, check_int
 from slam_backend.trajectory import Trajectory
 
 PACKAGES = (

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from slam_backend.errors import FloatArray
+from slam_backend.core.validation import FloatArray
 from training.experiments.tables import number
 
 CONFIDENCE = 0.95

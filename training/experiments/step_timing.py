@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend.errors import FloatArray
+from slam_backend.core.validation import FloatArray
 
 
 @dataclass(frozen=True, slots=True)

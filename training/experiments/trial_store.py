@@ -9,8 +9,8 @@ from multiprocessing import active_children, get_context
 from pathlib import Path
 from typing import Any, TypeVar
 
-from slam_backend.errors import bad_argument
-from slam_backend.files import append_text
+from slam_backend.core.files import append_text
+from slam_backend.core.validation import bad_argument
 from training.experiments.interrupt import begin_worker, signals_held
 from training.experiments.run_folder import CONFIG_FILE, RunFolder, installed_versions, plain, read_config
 

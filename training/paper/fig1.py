@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slam_backend.errors import FloatArray, IntArray, check_float, check_int
+from slam_backend.core.validation import FloatArray, IntArray, check_float, check_int
 from training.bench.accuracy.batch_problem import BatchProblem
 from training.bench.accuracy.runs import STEP, StereoRun, simulate_run
 from training.bench.accuracy.world import start_crossings

@@ -12,7 +12,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 
-from slam_backend.errors import FloatArray
+from slam_backend.core.validation import FloatArray
 from training.bench.accuracy.runs import StereoRun
 from training.bench.accuracy.world import Office
 from training.experiments.plotting import save_png

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend.alignment import RIVAL_ANGLE, RIVAL_DISTANCE, align_maps, propose_motion
-from slam_backend.errors import FloatArray, check_float, check_int
+from slam_backend.core.validation import FloatArray, check_float, check_int
 from slam_backend.geometry import wrap_angle
+from slam_backend.maps.alignment import RIVAL_ANGLE, RIVAL_DISTANCE, align_maps, propose_motion
 from training.bench.accuracy.runs import STEP
 from training.experiments.config import PlainConfig
 from training.experiments.tables import csv_text

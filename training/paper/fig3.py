@@ -5,12 +5,12 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend.alignment import Alignment, align_maps, candidate_matches
-from slam_backend.alignment_types import AlignmentOptions
-from slam_backend.errors import FloatArray, IntArray, bad_argument, check_float, check_int
-from slam_backend.fusion import fuse_maps, move_covariances
+from slam_backend.core.validation import FloatArray, IntArray, bad_argument, check_float, check_int
 from slam_backend.geometry import transform_points, wrap_angle
-from slam_backend.landmark_map import LandmarkMap
+from slam_backend.maps.alignment import Alignment, align_maps, candidate_matches
+from slam_backend.maps.alignment_types import AlignmentOptions
+from slam_backend.maps.fusion import fuse_maps, move_covariances
+from slam_backend.maps.landmark_map import LandmarkMap
 from training.bench.accuracy.runs import STEP
 from training.experiments.config import PlainConfig
 from training.experiments.tables import csv_text

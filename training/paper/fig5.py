@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from agents.registry import make_policy
-from slam_backend.errors import BoolArray, FloatArray, bad_argument, check_int
+from slam_backend.core.validation import BoolArray, FloatArray, bad_argument, check_int
 from training.experiments.config import PlainConfig
 from training.experiments.tables import csv_text
 from vslam_env import EnvConfig, vslam_v0

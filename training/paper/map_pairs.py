@@ -5,10 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slam_backend.errors import FloatArray, IntArray
-from slam_backend.filter import FastSlam
+from slam_backend.core.validation import FloatArray, IntArray
+from slam_backend.fastslam.filter import FastSlam
 from slam_backend.geometry import between
-from slam_backend.landmark_map import LandmarkMap
+from slam_backend.maps.landmark_map import LandmarkMap
 from training.bench.accuracy.runs import FALSE_POINT, STEP, RunSpec, StereoRun, simulate_run
 
 ROBOTS = 2

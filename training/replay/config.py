@@ -1,7 +1,7 @@
 """What the configurations of all replays refuse."""
 
-from slam_backend.errors import check_choice, check_float, check_int
-from slam_backend.filter_options import PROPOSALS
+from slam_backend.core.validation import check_choice, check_float, check_int
+from slam_backend.fastslam.options import PROPOSALS
 
 # Steps of a log, as many as ticks in environments. 50 does as well, but for the 51 images of KITTI 06, which then end
 # 1.3 % of the path off in place of 1.0: see docs/real_data.md.

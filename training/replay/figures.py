@@ -9,9 +9,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
-from slam_backend.errors import FloatArray
+from slam_backend.core.validation import FloatArray
 from slam_backend.geometry import compose, inverse, transform_points
-from slam_backend.landmark_map import LandmarkMap
+from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.readers.mrclam import MrclamLog
 from training.experiments.plotting import save_png
 from training.replay.metrics import AlignedMap, PathScore, align_to_truth

@@ -5,8 +5,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from slam_backend.errors import FloatArray, IntArray
-from slam_backend.files import write_file
+from slam_backend.core.files import write_file
+from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.frontend.images import Image
 from slam_backend.geometry import inverse, transform_points
 

@@ -6,12 +6,11 @@ from typing import Any, Literal
 
 import numpy as np
 
-from slam_backend.errors import FloatArray, check_float
-from slam_backend.filter import FastSlam
-from slam_backend.filter_options import FilterOptions
+from slam_backend.core.validation import FloatArray, check_float
+from slam_backend.fastslam.filter import FastSlam
+from slam_backend.fastslam.options import FilterOptions
 from slam_backend.geometry import between, compose
-from slam_backend.readers.kitti import KittiLog
-from slam_backend.readers.kitti_steps import make_camera, motion_noise, steps
+from slam_backend.readers.kitti import KittiLog, make_camera, motion_noise, steps
 from training.experiments.config import PlainConfig
 from training.replay.config import REJUVENATE_EVERY, check_common
 from training.replay.single_robot import (

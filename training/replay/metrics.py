@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend.errors import BoolArray, FloatArray, IntArray
+from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from slam_backend.geometry import between, compose, inverse, transform_points, wrap_angle
-from slam_backend.landmark_map import LandmarkMap
+from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.metrics import MapScore, align_se2, ate, map_error, map_rmse
 from slam_backend.readers.mrclam import MrclamLog
 from slam_backend.trajectory import Trajectory

@@ -10,18 +10,17 @@ from typing import Any, Literal
 
 import numpy as np
 
-from slam_backend.alignment import AlignmentOptions
-from slam_backend.attempts import AttemptOptions
-from slam_backend.consistency import Consistency
-from slam_backend.errors import FloatArray, IntArray, bad_argument, check_choice, check_float
-from slam_backend.landmark_map import LandmarkMap
-from slam_backend.measurements import Measurements
-from slam_backend.motion import OdometryModel
-from slam_backend.readers.mrclam import MrclamLog
-from slam_backend.readers.mrclam_steps import Drive, SightingNoise, steps
-from slam_backend.refusals import PairAttempts
-from slam_backend.reports import MergeEvent, TeamReport
-from slam_backend.team import TeamSlam
+from slam_backend.core.validation import FloatArray, IntArray, bad_argument, check_choice, check_float
+from slam_backend.fastslam.consistency import Consistency
+from slam_backend.fastslam.reports import MergeEvent, TeamReport
+from slam_backend.maps.alignment import AlignmentOptions
+from slam_backend.maps.alignment_types import PairAttempts
+from slam_backend.maps.landmark_map import LandmarkMap
+from slam_backend.models.measurements import Measurements
+from slam_backend.models.odometry import OdometryModel
+from slam_backend.readers.mrclam import Drive, MrclamLog, SightingNoise, steps
+from slam_backend.team.merge_scheduler import AttemptOptions
+from slam_backend.team.team import TeamSlam
 from training.experiments.config import PlainConfig
 from training.replay.config import REJUVENATE_EVERY, check_common
 from training.replay.rejuvenation_counts import RejuvenationCount

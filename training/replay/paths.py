@@ -15,7 +15,7 @@ def find_log(path: str | None, below: Path, what: str) -> str:
     Raises:
         ValueError: If nothing is there, or `path` is None and the variable is not set.
     """
-    from slam_backend.errors import bad_argument
+    from slam_backend.core.validation import bad_argument
 
     data = os.environ.get("VSLAM_DATA")
     if path is None and not data:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # what computes is imported when the command runs, so that --help answers at once
-    from slam_backend.reports import RejuvenationReport
+    from slam_backend.fastslam.reports import RejuvenationReport
 
 NUMBER = re.compile(r"\d+(\.\d+)?")
 

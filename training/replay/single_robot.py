@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend.consistency import Consistency
-from slam_backend.errors import FloatArray
-from slam_backend.filter import FastSlam
+from slam_backend.core.validation import FloatArray
+from slam_backend.fastslam.consistency import Consistency
+from slam_backend.fastslam.filter import FastSlam
+from slam_backend.fastslam.reports import StepReport
 from slam_backend.geometry import compose, inverse, transform_points
-from slam_backend.landmark_map import LandmarkMap
-from slam_backend.measurements import Measurements
+from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.metrics import align_se2
-from slam_backend.reports import StepReport
+from slam_backend.models.measurements import Measurements
 from slam_backend.trajectory import dead_reckoning
 from training.episodes.consistency_table import consistency_rows
 from training.replay.rejuvenation_counts import RejuvenationCount

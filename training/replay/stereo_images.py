@@ -11,18 +11,18 @@ from typing import Any, Literal
 
 import numpy as np
 
-from slam_backend.camera import StereoCamera
-from slam_backend.errors import FloatArray, IntArray, check_choice, check_float
-from slam_backend.existence import ExistenceModel
-from slam_backend.filter import FastSlam
-from slam_backend.filter_options import FilterOptions
+from slam_backend.core.validation import FloatArray, IntArray, check_choice, check_float
+from slam_backend.fastslam.existence import ExistenceModel
+from slam_backend.fastslam.filter import FastSlam
+from slam_backend.fastslam.options import FilterOptions
+from slam_backend.fastslam.reports import StepReport
 from slam_backend.frontend import DESCRIPTORS, KINDS, CornerOptions, FrontEndOptions, StereoFrame, StereoFrontEnd
 from slam_backend.frontend.odometry import camera_motion
-from slam_backend.measurements import Measurements
-from slam_backend.motion import OdometryModel
+from slam_backend.models.camera import StereoCamera
+from slam_backend.models.measurements import Measurements
+from slam_backend.models.odometry import OdometryModel
 from slam_backend.readers.kitti_images import KittiImages, load_kitti_images
 from slam_backend.readers.stereo_files import StereoFiles, load_stereo_images
-from slam_backend.reports import StepReport
 from training.experiments.config import PlainConfig
 from training.replay.config import REJUVENATE_EVERY, check_common
 from training.replay.kitti import mean_drift
@@ -204,7 +204,7 @@ class _Eye:
         self._before, self.features[step] = own, len(points)
         self.seconds += time.perf_counter() - begin
         level = points[::2].copy()
-        level[:, 1] = 0.0  # a plane knows no rows; see `slam_backend.readers.kitti_steps`
+        level[:, 1] = 0.0  # a plane knows no rows; see `slam_backend.readers.kitti`
         return self._motion, Measurements(level, descriptors[::2])
 
     def remember(self, report: StepReport) -> None:

@@ -8,16 +8,16 @@ from typing import Any, Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from slam_backend.camera import ROBOT_FROM_CAMERA, StereoCamera
-from slam_backend.errors import FloatArray, bad_argument, check_choice, check_float, check_int
+from slam_backend.core.validation import FloatArray, bad_argument, check_choice, check_float, check_int
 from slam_backend.frontend import DESCRIPTORS, KINDS, CornerOptions, FrontEndOptions, StereoFrame, StereoFrontEnd
 from slam_backend.frontend.images import Image
 from slam_backend.frontend.odometry import CameraMotion, camera_motion
-from slam_backend.landmark_map import LandmarkMap
+from slam_backend.geometry3d import rotation_angle
+from slam_backend.maps.landmark_map import LandmarkMap
+from slam_backend.models.camera import ROBOT_FROM_CAMERA, StereoCamera
 from slam_backend.readers.calibration import Rectified, Rectifier
 from slam_backend.readers.kitti_images import read_grey
 from slam_backend.readers.stereo_files import StereoFiles, find_pairs, load_rig, truth_file
-from slam_backend.rigid import rotation_angle
 from training.experiments.config import PlainConfig
 
 FILES = StereoFiles()

@@ -6,16 +6,15 @@ from typing import Any, Literal
 
 import numpy as np
 
-from slam_backend.camera import ROBOT_FROM_CAMERA, StereoCamera
-from slam_backend.errors import FloatArray
-from slam_backend.filter import FastSlam
-from slam_backend.filter_options import FilterOptions
+from slam_backend.core.validation import FloatArray
+from slam_backend.fastslam.filter import FastSlam
+from slam_backend.fastslam.options import FilterOptions
 from slam_backend.geometry import compose, transform_points
-from slam_backend.measurements import Measurements
 from slam_backend.metrics import align_se2
-from slam_backend.motion import OdometryModel
-from slam_backend.readers.victoria import VictoriaLog
-from slam_backend.readers.victoria_steps import SENSOR, TreeNoise, steps
+from slam_backend.models.camera import ROBOT_FROM_CAMERA, StereoCamera
+from slam_backend.models.measurements import Measurements
+from slam_backend.models.odometry import OdometryModel
+from slam_backend.readers.victoria import SENSOR, TreeNoise, VictoriaLog, steps
 from slam_backend.trajectory import Trajectory
 from training.experiments.config import PlainConfig
 from training.replay.config import REJUVENATE_EVERY, check_common

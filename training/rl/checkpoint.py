@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from slam_backend.errors import bad_argument
-from slam_backend.files import write_file
-from slam_backend.state_codec import MOST_BYTES, decoded, encoded, read_file
+from slam_backend.core.files import write_file
+from slam_backend.core.state_codec import MOST_BYTES, decoded, encoded, read_file
+from slam_backend.core.validation import bad_argument
 from training.experiments.run_folder import installed_versions
 from vslam_env.state_kinds import ENV_KINDS
 

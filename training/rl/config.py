@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from slam_backend.errors import bad_argument, check_choice, check_float, check_int
+from slam_backend.core.validation import bad_argument, check_choice, check_float, check_int
 from training.experiments.config import PlainConfig
 from vslam_env.config import MAX_ROBOTS, EnvConfig
 from vslam_env.presets import PRESETS, preset_config

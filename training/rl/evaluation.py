@@ -11,7 +11,7 @@ import numpy as np
 from agents.policy import Policy
 from agents.registry import make_policy
 from agents.trained import TrainedGoals, load_model
-from slam_backend.errors import bad_argument, check_choice, check_int
+from slam_backend.core.validation import bad_argument, check_choice, check_int
 from training.episodes.runner import run_episode
 from training.experiments.config import PlainConfig
 from vslam_env import vslam_v0

@@ -7,7 +7,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from slam_backend.errors import FloatArray
+from slam_backend.core.validation import FloatArray
 from training.experiments.plotting import save_png
 
 PANELS = (

@@ -2,7 +2,7 @@
 
 from importlib.util import find_spec
 
-from slam_backend.errors import bad_argument
+from slam_backend.core.validation import bad_argument
 
 NEEDED = ("torch", "stable_baselines3", "sb3_contrib", "tensorboard")
 

@@ -10,7 +10,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
-from slam_backend.errors import BoolArray, Float32Array, FloatArray, bad_argument
+from slam_backend.core.validation import BoolArray, Float32Array, FloatArray, bad_argument
 
 MakeEnv = Callable[[], ParallelEnv[str, Any, Any]]
 Infos = list[dict[str, Any]]

@@ -16,7 +16,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from slam_backend.errors import bad_argument
+from slam_backend.core.validation import bad_argument
 from training.experiments.interrupt import begin_worker, signals_held
 from training.experiments.trial_store import SINGLE_THREAD
 from training.rl.slots import Infos, Layout, MakeEnv, SlotBatch, Stepped, buffers

@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend._jit import device, in_place
-from slam_backend.standpoints import COVARIANCE, ESS, OWN, SIGMAS
+from slam_backend.core.jit import device, in_place
+from slam_backend.fastslam.relative_poses import COVARIANCE, ESS, OWN, SIGMAS
 
 MOST_TEAMMATES = 7
 POSE_LIMIT = np.array([30.0, 30.0, np.pi])

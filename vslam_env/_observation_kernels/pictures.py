@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend._jit import device, in_place, room_of
-from slam_backend.standpoints import OWN, START
+from slam_backend.core.jit import device, in_place, room_of
+from slam_backend.fastslam.relative_poses import OWN, START
 from vslam_env.navigation import CELL, FREE, GRID_SIZE, OCCUPIED, UNKNOWN
 
 SIZE = 48

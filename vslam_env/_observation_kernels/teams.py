@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from slam_backend._jit import in_place
+from slam_backend.core.jit import in_place
 from vslam_env._observation_kernels.numbers import clip_candidates, write_map_stats, write_pose, write_teammates
 from vslam_env._observation_kernels.pictures import paint
 

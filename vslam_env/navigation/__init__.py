@@ -4,16 +4,7 @@ from vslam_env.navigation._arguments import ray_directions
 from vslam_env.navigation.candidate_slots import CandidateSlots, TeamSlots
 from vslam_env.navigation.frontiers import Frontiers, find_frontiers
 from vslam_env.navigation.planning import DistanceMap, distance_map, follow_path, plan_path
-from vslam_env.navigation.seen_grid import (
-    CELL,
-    FREE,
-    GRID_SIZE,
-    OCCUPIED,
-    UNKNOWN,
-    SeenGrid,
-    cell_of,
-    centre_of,
-)
+from vslam_env.navigation.seen_grid import CELL, FREE, GRID_SIZE, OCCUPIED, UNKNOWN, SeenGrid, cell_of, centre_of
 from vslam_env.navigation.team_grids import TeamGrids
 
 __all__ = [

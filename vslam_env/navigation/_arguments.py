@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from slam_backend.errors import FloatArray, bad_argument
+from slam_backend.core.validation import FloatArray, bad_argument
 from vslam_env.navigation._painting_kernels import GRID_SIZE, directions_of, good_angles, good_ranges
 
 

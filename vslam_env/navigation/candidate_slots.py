@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import linear_sum_assignment
 
-from slam_backend._jit import in_place
-from slam_backend.errors import BoolArray, FloatArray
+from slam_backend.core.jit import in_place
+from slam_backend.core.validation import BoolArray, FloatArray
 from vslam_env.navigation._arguments import check_cells, pose_floats, positions_array
 from vslam_env.navigation._painting_kernels import GRID_SIZE, known_bounds
 from vslam_env.navigation._search_kernels import HEADING, LENGTH, NUM_COLUMNS, SAME_GOAL, SIZE, XY, refill, renew

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from slam_backend.errors import BoolArray, FloatArray, check_array
+from slam_backend.core.validation import BoolArray, FloatArray, check_array
 from vslam_env.navigation._arguments import check_cells
 from vslam_env.navigation._painting_kernels import GRID_SIZE, known_bounds
 from vslam_env.navigation._search_kernels import HEADING, LENGTH, SIZE, XY, frontiers_over

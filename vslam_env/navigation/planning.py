@@ -16,8 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from slam_backend._jit import in_place
-from slam_backend.errors import FloatArray, bad_argument, check_float
+from slam_backend.core.jit import in_place
+from slam_backend.core.validation import FloatArray, bad_argument, check_float
 from vslam_env.navigation._arguments import check_cells, point_floats, pose_floats
 from vslam_env.navigation._painting_kernels import CELL, HALF_WIDTH, known_bounds
 from vslam_env.navigation._search_kernels import UNREACHED, nearest_open, parents_of, straight_path, ways_over

@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from slam_backend.errors import FloatArray, IntArray, bad_argument, check_array, check_float
-from slam_backend.read_only import as_read_only
+from slam_backend.core.read_only import as_read_only
+from slam_backend.core.validation import FloatArray, IntArray, bad_argument, check_array, check_float
 from vslam_env.navigation import _painting_kernels as _painting
 from vslam_env.navigation._arguments import check_ranges, pose_floats, ray_directions
 from vslam_env.navigation._painting_kernels import CELL, FREE, GRID_SIZE, HALF_WIDTH, OCCUPIED, UNKNOWN

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from slam_backend.errors import BoolArray, FloatArray, IntArray
+from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from vslam_env.navigation import _painting_kernels as _painting
 from vslam_env.navigation._arguments import check_ranges, pose_floats
 from vslam_env.navigation.seen_grid import GRID_SIZE, UNKNOWN, SeenGrid

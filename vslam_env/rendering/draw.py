@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from slam_backend.errors import FloatArray, bad_argument, check_int
+from slam_backend.core.validation import FloatArray, bad_argument, check_int
 from vslam_env.rendering import palette
 from vslam_env.rendering.canvas import Image, Viewport, disc, dots, ellipse_outlines, fill, lines, path, veils
 from vslam_env.rendering.flash import draw_captions, draw_flashes

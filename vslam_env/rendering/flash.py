@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from slam_backend.errors import FloatArray
+from slam_backend.core.validation import FloatArray
 from vslam_env.rendering import palette
 from vslam_env.rendering.canvas import Image, Viewport, disc, lines, text_width, write
 from vslam_env.rendering.palette import mix

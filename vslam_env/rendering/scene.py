@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from slam_backend.errors import FloatArray
+from slam_backend.core.validation import FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend._jit import device, in_place
-from slam_backend.errors import FloatArray, IntArray
+from slam_backend.core.jit import device, in_place
+from slam_backend.core.validation import FloatArray, IntArray
 
 NEAREST_FALSE_POINT = 0.5  # [m]
 NEAREST = 0.05  # [m] no matcher reports smaller depths, and filters take none

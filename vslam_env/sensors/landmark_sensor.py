@@ -5,9 +5,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from slam_backend.camera import StereoCamera
-from slam_backend.errors import BoolArray, FloatArray, IntArray, bad_argument, check_array, check_float, check_int
-from slam_backend.measurements import Measurements, TeamMeasurements
+from slam_backend.core.validation import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    bad_argument,
+    check_array,
+    check_float,
+    check_int,
+)
+from slam_backend.models.camera import StereoCamera
+from slam_backend.models.measurements import Measurements, TeamMeasurements
 from vslam_env.sensors._landmark_kernels import BEYOND, FARTHEST, make_up, measure, mix_in
 from vslam_env.world.sight_kernels import detect
 from vslam_env.world.spec import Landmarks

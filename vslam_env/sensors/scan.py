@@ -4,8 +4,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from slam_backend.camera import StereoCamera
-from slam_backend.errors import FloatArray, check_array, check_float, check_int
+from slam_backend.core.validation import FloatArray, check_array, check_float, check_int
+from slam_backend.models.camera import StereoCamera
 from vslam_env.world.sight_kernels import cast_scans, rays_at
 
 MOST_RAYS = 100_000  # of a robot; memory ends before

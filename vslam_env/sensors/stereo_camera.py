@@ -6,9 +6,9 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from slam_backend.camera import StereoCamera
-from slam_backend.errors import Float32Array, FloatArray, IntArray, check_float, check_int
+from slam_backend.core.validation import Float32Array, FloatArray, IntArray, check_float, check_int
 from slam_backend.frontend.images import Image
+from slam_backend.models.camera import StereoCamera
 from vslam_env.sensors.stereo_render import expose, render, trace
 from vslam_env.sensors.stereo_textures import WallTextures
 from vslam_env.world.sight_kernels import walls_in_wedge

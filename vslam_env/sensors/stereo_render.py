@@ -8,8 +8,8 @@ sub-columns, each of which meets one wall.
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend._jit import device, fused, jit, lanes
-from slam_backend.errors import Float32Array, FloatArray, IntArray
+from slam_backend.core.jit import device, fused, jit, lanes
+from slam_backend.core.validation import Float32Array, FloatArray, IntArray
 
 NOTHING, ROBOT = -1, -2  # instead of a wall
 NEAREST = 0.02  # [m] nothing nearer than this is seen

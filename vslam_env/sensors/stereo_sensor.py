@@ -6,11 +6,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from slam_backend.camera import StereoCamera
-from slam_backend.errors import BoolArray, FloatArray, IntArray, bad_argument, check_float
+from slam_backend.core.validation import BoolArray, FloatArray, IntArray, bad_argument, check_float
 from slam_backend.frontend import CornerOptions, FrontEndOptions, StereoFrame, StereoFrontEnd
 from slam_backend.frontend.images import LARGEST, SMALLEST, Image
-from slam_backend.measurements import Measurements
+from slam_backend.models.camera import StereoCamera
+from slam_backend.models.measurements import Measurements
 from vslam_env.sensors.stereo_camera import ImagingConfig, StereoEye
 from vslam_env.sensors.stereo_textures import TextureConfig, WallTextures, draw_textures
 from vslam_env.sensors.stereo_truth import TextureCorners

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend.errors import FloatArray, IntArray, bad_argument, check_array, check_choice, check_float
+from slam_backend.core.validation import FloatArray, IntArray, bad_argument, check_array, check_choice, check_float
 from slam_backend.frontend.images import Image
 
 STYLES = ("distinct", "bricks", "posters_alike", "bricks_alike")

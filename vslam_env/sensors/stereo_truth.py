@@ -7,7 +7,7 @@ they are; a filter never learns of them.
 import cv2
 import numpy as np
 
-from slam_backend.errors import FloatArray, IntArray
+from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.frontend import CornerOptions, harris_corners, usurf_descriptors
 from slam_backend.frontend.images import SMALLEST
 from vslam_env.sensors.stereo_camera import Traced

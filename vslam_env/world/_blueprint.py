@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from slam_backend.errors import FloatArray
+from slam_backend.core.validation import FloatArray
 
 DOOR = (1.1, 1.4)  # [m] least and greatest width
 JAMB = 0.35  # [m] wall left between a door and the end of its wall

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from slam_backend._jit import inlined, jit
-from slam_backend.errors import FloatArray
+from slam_backend.core.jit import inlined, jit
+from slam_backend.core.validation import FloatArray
 
 
 @inlined

@@ -8,8 +8,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from slam_backend.errors import FloatArray, bad_argument, check_float
-from slam_backend.files import write_file
+from slam_backend.core.files import write_file
+from slam_backend.core.validation import FloatArray, bad_argument, check_float
 from vslam_env.world.spec import World
 
 BRIGHT_SHARE = 0.85  # light grey 195 over mid grey 128, white over black, 254 over the 205 of "unknown" in ROS maps

@@ -5,9 +5,9 @@ from typing import Any
 import cv2
 import numpy as np
 
-from slam_backend.camera import StereoCamera
-from slam_backend.errors import BoolArray, FloatArray, bad_argument, check_array, check_float, check_int
+from slam_backend.core.validation import BoolArray, FloatArray, bad_argument, check_array, check_float, check_int
 from slam_backend.geometry import wrap_angle
+from slam_backend.models.camera import StereoCamera
 from vslam_env.world.clearance import clearance_raster, distances_to_walls
 from vslam_env.world.sight_kernels import cast_scans, rays_at, seen_from_somewhere
 from vslam_env.world.spec import FARTHEST_PLACE, Landmarks, World

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from slam_backend.errors import FloatArray
+from slam_backend.core.validation import FloatArray
 from vslam_env.world.spec import World
 
 PILLARS = (8, 14)  # least and greatest number

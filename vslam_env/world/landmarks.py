@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend.errors import FloatArray, bad_argument, check_float, check_int
+from slam_backend.core.validation import FloatArray, bad_argument, check_float, check_int
 from vslam_env.world.freespace import FreeSpace
 from vslam_env.world.spec import Landmarks, World
 

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from slam_backend.errors import BoolArray
+from slam_backend.core.validation import BoolArray
 from vslam_env.world._blueprint import Segment
 from vslam_env.world.spec import World
 

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slam_backend._jit import in_place
-from slam_backend.errors import FloatArray, check_float
+from slam_backend.core.jit import in_place
+from slam_backend.core.validation import FloatArray, check_float
 
 LARGEST_SIGMA = 100.0  # per metre; filters take no motion of 10 km in a tick
 

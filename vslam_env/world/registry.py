@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend.errors import bad_argument, is_built_in
+from slam_backend.core.validation import bad_argument, is_built_in
 from vslam_env.world.fig5 import fig5
 from vslam_env.world.floorplan import existing, load_floorplan, load_walls_json
 from vslam_env.world.hall import hall

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import yaml
 
-from slam_backend.errors import bad_argument, check_array, check_choice, check_float
+from slam_backend.core.validation import bad_argument, check_array, check_choice, check_float
 from slam_backend.geometry import transform_points
 from vslam_env.world.floorplan import existing, largest_part, read_image, trace
 from vslam_env.world.spec import World

@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 import pymunk
 
-from slam_backend._jit import in_place
-from slam_backend.errors import FloatArray, check_array, check_float
+from slam_backend.core.jit import in_place
+from slam_backend.core.validation import FloatArray, check_array, check_float
 from vslam_env.world.spec import World
 
 LONGEST_SUBSTEP = 12.5e-3  # [m] no robot moves farther between two looks for contacts

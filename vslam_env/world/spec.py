@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend.errors import FloatArray, IntArray, bad_argument, check_array
-from slam_backend.read_only import as_read_only
+from slam_backend.core.read_only import as_read_only
+from slam_backend.core.validation import FloatArray, IntArray, bad_argument, check_array
 
 SHORTEST_WALL = 1e-3  # [m] anything shorter has no direction worth the name
 LARGEST_EXTENT = 200.0  # [m] grids of free space grow with its square

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from slam_backend.errors import bad_argument, check_choice
+from slam_backend.core.validation import bad_argument, check_choice
 
 # Seeds of layout and textures, from (included) to (excluded).
 SPLITS: dict[str, tuple[int, int]] = {

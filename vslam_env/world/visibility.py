@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from slam_backend.camera import StereoCamera
-from slam_backend.errors import BoolArray, FloatArray
+from slam_backend.core.validation import BoolArray, FloatArray
+from slam_backend.models.camera import StereoCamera
 from vslam_env.world.sight_kernels import see
 from vslam_env.world.spec import Landmarks
 

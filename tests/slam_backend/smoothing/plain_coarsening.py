@@ -5,13 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from slam_backend._packed import UNPACK, UPPER
-from slam_backend.errors import BoolArray, FloatArray, IntArray
+from slam_backend.core.packed_symmetric import UNPACK, UPPER
+from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from slam_backend.geometry import between, compose, rotation
-from slam_backend.smoothing.coarsening import CONTRADICTION
-from slam_backend.smoothing.graph import NONE, OF_POINTS, PathGraph
-from slam_backend.smoothing.options import SmoothingOptions
-from slam_backend.smoothing.sightings import Sightings
+from slam_backend.smoother.graph import NONE, OF_POINTS, PathGraph
+from slam_backend.smoother.graph_reduction import CONTRADICTION
+from slam_backend.smoother.optimizer import Sightings
+from slam_backend.smoother.options import SmoothingOptions
 
 
 def chained(

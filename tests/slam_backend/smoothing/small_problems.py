@@ -4,13 +4,13 @@ from functools import lru_cache
 
 import numpy as np
 
-from slam_backend.errors import FloatArray
+from slam_backend.core.validation import FloatArray
+from slam_backend.fastslam.run_log import RobotLog
 from slam_backend.geometry import between, inverse, transform_points, wrap_angle
-from slam_backend.run_log import RobotLog
-from slam_backend.smoothing.extending import extended
-from slam_backend.smoothing.graph import PathGraph
-from slam_backend.smoothing.options import SmoothingOptions
-from slam_backend.smoothing.solving import Mode
+from slam_backend.smoother.graph import PathGraph
+from slam_backend.smoother.graph_building import extended
+from slam_backend.smoother.optimizer import Mode
+from slam_backend.smoother.options import SmoothingOptions
 from training.bench.accuracy.batch_problem import BatchProblem
 from training.bench.accuracy.runs import RunSpec, StereoRun, simulate_run
 

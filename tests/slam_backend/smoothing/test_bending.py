@@ -6,15 +6,14 @@ import numpy as np
 import pytest
 from small_problems import TIGHT, camera_of, graph_of, small_run
 
-from slam_backend.errors import FloatArray
+from slam_backend.core.validation import FloatArray
+from slam_backend.fastslam.run_log import RobotLog
 from slam_backend.geometry import between, compose
-from slam_backend.motion import OdometryModel
-from slam_backend.run_log import RobotLog
-from slam_backend.smoothing.bending import bend
-from slam_backend.smoothing.extending import extended
-from slam_backend.smoothing.graph import PathGraph
-from slam_backend.smoothing.sampling import _weighed, draw_paths
-from slam_backend.smoothing.solving import find_mode
+from slam_backend.models.odometry import OdometryModel
+from slam_backend.smoother.graph import PathGraph
+from slam_backend.smoother.graph_building import extended
+from slam_backend.smoother.optimizer import find_mode
+from slam_backend.smoother.sampling import _weighed, bend, draw_paths
 
 PREVIOUS = np.array([2, 0, 4, -1, 3, 0])  # a tree whose keys do not lie in the order of its branches
 CAMERA = np.array([320.0, 0.12, 0.2, 0.1, 0.0, 0.0, 0.0])

@@ -5,15 +5,15 @@ import pytest
 from plain_coarsening import plainly_coarsened
 from small_problems import TIGHT, camera_of, graph_of, logs_of, small_run, upper
 
+from slam_backend.fastslam.run_log import RobotLog
 from slam_backend.geometry import compose
-from slam_backend.run_log import RobotLog
-from slam_backend.smoothing.coarsening import at_mode, coarsened
-from slam_backend.smoothing.extending import extended
-from slam_backend.smoothing.graph import PathGraph
-from slam_backend.smoothing.options import SmoothingOptions
-from slam_backend.smoothing.rejuvenation import rejuvenate
-from slam_backend.smoothing.sampling import draw_paths, lane_rows, replay
-from slam_backend.smoothing.solving import find_mode
+from slam_backend.smoother.graph import PathGraph
+from slam_backend.smoother.graph_building import extended
+from slam_backend.smoother.graph_reduction import at_mode, coarsened
+from slam_backend.smoother.optimizer import find_mode
+from slam_backend.smoother.options import SmoothingOptions
+from slam_backend.smoother.rejuvenation import rejuvenate
+from slam_backend.smoother.sampling import draw_paths, lane_rows, replay
 
 
 def limits(max_keys, fresh_keys):

@@ -7,18 +7,17 @@ import pytest
 from python_entry import python_entry
 from small_problems import TIGHT, camera_of, graph_of, small_run
 
-from slam_backend.errors import FloatArray
+from slam_backend.core.validation import FloatArray
+from slam_backend.fastslam.run_log import RobotLog
 from slam_backend.geometry import between
-from slam_backend.motion import OdometryModel
-from slam_backend.run_log import RobotLog
-from slam_backend.smoothing import _kernels
-from slam_backend.smoothing._kernels.factoring import solve
-from slam_backend.smoothing.coarsening import at_mode, coarsened
-from slam_backend.smoothing.extending import extended
-from slam_backend.smoothing.graph import LEVER, PathGraph
-from slam_backend.smoothing.options import SmoothingOptions
-from slam_backend.smoothing.sightings import Sightings
-from slam_backend.smoothing.solving import Mode, find_mode
+from slam_backend.models.odometry import OdometryModel
+from slam_backend.smoother import _kernels
+from slam_backend.smoother._kernels.sparse_cholesky import solve
+from slam_backend.smoother.graph import LEVER, PathGraph
+from slam_backend.smoother.graph_building import extended
+from slam_backend.smoother.graph_reduction import at_mode, coarsened
+from slam_backend.smoother.optimizer import Mode, Sightings, find_mode
+from slam_backend.smoother.options import SmoothingOptions
 
 solve = python_entry(solve)
 

@@ -3,15 +3,14 @@ import pytest
 from plain_coarsening import chained
 from small_problems import camera_of, graph_of, logs_of, small_run
 
+from slam_backend.fastslam.run_log import RobotLog
 from slam_backend.geometry import between, compose
-from slam_backend.run_log import RobotLog
-from slam_backend.smoothing.coarsening import at_mode
-from slam_backend.smoothing.extending import Places, extended, first_rows
-from slam_backend.smoothing.graph import PathGraph
-from slam_backend.smoothing.guesses import Guesses
-from slam_backend.smoothing.options import SmoothingOptions
-from slam_backend.smoothing.rejuvenation import rejuvenate
-from slam_backend.smoothing.solving import find_mode
+from slam_backend.smoother.graph import PathGraph
+from slam_backend.smoother.graph_building import Guesses, Places, extended, first_rows
+from slam_backend.smoother.graph_reduction import at_mode
+from slam_backend.smoother.optimizer import find_mode
+from slam_backend.smoother.options import SmoothingOptions
+from slam_backend.smoother.rejuvenation import rejuvenate
 
 
 def test_chained_odometry_has_the_spread_of_its_samples():

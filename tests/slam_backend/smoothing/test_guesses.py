@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from slam_backend.smoothing.guesses import Guesses
+from slam_backend.smoother.graph_building import Guesses
 
 STEPS = st.lists(st.integers(0, 30), unique=True).map(sorted)
 

@@ -5,17 +5,16 @@ import pytest
 from python_entry import python_entry
 from small_problems import small_run
 
-from slam_backend._kernels import add_share
-from slam_backend._mixtures import widen
-from slam_backend._rejuvenation_step import RejuvenationStep
-from slam_backend.errors import FloatArray
-from slam_backend.filter import FastSlam
-from slam_backend.filter_options import FilterOptions
+from slam_backend.core.validation import FloatArray
+from slam_backend.fastslam._kernels import add_share
+from slam_backend.fastslam.estimates import widen
+from slam_backend.fastslam.filter import FastSlam
+from slam_backend.fastslam.options import FilterOptions
+from slam_backend.fastslam.rejuvenation import RejuvenationStep
 from slam_backend.geometry import between, compose, inverse, rotation, transform_points, wrap_angle
-from slam_backend.smoothing import rejuvenation
-from slam_backend.smoothing._kernels import LANES
-from slam_backend.smoothing.graph import RIGID, PathGraph
-from slam_backend.smoothing.holding import (
+from slam_backend.smoother import rejuvenation
+from slam_backend.smoother._kernels import LANES
+from slam_backend.smoother.gauge import (
     add_scatter,
     bring_nearer,
     fit,
@@ -26,6 +25,7 @@ from slam_backend.smoothing.holding import (
     move_tiles,
     share,
 )
+from slam_backend.smoother.graph import RIGID, PathGraph
 from training.bench.accuracy.runs import RunSpec, simulate_run
 
 add_scatter, bring_nearer, fit, look_at, measure_off, share, widen = map(

@@ -3,10 +3,9 @@ import pytest
 from small_problems import TIGHT, camera_of, logs_of, small_run, upper
 
 from slam_backend.geometry import between, compose
-from slam_backend.smoothing.extending import extended
-from slam_backend.smoothing.graph import NONE, PathGraph, scattered
-from slam_backend.smoothing.joining import joined
-from slam_backend.smoothing.solving import find_mode
+from slam_backend.smoother.graph import NONE, PathGraph, scattered
+from slam_backend.smoother.graph_building import extended, joined
+from slam_backend.smoother.optimizer import find_mode
 
 OFFSET = 500  # by which other groups call landmarks differently
 

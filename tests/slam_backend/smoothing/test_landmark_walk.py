@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from slam_backend.filter import FastSlam
-from slam_backend.landmark_map import LandmarkMap
-from slam_backend.measurements import Measurements
+from slam_backend.fastslam.filter import FastSlam
+from slam_backend.maps.landmark_map import LandmarkMap
+from slam_backend.models.measurements import Measurements
 
 NOISE = 0.05  # [m]
 

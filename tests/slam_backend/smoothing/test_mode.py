@@ -13,16 +13,16 @@ from small_problems import (
     upper,
 )  # fmt: skip
 
-from slam_backend.camera import StereoCamera
-from slam_backend.motion import OdometryModel
-from slam_backend.run_log import RobotLog
-from slam_backend.smoothing._kernels import FREE
-from slam_backend.smoothing._kernels.equations import advance
-from slam_backend.smoothing._kernels.forms import invert, seek, seek_poses
-from slam_backend.smoothing.extending import extended
-from slam_backend.smoothing.graph import PathGraph
-from slam_backend.smoothing.options import SmoothingOptions
-from slam_backend.smoothing.solving import find_mode
+from slam_backend.fastslam.run_log import RobotLog
+from slam_backend.models.camera import StereoCamera
+from slam_backend.models.odometry import OdometryModel
+from slam_backend.smoother._kernels import FREE
+from slam_backend.smoother._kernels.factors import invert, seek, seek_poses
+from slam_backend.smoother._kernels.normal_equations import advance
+from slam_backend.smoother.graph import PathGraph
+from slam_backend.smoother.graph_building import extended
+from slam_backend.smoother.optimizer import find_mode
+from slam_backend.smoother.options import SmoothingOptions
 from training.bench.accuracy.batch_ml import batch_ml
 from training.bench.accuracy.runs import NoisePreset, RunSpec, simulate_run
 

@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 
-from slam_backend.camera import StereoCamera
-from slam_backend.filter import FastSlam
-from slam_backend.filter_options import FilterOptions
+from slam_backend.fastslam.filter import FastSlam
+from slam_backend.fastslam.options import FilterOptions
+from slam_backend.fastslam.run_log import RobotLog
 from slam_backend.geometry import inverse, transform_points
-from slam_backend.log_arrays import REJECTED
-from slam_backend.measurements import Measurements
-from slam_backend.run_log import RobotLog
-from slam_backend.smoothing.guesses import Guesses
-from slam_backend.smoothing.reassociation import NO_ONE, Known, Refused, find_only, taken_up
+from slam_backend.models.camera import StereoCamera
+from slam_backend.models.measurements import Measurements
+from slam_backend.smoother.graph_building import Guesses
+from slam_backend.smoother.log_arrays import REJECTED
+from slam_backend.smoother.reassociation import NO_ONE, Known, Refused, find_only, taken_up
 
 OPTIONS = FilterOptions(camera=StereoCamera(sigma_px=0.2, sigma_disparity_px=0.1, mount=(0.1, 0.0, 0.9)))
 POSES = {4: np.array([0.0, 0.0, 0.3]), 5: np.array([0.4, 0.1, 0.2]), 7: np.array([0.9, 0.1, -0.1])}

@@ -5,13 +5,14 @@ import pytest
 from same_bits import assert_same
 from small_problems import small_run
 
-from slam_backend.existence import ExistenceModel
-from slam_backend.filter import FastSlam
-from slam_backend.measurements import Measurements
-from slam_backend.motion import OdometryModel
-from slam_backend.smoothing import rejuvenation, solving
-from slam_backend.smoothing.options import SmoothingOptions
-from slam_backend.smoothing.sampling import drawn_spreads
+from slam_backend.fastslam.existence import ExistenceModel
+from slam_backend.fastslam.filter import FastSlam
+from slam_backend.models.measurements import Measurements
+from slam_backend.models.odometry import OdometryModel
+from slam_backend.smoother import optimizer as solving
+from slam_backend.smoother import rejuvenation
+from slam_backend.smoother.options import SmoothingOptions
+from slam_backend.smoother.sampling import drawn_spreads
 from training.bench.accuracy.runs import RunSpec, simulate_run
 from training.bench.accuracy.trials import follow, score
 

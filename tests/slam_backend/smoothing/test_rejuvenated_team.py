@@ -10,12 +10,12 @@ from merged_pair import NEVER, false_alignment
 from same_bits import assert_same
 from simulated_team import SimulatedTeam
 
-from slam_backend.alignment import AlignmentOptions
-from slam_backend.attempts import AttemptOptions
-from slam_backend.smoothing import slices
-from slam_backend.smoothing.options import SmoothingOptions
-from slam_backend.smoothing.solving import find_mode
-from slam_backend.team import TeamSlam
+from slam_backend.maps.alignment import AlignmentOptions
+from slam_backend.smoother import rejuvenation as slices
+from slam_backend.smoother.optimizer import find_mode
+from slam_backend.smoother.options import SmoothingOptions
+from slam_backend.team.merge_scheduler import AttemptOptions
+from slam_backend.team.team import TeamSlam
 
 
 def build(simulation, every=20, slice_steps=None):

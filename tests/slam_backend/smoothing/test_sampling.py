@@ -3,15 +3,15 @@ import pytest
 from scipy.stats import chi2
 from small_problems import TIGHT, camera_of, graph_of, small_run, upper
 
-from slam_backend._kernels import LANES as FILTER_LANES
-from slam_backend.errors import FloatArray
-from slam_backend.motion import OdometryModel
-from slam_backend.run_log import RobotLog
-from slam_backend.smoothing._kernels import LANES, normalise, weigh_deviations
-from slam_backend.smoothing.extending import extended
-from slam_backend.smoothing.graph import PathGraph
-from slam_backend.smoothing.sampling import Draws, draw_paths, drawn_spreads, lane_rows, replay, weigh_odometry
-from slam_backend.smoothing.solving import Mode, find_mode
+from slam_backend.core.validation import FloatArray
+from slam_backend.fastslam._kernels import LANES as FILTER_LANES
+from slam_backend.fastslam.run_log import RobotLog
+from slam_backend.models.odometry import OdometryModel
+from slam_backend.smoother._kernels import LANES, normalise, weigh_deviations
+from slam_backend.smoother.graph import PathGraph
+from slam_backend.smoother.graph_building import extended
+from slam_backend.smoother.optimizer import Mode, find_mode
+from slam_backend.smoother.sampling import Draws, draw_paths, drawn_spreads, lane_rows, replay, weigh_odometry
 
 MOUNT = np.array([0.1, -0.05, 0.2])
 CAMERA = np.array([320.0, 0.12, 0.2, 0.1, *MOUNT])

@@ -9,14 +9,13 @@ from python_entry import python_entry
 from small_problems import camera_of, graph_of, logs_of, small_run
 
 from slam_backend.geometry import between, compose, transform_points, wrap_angle
-from slam_backend.log_arrays import ODOMETRY, REJECTED, STOOD
-from slam_backend.motion import OdometryModel
-from slam_backend.smoothing._kernels.naming import number, place, rename, start_anew
-from slam_backend.smoothing._kernels.walking import choose, walk
-from slam_backend.smoothing.extending import extended
-from slam_backend.smoothing.graph import LEVER, PathGraph
-from slam_backend.smoothing.options import SmoothingOptions
-from slam_backend.smoothing.rejuvenation import rejuvenate
+from slam_backend.models.odometry import OdometryModel
+from slam_backend.smoother._kernels.keyframes import choose, number, place, rename, start_anew, walk
+from slam_backend.smoother.graph import LEVER, PathGraph
+from slam_backend.smoother.graph_building import extended
+from slam_backend.smoother.log_arrays import ODOMETRY, REJECTED, STOOD
+from slam_backend.smoother.options import SmoothingOptions
+from slam_backend.smoother.rejuvenation import rejuvenate
 from training.bench.accuracy.runs import RunSpec, simulate_run
 
 choose, number, place, start_anew, walk = map(python_entry, (choose, number, place, start_anew, walk))

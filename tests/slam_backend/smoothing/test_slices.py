@@ -8,16 +8,15 @@ import pytest
 from same_bits import assert_same
 from small_problems import TIGHT, camera_of, graph_of, logs_of, small_run
 
-from slam_backend.filter import FastSlam
+from slam_backend.fastslam.filter import FastSlam
 from slam_backend.geometry import wrap_angle
-from slam_backend.motion import OdometryModel
-from slam_backend.smoothing import slices
-from slam_backend.smoothing.extending import Places, first_rows
-from slam_backend.smoothing.graph import PathGraph
-from slam_backend.smoothing.guesses import Guesses
-from slam_backend.smoothing.options import SmoothingOptions
-from slam_backend.smoothing.slices import Draft, Smoother
-from slam_backend.smoothing.solving import find_mode
+from slam_backend.models.odometry import OdometryModel
+from slam_backend.smoother import rejuvenation as slices
+from slam_backend.smoother.graph import PathGraph
+from slam_backend.smoother.graph_building import Guesses, Places, first_rows
+from slam_backend.smoother.optimizer import find_mode
+from slam_backend.smoother.options import SmoothingOptions
+from slam_backend.smoother.rejuvenation import Draft, Smoother
 
 NOWHERE = Places(np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
 IN_SLICES = SmoothingOptions(slice_steps=8, max_keys=20, fresh_keys=8)

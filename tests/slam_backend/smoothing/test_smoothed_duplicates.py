@@ -6,12 +6,12 @@ from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 from small_problems import TIGHT, camera_of, graph_of, logs_of, small_run
 
-from slam_backend.run_log import RobotLog
-from slam_backend.smoothing.duplicates import alike_pairs, find_duplicates, without_duplicates
-from slam_backend.smoothing.extending import extended
-from slam_backend.smoothing.graph import PathGraph
-from slam_backend.smoothing.sampling import draw_paths
-from slam_backend.smoothing.solving import find_mode
+from slam_backend.fastslam.run_log import RobotLog
+from slam_backend.smoother.duplicates import alike_pairs, find_duplicates, without_duplicates
+from slam_backend.smoother.graph import PathGraph
+from slam_backend.smoother.graph_building import extended
+from slam_backend.smoother.optimizer import find_mode
+from slam_backend.smoother.sampling import draw_paths
 
 NEW_NAME = 1000
 

@@ -7,15 +7,15 @@ import pytest
 from same_bits import assert_same
 from small_problems import TIGHT, camera_of, logs_of, small_run, upper
 
-from slam_backend.filter import FastSlam
-from slam_backend.measurements import Measurements
-from slam_backend.motion import OdometryModel
-from slam_backend.run_log import RobotLog
-from slam_backend.smoothing.coarsening import MOST_FRAMES, at_mode, coarsened
-from slam_backend.smoothing.extending import extended
-from slam_backend.smoothing.graph import PathGraph
-from slam_backend.smoothing.options import SmoothingOptions
-from slam_backend.smoothing.solving import find_mode
+from slam_backend.fastslam.filter import FastSlam
+from slam_backend.fastslam.run_log import RobotLog
+from slam_backend.models.measurements import Measurements
+from slam_backend.models.odometry import OdometryModel
+from slam_backend.smoother.graph import PathGraph
+from slam_backend.smoother.graph_building import extended
+from slam_backend.smoother.graph_reduction import MOST_FRAMES, at_mode, coarsened
+from slam_backend.smoother.optimizer import find_mode
+from slam_backend.smoother.options import SmoothingOptions
 from training.bench.accuracy.runs import StereoRun
 
 EVERY = 10

@@ -15,7 +15,7 @@ import numpy as np
 import scipy.linalg
 import scipy.sparse
 
-from slam_backend.errors import FloatArray, IntArray, bad_argument, check_float
+from slam_backend.core.validation import FloatArray, IntArray, bad_argument, check_float
 from slam_backend.geometry import wrap_angle
 from training.bench.accuracy.batch_problem import BatchProblem, Estimate, Moves, Sights
 

@@ -5,9 +5,9 @@ from typing import Self
 
 import numpy as np
 
-from slam_backend.camera import ROBOT_FROM_CAMERA, StereoCamera
-from slam_backend.errors import FloatArray, IntArray
+from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.geometry import between, compose, rotation, wrap_angle
+from slam_backend.models.camera import ROBOT_FROM_CAMERA, StereoCamera
 from training.bench.accuracy.runs import FALSE_POINT, StereoRun
 
 

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from slam_backend.errors import check_int
+from slam_backend.core.validation import check_int
 from training.bench.accuracy.trials import FILTERS, PEERS, Trial
 from training.experiments.config import PlainConfig, check_each_once
 

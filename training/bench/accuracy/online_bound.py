@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg
 
-from slam_backend.errors import FloatArray, IntArray
+from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.geometry import wrap_angle
 from training.bench.accuracy.batch_ml import BatchEstimate
 from training.bench.accuracy.batch_problem import BatchProblem, Estimate

@@ -7,12 +7,12 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend.camera import StereoCamera
-from slam_backend.errors import FloatArray, IntArray, check_choice, check_float, check_int
-from slam_backend.filter import FastSlam
+from slam_backend.core.validation import FloatArray, IntArray, check_choice, check_float, check_int
+from slam_backend.fastslam.filter import FastSlam
 from slam_backend.geometry import between, inverse, transform_points
-from slam_backend.measurements import Measurements
-from slam_backend.motion import OdometryModel
+from slam_backend.models.camera import StereoCamera
+from slam_backend.models.measurements import Measurements
+from slam_backend.models.odometry import OdometryModel
 from training.bench.accuracy.world import Office, start_crossings
 
 STEP = 0.25  # distance between frames along the path [m]

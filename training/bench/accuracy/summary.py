@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend.errors import FloatArray
+from slam_backend.core.validation import FloatArray
 from training.experiments.statistics import grouped, interval
 
 CONDITION = ("preset", "association", "robots", "length")

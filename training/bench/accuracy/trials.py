@@ -7,9 +7,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from slam_backend.errors import FloatArray, IntArray, check_choice, check_float, check_int
-from slam_backend.existence import ExistenceModel
-from slam_backend.filter import FastSlam
+from slam_backend.core.validation import FloatArray, IntArray, check_choice, check_float, check_int
+from slam_backend.fastslam.existence import ExistenceModel
+from slam_backend.fastslam.filter import FastSlam
 from slam_backend.geometry import transform_points, wrap_angle
 from slam_backend.metrics import align_se2, ate, map_rmse, nees
 from training.bench.accuracy.batch_ml import BatchEstimate, batch_ml

@@ -5,9 +5,9 @@ from typing import Self
 
 import numpy as np
 
-from slam_backend.camera import StereoCamera
-from slam_backend.errors import BoolArray, FloatArray, bad_argument, check_float, check_int
+from slam_backend.core.validation import BoolArray, FloatArray, bad_argument, check_float, check_int
 from slam_backend.geometry import compose, inverse, transform_points, wrap_angle
+from slam_backend.models.camera import StereoCamera
 
 AISLE = 3.0  # width [m]
 BLOCK = (4.5, 2.5)  # size of a block of rooms [m]

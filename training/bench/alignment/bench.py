@@ -2,8 +2,8 @@
 
 from dataclasses import dataclass
 
-from slam_backend.alignment import METHODS
-from slam_backend.errors import check_choice, check_int
+from slam_backend.core.validation import check_choice, check_int
+from slam_backend.maps.alignment import METHODS
 from training.bench.alignment.trials import Trial, cases
 from training.experiments.config import PlainConfig, check_each_once
 

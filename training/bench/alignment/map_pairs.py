@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend.errors import FloatArray, IntArray, check_choice, check_float
-from slam_backend.fusion import alignment_jacobian
+from slam_backend.core.validation import FloatArray, IntArray, check_choice, check_float
 from slam_backend.geometry import inverse, transform_points
-from slam_backend.landmark_map import LandmarkMap
+from slam_backend.maps.fusion import alignment_jacobian
+from slam_backend.maps.landmark_map import LandmarkMap
 
 NOISE = 0.05  # standard deviation of each landmark in each map and axis [m]
 LANDMARKS = 200  # of each map

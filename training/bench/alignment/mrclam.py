@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend.alignment import RIVAL_ANGLE, RIVAL_DISTANCE, Alignment, AlignmentOptions, align_maps
-from slam_backend.errors import IntArray, check_float, check_int
+from slam_backend.core.validation import IntArray, check_float, check_int
 from slam_backend.geometry import between, transform_points, wrap_angle
-from slam_backend.landmark_map import LandmarkMap
+from slam_backend.maps.alignment import RIVAL_ANGLE, RIVAL_DISTANCE, Alignment, AlignmentOptions, align_maps
+from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.readers.mrclam import MrclamLog, load_mrclam
 from training.experiments.config import PlainConfig, check_each_once
 from training.experiments.statistics import grouped

@@ -7,8 +7,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from slam_backend.alignment import RIVAL_ANGLE, RIVAL_DISTANCE, align_maps
 from slam_backend.geometry import wrap_angle
+from slam_backend.maps.alignment import RIVAL_ANGLE, RIVAL_DISTANCE, align_maps
 from training.bench.alignment.map_pairs import (
     IDENTIFIABLE,
     UNALIGNABLE,

@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any
 
-from slam_backend.errors import bad_argument, check_int
+from slam_backend.core.validation import bad_argument, check_int
 from training.bench.env.profile import BudgetRow, measure_budget
 from training.bench.env.timing import (
     StepTimes,

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend.filter import FastSlam
-from slam_backend.team import TeamSlam
+from slam_backend.fastslam.filter import FastSlam
+from slam_backend.team.team import TeamSlam
 from vslam_env import environment, observation
 from vslam_env.belief import TeamBelief
 from vslam_env.episode import Episode

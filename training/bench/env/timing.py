@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from agents.registry import make_policy
-from slam_backend.errors import FloatArray
+from slam_backend.core.validation import FloatArray
 from training.experiments.step_timing import no_garbage_collection
 from vslam_env import vslam_v0
 from vslam_env.config import TICK, EnvConfig

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from agents.registry import action_types, is_model
-from slam_backend.errors import bad_argument, check_choice, check_float, check_int
+from slam_backend.core.validation import bad_argument, check_choice, check_float, check_int
 from training.episodes.config import RunConfig
 from training.experiments.config import PlainConfig, check_each_once
 from vslam_env.config import EnvConfig

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from agents.policy import Policy
-from slam_backend.errors import FloatArray
+from slam_backend.core.validation import FloatArray
 from slam_backend.geometry import compose
 from training.bench.exploration.bench import ExplorationBenchConfig, ExplorationTrial
 from training.episodes.metrics import score_episode

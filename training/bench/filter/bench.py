@@ -5,8 +5,8 @@ from dataclasses import asdict, dataclass, replace
 from itertools import product
 from typing import Any
 
-from slam_backend.errors import check_choice, check_int
-from slam_backend.filter_options import PROPOSALS
+from slam_backend.core.validation import check_choice, check_int
+from slam_backend.fastslam.options import PROPOSALS
 from training.bench.filter.compile_time import time_compilation
 from training.bench.filter.trials import Row, time_row, time_state
 from training.bench.filter.workload import FilterLoad, Proposal

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from slam_backend.errors import FloatArray
+from slam_backend.core.validation import FloatArray
 from training.bench.filter.bench import BenchResult
 from training.bench.filter.trials import Row
 from training.experiments.plotting import save_png

@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend.errors import IntArray
-from slam_backend.filter import FastSlam
-from slam_backend.reports import StepReport
+from slam_backend.core.validation import IntArray
+from slam_backend.fastslam.filter import FastSlam
+from slam_backend.fastslam.reports import StepReport
 from training.bench.filter.workload import FilterLoad, LoadStep, LoadWorld
 from training.experiments.step_timing import Timing, time_calls
 

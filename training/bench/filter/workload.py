@@ -7,11 +7,11 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend.camera import ROBOT_FROM_CAMERA
-from slam_backend.errors import FloatArray, IntArray, bad_argument, check_choice, check_int
-from slam_backend.filter_options import PROPOSALS, FilterOptions
+from slam_backend.core.validation import FloatArray, IntArray, bad_argument, check_choice, check_int
+from slam_backend.fastslam.options import PROPOSALS, FilterOptions
 from slam_backend.geometry import between, compose, inverse, transform_points
-from slam_backend.measurements import Measurements
+from slam_backend.models.camera import ROBOT_FROM_CAMERA
+from slam_backend.models.measurements import Measurements
 
 Proposal = Literal["fastslam2", "fastslam1"]
 

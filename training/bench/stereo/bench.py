@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend.camera import StereoCamera
-from slam_backend.errors import check_choice, check_int
+from slam_backend.core.validation import check_choice, check_int
 from slam_backend.frontend import DESCRIPTORS, CornerOptions, FrontEndOptions, StereoFrontEnd
+from slam_backend.models.camera import StereoCamera
 from training.bench.stereo.quality import quality_row, retrieval, second_looks
 from training.bench.stereo.scenes import Scene, panel_hall
 from training.experiments.config import PlainConfig, check_each_once

@@ -4,10 +4,10 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend.camera import StereoCamera
-from slam_backend.errors import FloatArray
+from slam_backend.core.validation import FloatArray
 from slam_backend.frontend import GUARDS, KINDS, FrontEndOptions, StereoFrontEnd
 from slam_backend.geometry import rotation
+from slam_backend.models.camera import StereoCamera
 from training.bench.stereo.scenes import WALL, Named, Scene, office_views, wall_pose
 from vslam_env.sensors.stereo_textures import TextureConfig
 from vslam_env.world import make_world

@@ -14,11 +14,11 @@ from typing import Any
 import cv2
 import numpy as np
 
-from slam_backend.camera import StereoCamera
-from slam_backend.errors import Float32Array, FloatArray, bad_argument
+from slam_backend.core.validation import Float32Array, FloatArray, bad_argument
 from slam_backend.frontend import GUARDS, KINDS, CornerOptions, FrontEndOptions, StereoFrontEnd, harris_corners
 from slam_backend.frontend.descriptors import describe_points, nearest
 from slam_backend.frontend.images import Image
+from slam_backend.models.camera import StereoCamera
 from slam_backend.readers.calibration import Eye, Rectifier
 from slam_backend.readers.kitti_images import read_grey
 from slam_backend.readers.stereo_files import load_rig

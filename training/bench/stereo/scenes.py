@@ -4,11 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slam_backend.camera import StereoCamera
-from slam_backend.errors import FloatArray, IntArray
+from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.frontend import StereoFrame, StereoFrontEnd
 from slam_backend.frontend.images import Image
 from slam_backend.geometry import transform_points
+from slam_backend.models.camera import StereoCamera
 from vslam_env.sensors.stereo_camera import ImagingConfig, StereoEye
 from vslam_env.sensors.stereo_sensor import SPURIOUS_PX
 from vslam_env.sensors.stereo_textures import TextureConfig, WallTextures, draw_textures

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from slam_backend.errors import bad_argument, check_int
+from slam_backend.core.validation import bad_argument, check_int
 from training.bench.train.timing import Part, Recording, record, time_adapter, time_learner
 from training.bench.train.workers import CLOCK, WorkerRow, WorkerTimes, summarise_workers, time_workers
 from training.experiments.config import PlainConfig

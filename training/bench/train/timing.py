@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 from sb3_contrib import MaskablePPO
 
-from slam_backend.errors import FloatArray
+from slam_backend.core.validation import FloatArray
 from training.bench.env.timing import time_steps
 from training.rl.config import TrainConfig
 from training.rl.network import GoalPolicy

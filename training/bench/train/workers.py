@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend.errors import BoolArray, FloatArray
+from slam_backend.core.validation import BoolArray, FloatArray
 from training.experiments.statistics import interval
 from training.experiments.step_timing import no_garbage_collection
 from training.vec_env import make_vec_env

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend.errors import check_choice, check_int
+from slam_backend.core.validation import check_choice, check_int
 from training.bench.accuracy.world import start_crossings
 from training.experiments.config import PlainConfig, check_each_once
 from training.paper.fig6.noise_regimes import BOUND, FEW, REGIMES, Regime

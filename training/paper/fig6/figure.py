@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator
 
-from slam_backend.errors import FloatArray
+from slam_backend.core.validation import FloatArray
 from training.experiments.plotting import save_png
 from training.paper.fig6.noise_regimes import BOUND, REGIMES
 from vslam_env.rendering.palette import robot_colour

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from slam_backend.errors import FloatArray
+from slam_backend.core.validation import FloatArray
 from training.experiments.statistics import CONFIDENCE, grouped, mean_of
 from training.experiments.tables import csv_text
 from training.paper.fig6.trials import FIGURES

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend.errors import BoolArray, FloatArray, bad_argument, check_choice, check_int
-from slam_backend.filter import FastSlam
+from slam_backend.core.validation import BoolArray, FloatArray, bad_argument, check_choice, check_int
+from slam_backend.fastslam.filter import FastSlam
 from training.bench.accuracy.runs import FALSE_POINT, RunSpec, StereoRun, simulate_run
 from training.bench.accuracy.trials import Answer, follow, optimal, score
 from training.experiments.step_timing import no_garbage_collection

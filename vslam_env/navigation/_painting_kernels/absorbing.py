@@ -3,7 +3,7 @@
 import math
 from typing import Any
 
-from slam_backend._jit import device, in_place
+from slam_backend.core.jit import device, in_place
 from vslam_env.navigation._painting_kernels.evidence import (
     CELL,
     FREE,

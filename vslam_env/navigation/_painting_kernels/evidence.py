@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from slam_backend._jit import device, in_place, inlined
+from slam_backend.core.jit import device, in_place, inlined
 from vslam_env.navigation._painting_kernels.bounds import widen
 
 GRID_SIZE = 300

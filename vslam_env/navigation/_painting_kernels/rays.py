@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend._jit import device, in_place, inlined
-from slam_backend.errors import FloatArray
+from slam_backend.core.jit import device, in_place, inlined
+from slam_backend.core.validation import FloatArray
 from vslam_env.navigation._painting_kernels.evidence import CELL
 from vslam_env.navigation._painting_kernels.surveys import ALONG_X, ALONG_Y, TELLING
 

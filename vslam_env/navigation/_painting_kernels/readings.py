@@ -3,8 +3,8 @@
 import math
 from typing import Any
 
-from slam_backend._jit import device, in_place
-from slam_backend.errors import BoolArray, FloatArray
+from slam_backend.core.jit import device, in_place
+from slam_backend.core.validation import BoolArray, FloatArray
 from vslam_env.navigation._painting_kernels.evidence import (
     CELL,
     FREE,

@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend._jit import device, in_place, jit
-from slam_backend.errors import FloatArray
+from slam_backend.core.jit import device, in_place, jit
+from slam_backend.core.validation import FloatArray
 
 SAME_SURFACE_GAP = 0.4  # [m] no robot fits between two hits this near: they are joined unseen
 STRAIGHT_GAP = 0.8  # [m] joined if a third hit lies on their line; doors are 1.1 m and wider

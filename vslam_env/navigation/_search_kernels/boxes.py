@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend._jit import device, in_place, jit
+from slam_backend.core.jit import device, in_place, jit
 from vslam_env.navigation._painting_kernels import GRID_SIZE
 
 PAD = 2  # cells around the known box, so that loops over frontiers and neighbours need no bounds

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend._jit import device, in_place, jit
+from slam_backend.core.jit import device, in_place, jit
 from vslam_env.navigation._painting_kernels import CELL, FREE, GRID_SIZE, HALF_WIDTH, UNKNOWN
 from vslam_env.navigation._search_kernels.boxes import any_above_zero
 from vslam_env.navigation._search_kernels.ways import NUM_STRAIGHT, UNREACHED, steps_over, ways_over

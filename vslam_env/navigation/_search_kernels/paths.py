@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend._jit import device, in_place, jit
+from slam_backend.core.jit import device, in_place, jit
 from vslam_env.navigation._search_kernels.ways import STRAIGHT
 
 

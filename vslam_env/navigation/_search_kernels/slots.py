@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend._jit import device, in_place, jit
+from slam_backend.core.jit import device, in_place, jit
 from vslam_env.navigation._painting_kernels import CELL, GRID_SIZE, HALF_WIDTH
 from vslam_env.navigation._search_kernels.frontiers import HEADING, NUM_COLUMNS, frontiers_over
 

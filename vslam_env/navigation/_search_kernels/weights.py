@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend._jit import device, in_place, jit
+from slam_backend.core.jit import device, in_place, jit
 from vslam_env.navigation._painting_kernels import FREE, OCCUPIED, UNKNOWN
 
 CLOSE, NEAR, OPEN = 4, 2, 1  # weights of cells by their distance from walls

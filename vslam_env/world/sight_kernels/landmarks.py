@@ -5,8 +5,8 @@ A camera at (x, y) with axis theta looks along its own x axis; `ahead` and `left
 
 import numpy as np
 
-from slam_backend._jit import device, in_place, jit
-from slam_backend.errors import BoolArray, FloatArray, IntArray
+from slam_backend.core.jit import device, in_place, jit
+from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from vslam_env.world.sight_kernels.rays import EPSILON, ray_to_disc, ray_to_wall, those, walls_in_wedge
 
 TOUCH = 1e-6  # [m] what a ray meets this close to its target does not hide the target

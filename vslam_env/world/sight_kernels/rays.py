@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from slam_backend._jit import device, in_place, jit
-from slam_backend.errors import FloatArray, IntArray
+from slam_backend.core.jit import device, in_place, jit
+from slam_backend.core.validation import FloatArray, IntArray
 
 EPSILON = 1e-9  # walls that share an end point leave no gap between them
 

@@ -1,0 +1,59 @@
+"""Archives of arrays (.npz) that others may have made: read without running code, and within bounds of memory."""
+
+import io
+import zipfile
+from collections.abc import Iterable
+from math import prod
+from pathlib import Path
+
+import numpy as np
+from numpy.lib import format as npy
+from numpy.typing import NDArray
+
+from slam_backend.core.state_codec import MOST_BYTES, read_file
+
+HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
+KINDS = "biufUS"  # of numbers and texts; objects would be pickles
+
+
+class UnreadableArchiveError(ValueError):
+    """A file is no whole archive of plain arrays."""
+
+
+def read_arrays(path: Path, names: Iterable[str] | None = None) -> dict[str, NDArray[np.generic]]:
+    """Return arrays of an archive by name.
+
+    Args:
+        path: File that `numpy.savez` or `numpy.savez_compressed` wrote.
+        names: Which; None: all. Those that are not there are left out.
+
+    Raises:
+        UnreadableArchiveError: If it is no such file, is damaged, holds anything but numbers and texts, or unpacks to
+            more than any file of this project's.
+    """
+    try:
+        with zipfile.ZipFile(io.BytesIO(read_file(path))) as archive:
+            members = {member.filename.removesuffix(".npy"): member for member in archive.infolist()}
+            wanted = {name: members[name] for name in (members if names is None else names) if name in members}
+            if sum(member.file_size for member in wanted.values()) > MOST_BYTES:
+                raise UnreadableArchiveError(f"it unpacks to more than {MOST_BYTES >> 20} MiB")
+            return {name: _array(archive, member) for name, member in wanted.items()}
+    except UnreadableArchiveError:
+        raise
+    except Exception as error:  # whatever zipfile, zlib and numpy say of bytes that somebody made up
+        raise UnreadableArchiveError(str(error) or type(error).__name__) from error
+
+
+def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[np.generic]:
+    """Return an array whose header says how many bytes follow, if so many do."""
+    with archive.open(member) as stream:
+        shape, by_columns, dtype = HEADERS[npy.read_magic(stream)](stream)
+        if dtype.kind not in KINDS or dtype.hasobject:
+            raise UnreadableArchiveError(f"{member.filename} holds {dtype}")
+        size = prod(shape) * dtype.itemsize
+        if min(shape, default=0) < 0 or size > member.file_size:
+            raise UnreadableArchiveError(f"{member.filename} says that it has the shape {shape}")
+        content = stream.read(size + 1)
+    if len(content) != size:
+        raise UnreadableArchiveError(f"{member.filename} has {len(content)} bytes of {size}")
+    return np.frombuffer(content, dtype).reshape(shape, order="F" if by_columns else "C").copy("A")

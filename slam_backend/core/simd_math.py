@@ -1,0 +1,134 @@
+"""Arithmetic of one lane: what loops over lanes are made of."""
+
+import math
+
+from slam_backend.core.jit import bits_float, float_bits, lanes_inlined
+from slam_backend.fastslam._kernels.layout import LN2
+
+HALF_PI_HIGH = 1.5707963267341256  # pi / 2 in two parts: the first has 33 bits, so that small multiples are exact
+HALF_PI_LOW = 6.077100506506192e-11
+ROUND = 6755399441055744.0  # 1.5 * 2^52: adding and subtracting it rounds to the nearest integer
+
+
+@lanes_inlined
+def inverted(
+    a: float, b: float, c: float, d: float, e: float, f: float
+) -> tuple[float, float, float, float, float, float, float]:
+    """Invert the symmetric [[a, b, c], [b, d, e], [c, e, f]]: its inverse likewise (6), and its determinant."""
+    p = d * f - e * e
+    q = c * e - b * f
+    r = b * e - c * d
+    det = a * p + b * q + c * r
+    g = 1.0 / det
+    return p * g, q * g, r * g, (a * f - c * c) * g, (b * c - a * e) * g, (a * d - b * b) * g, det
+
+
+@lanes_inlined
+def cofactors_cancel(a: float, b: float, c: float, d: float, e: float, f: float, least: float) -> bool:
+    """Tell whether the determinant by cofactors is less than this share of the product of the diagonal.
+
+    The matrix is that of `inverted`, positive definite, and so flat and so turned that its digits are lost.
+    """
+    det = a * (d * f - e * e) + b * (c * e - b * f) + c * (b * e - c * d)
+    return det < least * a * d * f
+
+
+@lanes_inlined
+def inverted_by_parts(
+    a: float, b: float, c: float, d: float, e: float, f: float
+) -> tuple[float, float, float, float, float, float, float]:
+    """Return what `inverted` does of a positive definite matrix, by L D L^T: three divisions, and it stays definite.
+
+    Errors grow with the ratio of the extreme eigenvalues, those of `inverted` with its square.
+    """
+    per_a = 1.0 / a
+    m10, m20 = b * per_a, c * per_a
+    d1, n = d - m10 * b, e - m10 * c
+    per_d1 = 1.0 / d1
+    m21 = n * per_d1
+    d2 = f - m20 * c - m21 * n
+    per_d2, k = 1.0 / d2, m10 * m21 - m20
+    return (
+        per_a + m10 * m10 * per_d1 + k * k * per_d2, -m10 * per_d1 - k * m21 * per_d2, k * per_d2,
+        per_d1 + m21 * m21 * per_d2, -m21 * per_d2, per_d2, a * d1 * d2,
+    )  # fmt: skip
+
+
+@lanes_inlined
+def quadratic_form(
+    i00: float, i01: float, i02: float, i11: float, i12: float, i22: float, x: float, y: float, z: float
+) -> float:
+    """Return the quadratic form of (x, y, z)."""
+    return i00 * x * x + i11 * y * y + i22 * z * z + 2.0 * (i01 * x * y + i02 * x * z + i12 * y * z)
+
+
+@lanes_inlined
+def sine_cosine(angle: float) -> tuple[float, float]:
+    """Return sine and cosine to the last bits but one, for angles up to some thousand turns, without a branch.
+
+    Reduction to [-pi/4, pi/4] and Taylor's series there.
+    """
+    quarter = (angle * (2.0 / math.pi) + ROUND) - ROUND
+    x = (angle - quarter * HALF_PI_HIGH) - quarter * HALF_PI_LOW
+    z = x * x
+    s = -1.0 / 1307674368000.0
+    s = s * z + 1.0 / 6227020800.0
+    s = s * z - 1.0 / 39916800.0
+    s = s * z + 1.0 / 362880.0
+    s = s * z - 1.0 / 5040.0
+    s = s * z + 1.0 / 120.0
+    s = s * z - 1.0 / 6.0
+    s = x + x * z * s
+    c = 1.0 / 20922789888000.0
+    c = c * z - 1.0 / 87178291200.0
+    c = c * z + 1.0 / 479001600.0
+    c = c * z - 1.0 / 3628800.0
+    c = c * z + 1.0 / 40320.0
+    c = c * z - 1.0 / 720.0
+    c = c * z + 1.0 / 24.0
+    c = c * z - 0.5
+    c = 1.0 + z * c
+    turn = quarter - 4.0 * math.floor(0.25 * quarter)  # 0, 1, 2 or 3
+    odd = turn == 1.0 or turn == 3.0
+    sine = c if odd else s
+    cosine = s if odd else c
+    sine = -sine if turn >= 2.0 else sine
+    cosine = -cosine if turn == 1.0 or turn == 2.0 else cosine
+    return sine, cosine
+
+
+@lanes_inlined
+def log_of(x: float) -> float:
+    """Return the natural logarithm of a positive normal number, without a branch: x = 2^e m, and atanh's series."""
+    bits = float_bits(x)
+    exponent = float((bits >> 52) - 1023)
+    m = bits_float((bits & 0x000FFFFFFFFFFFFF) | 0x3FF0000000000000)
+    big = m > 1.4142135623730951
+    m = 0.5 * m if big else m
+    exponent = exponent + 1.0 if big else exponent
+    f = (m - 1.0) / (m + 1.0)
+    z = f * f
+    s = 1.0 / 21.0
+    s = s * z + 1.0 / 19.0
+    s = s * z + 1.0 / 17.0
+    s = s * z + 1.0 / 15.0
+    s = s * z + 1.0 / 13.0
+    s = s * z + 1.0 / 11.0
+    s = s * z + 1.0 / 9.0
+    s = s * z + 1.0 / 7.0
+    s = s * z + 0.2
+    s = s * z + 1.0 / 3.0
+    return exponent * LN2 + 2.0 * (f + f * z * s)
+
+
+@lanes_inlined
+def mantissa_exponent(x: float) -> tuple[float, float]:
+    """Return mantissa in [1, 2) and exponent of a positive normal number: products of many never overflow."""
+    bits = float_bits(x)
+    return bits_float((bits & 0x000FFFFFFFFFFFFF) | 0x3FF0000000000000), float((bits >> 52) - 1023)
+
+
+@lanes_inlined
+def wrapped(angle: float) -> float:
+    """Return the angle in [-pi, pi)."""
+    return angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))

@@ -1,0 +1,257 @@
+"""Checks of state that comes back from a caller: kinds, shapes, index ranges and sizes, each array looked at once.
+
+Kernels do not check the indices that they are given: what a state holds is checked before it is taken over, whether it
+comes from a file or from a program.
+"""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import fields, is_dataclass
+from typing import Any, NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_backend.core.jit import in_place
+from slam_backend.core.validation import bad_argument
+
+CURE = "Pass it unchanged."
+LARGEST = 1e12  # of plain numbers [m, rad, 1]; squares and products of a few of them are finite
+FARTHEST = 1e7  # [m, rad] of poses and landmarks
+MOST = 1 << 62  # of counts and steps: sums of two of them are int64
+
+BOOL, INT8, UINT8 = np.dtype(np.bool_), np.dtype(np.int8), np.dtype(np.uint8)
+INT32, INT64 = np.dtype(np.int32), np.dtype(np.int64)
+FLOAT32, FLOAT64 = np.dtype(np.float32), np.dtype(np.float64)
+STREAMS: dict[str, dict[str, tuple[np.dtype[Any], tuple[int, ...]]]] = {  # arrays in the states of numpy's streams
+    "PCG64": {},
+    "PCG64DXSM": {},
+    "MT19937": {"key": (np.dtype(np.uint32), (624,))},
+    "Philox": {"counter": (np.dtype(np.uint64), (4,)), "key": (np.dtype(np.uint64), (2,))},
+    "SFC64": {"state": (np.dtype(np.uint64), (4,))},
+}
+
+
+@in_place
+def count_outside(values: Any, columns: int, low: Any, high: Any) -> int:
+    """Return how many of the first columns of values (n, P) are not within bounds; those that are NaN are not."""
+    outside = 0
+    for i in range(len(values)):
+        for j in range(columns):
+            outside += not low <= values[i, j] <= high
+    return outside
+
+
+@in_place
+def count_falls(values: Any) -> int:
+    """Return how many of the values (n,) are not above the one before."""
+    falls = 0
+    for i in range(1, len(values)):
+        falls += values[i] <= values[i - 1]
+    return falls
+
+
+def refuse(name: str, expected: str, got: object) -> NoReturn:
+    """Raise the error for a part of a state."""
+    raise bad_argument(name, expected, got, CURE)
+
+
+@contextmanager
+def refusing(name: str) -> Iterator[None]:
+    """Turn what a check trips over, in a state of a form that it does not expect, into a refusal as well."""
+    try:
+        yield
+    except ValueError:
+        raise
+    except Exception as error:
+        got = f"'{type(error).__name__}: {error}' as it was looked at"
+        raise bad_argument(name, "what get_state returned", got, CURE) from error
+
+
+def check_kind(name: str, value: Any, *kinds: type) -> None:
+    """Refuse what is of none of some types; subclasses are other types."""
+    if type(value) not in kinds:
+        refuse(name, f"a {' or '.join(kind.__name__ for kind in kinds)}", f"a {type(value).__name__}")
+
+
+def check_keys(name: str, value: Any, keys: Iterable[str]) -> None:
+    """Refuse what is no dict, or lacks a key."""
+    if not isinstance(value, Mapping):
+        refuse(name, "a dict from get_state", f"a {type(value).__name__}")
+    for key in keys:
+        if key not in value:
+            refuse(name, "a dict from get_state", f"no {key!r}")
+
+
+def check_length(name: str, value: Any, length: int | None = None) -> None:
+    """Refuse what is neither a tuple nor a list, or of another length."""
+    check_kind(name, value, tuple, list)
+    if length is not None and len(value) != length:
+        refuse(name, f"{length} of them", len(value))
+
+
+def check_whole(name: str, value: Any, low: int = 0, high: int = MOST) -> None:
+    """Refuse what is no int, or not within bounds."""
+    if type(value) is not int or not low <= value <= high:
+        refuse(name, f"an int from {low} to {high}", value)
+
+
+def check_number(name: str, value: Any, low: float = -LARGEST, high: float = LARGEST) -> None:
+    """Refuse what is no float, or not within bounds."""
+    if not isinstance(value, float) or not low <= value <= high:
+        refuse(name, f"a float from {low:g} to {high:g}", value)
+
+
+def check_flag(name: str, value: Any) -> None:
+    """Refuse what is no bool."""
+    check_kind(name, value, bool)
+
+
+def check_wholes(name: str, values: Any, low: int = 0, high: int = MOST) -> None:
+    """Refuse what is no tuple, list or set of ints within bounds."""
+    check_kind(name, values, tuple, list, set, frozenset)
+    for value in values:
+        if type(value) is not int or not low <= value <= high:
+            refuse(name, f"ints from {low} to {high}", value)
+
+
+def check_robots(name: str, robots: Any, count: int) -> None:
+    """Refuse what is no tuple of some of so many robots, at least one, in ascending order."""
+    check_kind(name, robots, tuple)
+    check_wholes(name, robots, 0, count - 1)
+    if not robots or list(robots) != sorted(set(robots)):
+        refuse(name, "robots in ascending order", robots)
+
+
+def check_kept(name: str, value: Any, dtype: np.dtype[Any], shape: tuple[int | None, ...]) -> None:
+    """Refuse what is no array of a type and a shape, None for a free axis."""
+    if type(value) is not np.ndarray or value.dtype != dtype:
+        got = f"an array of {value.dtype}" if isinstance(value, np.ndarray) else f"a {type(value).__name__}"
+        refuse(name, f"an array of {dtype}", got)
+    if value.shape != shape and (
+        value.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, value.shape, strict=True))
+    ):
+        wanted = tuple("n" if n is None else n for n in shape)
+        refuse(name, f"an array of shape {wanted}".replace("'", ""), f"shape {value.shape}")
+
+
+def check_floats(
+    name: str,
+    value: Any,
+    shape: tuple[int | None, ...],
+    low: float = -LARGEST,
+    high: float = LARGEST,
+    columns: int | None = None,
+    dtype: np.dtype[Any] = FLOAT64,
+) -> None:
+    """Refuse what is no array of floats of a shape, all within bounds; NaN is not.
+
+    Args:
+        name: Name of the part.
+        value: The value to check.
+        shape: None for a free axis.
+        low, high: The bounds.
+        columns: Only so many entries of the last axis mean something; None: all.
+        dtype: Type of the array.
+    """
+    check_kept(name, value, dtype, shape)
+    if value.size:
+        wide = value.reshape(-1, value.shape[-1] if columns is not None else value.size)
+        if count_outside(wide, wide.shape[1] if columns is None else columns, float(low), float(high)):
+            refuse(name, f"numbers from {low:g} to {high:g}", "others, or NaN")
+
+
+def check_indices(
+    name: str,
+    value: Any,
+    shape: tuple[int | None, ...],
+    low: int,
+    high: int,
+    columns: int | None = None,
+    dtype: np.dtype[Any] = INT64,
+) -> None:
+    """Refuse what is no array of integers of a shape, all within bounds; as `check_floats`."""
+    check_kept(name, value, dtype, shape)
+    if value.size:
+        wide = value.reshape(-1, value.shape[-1] if columns is not None else value.size)
+        if count_outside(wide, wide.shape[1] if columns is None else columns, low, high):
+            refuse(name, f"integers from {low} to {high}", "others")
+
+
+def check_ascending(name: str, values: NDArray[Any]) -> None:
+    """Refuse values (n,) of which one is not above the one before."""
+    if count_falls(values):
+        refuse(name, "numbers in ascending order, each once", "others")
+
+
+def check_options(name: str, options: Any, kind: type, known: Iterable[Any] = ()) -> None:
+    """Refuse what are no options of a type, or such that its constructor refuses.
+
+    Args:
+        name: Name of the part.
+        options: The value to check.
+        kind: A frozen dataclass.
+        known: Options that need not be looked at again.
+    """
+    check_kind(name, options, kind)
+    try:
+        if not any(options is other or options == other for other in known):
+            _rebuilt(options)
+    except Exception as error:  # of whatever kind: options may hold anything where no constructor looked at them
+        raise bad_argument(name, f"{kind.__name__} that can be built", f"'{error}'", CURE) from error
+
+
+def _rebuilt(options: Any) -> Any:
+    """Return options, and those that are parts of them, built once more."""
+    parts = {field.name: getattr(options, field.name) for field in fields(options)}
+    return type(options)(**{name: _rebuilt(part) if is_dataclass(part) else part for name, part in parts.items()})
+
+
+def check_generator(name: str, state: Any) -> None:
+    """Refuse what is no state of one of numpy's random streams; numpy itself would read beyond its buffers."""
+    check_keys(name, state, ("bit_generator", "state"))
+    kind = state["bit_generator"]
+    if type(kind) is not str or kind not in STREAMS:
+        refuse(f"{name}['bit_generator']", "one of " + ", ".join(STREAMS), kind)
+    inner = state["state"]
+    check_keys(f"{name}['state']", inner, STREAMS[kind])
+    for part, (dtype, shape) in STREAMS[kind].items():
+        check_kept(f"{name}['state'][{part!r}]", inner[part], dtype, shape)
+    if kind == "MT19937":
+        check_whole(f"{name}['state']['pos']", inner.get("pos"), 0, 624)
+        return
+    check_whole(f"{name}['has_uint32']", state.get("has_uint32"), 0, 1)
+    check_whole(f"{name}['uinteger']", state.get("uinteger"), 0, 2**32 - 1)
+    if kind in ("PCG64", "PCG64DXSM"):
+        for part in ("state", "inc"):
+            check_whole(f"{name}['state'][{part!r}]", inner.get(part), 0, 2**128 - 1)
+    elif kind == "Philox":
+        check_whole(f"{name}['buffer_pos']", state.get("buffer_pos"), 0, 4)
+        check_kept(f"{name}['buffer']", state.get("buffer"), np.dtype(np.uint64), (4,))
+
+
+def generator_of(state: Mapping[str, Any]) -> np.random.Generator:
+    """Return a random stream that goes on from a state that `check_generator` passed."""
+    kinds: dict[str, Any] = {name: getattr(np.random, name) for name in STREAMS}
+    stream = np.random.Generator(kinds[state["bit_generator"]](0))
+    stream.bit_generator.state = state
+    return stream
+
+
+def check_each(name: str, values: Sequence[Any], length: int) -> Iterable[tuple[str, Any]]:
+    """Return each of so many parts with its name, or refuse what is no tuple or list of them."""
+    check_length(name, values, length)
+    return [(f"{name}[{i}]", value) for i, value in enumerate(values)]
+
+
+def warm() -> None:
+    """Make all versions of the kernels ready that states need."""
+    for is_open in (True, False):
+        for dtype in (FLOAT64, FLOAT32, INT64, INT32):
+            values = np.zeros((1, 1), dtype)
+            values.setflags(write=is_open)
+            check = check_floats if dtype.kind == "f" else check_indices
+            check("warm", values, (1, 1), 0, 1, dtype=dtype)
+        names = np.zeros(1, np.int64)
+        names.setflags(write=is_open)
+        check_ascending("warm", names)

@@ -1,0 +1,35 @@
+"""The compiled inner loops of the filter: one robot's frame, for all particles.
+
+Particles are taken in blocks of `LANES`, and every loop over the lanes of a block is plain arithmetic on rows of one
+flat workspace, which the compiler turns into vector instructions; decisions become masks. A row is addressed as
+`work[ROW + i]`, lane i, with ROW a multiple of LANES known at compile time.
+
+Landmarks lie in `values[row, block, c, lane]` (flattened) with c = (x, y, z, Sxx, Sxy, Sxz, Syy, Syz, Szz) in the map
+frame, and `counts[row, particle]` says how often the particle saw it (0: it does not hold it). Resampling does not move
+them: see `fastslam/particle_maps.py`, which says what `row_of`, `map_of` and `maps` are. Everything is expressed in the
+map frame, where the derivative of a measured point with respect to the landmark is the identity (the robot only yaws).
+
+The measurement model (Eqs. 5-7). A landmark mu lies at e = mu - p from the camera centre p. A point v measured in the
+camera, turned into map axes, gives the innovation r = k (R v - e) with k = Z_predicted / Z_measured. This is the EKF in
+(u, v, disparity): the innovation and its covariance are those of the image coordinates, mapped to metres at the
+predicted point, and the density of the image coordinates is that of r times Z_predicted^4 (times a constant of the
+camera). Where the caller gives covariances, k = 1 and there is no such factor.
+
+The pose. x = x0 + C xi with xi ~ N(0, I) before the frame: nothing is inverted, so a motion without noise needs no
+special case. With A = (dr/dx) C and S = Sigma + R, a match adds J = A^T S^-1 A to the information of xi and
+g = A^T S^-1 r to the gradient. A gate takes S + A P A^T, with P the covariance of xi.
+"""
+
+from slam_backend.fastslam._kernels.inputs import extent, noises_to_robot_axes, read_team, to_robot_axes
+from slam_backend.fastslam._kernels.landmark_ekf import YOUNG
+from slam_backend.fastslam._kernels.layout import FAR, IDLE, LANES, MIN_DEPTH, MOVED, PLACED, STOOD
+from slam_backend.fastslam._kernels.map_storage import carry_odds, gather, hold, outline, refresh, resample
+from slam_backend.fastslam._kernels.relative_poses import stand
+from slam_backend.fastslam._kernels.step import take_turns, write_sigmas
+from slam_backend.fastslam._kernels.weights import add_share, mixture
+
+__all__ = [
+    "FAR", "IDLE", "LANES", "MIN_DEPTH", "MOVED", "PLACED", "STOOD", "YOUNG",
+    "add_share", "carry_odds", "extent", "gather", "hold", "mixture", "noises_to_robot_axes", "outline", "read_team",
+    "refresh", "resample", "stand", "take_turns", "to_robot_axes", "write_sigmas",
+]  # fmt: skip

@@ -1,0 +1,94 @@
+"""What robots read in a step: how far its points reach, measurements in the robots' axes, all of it in one table."""
+
+import math
+
+import numpy as np
+
+from slam_backend.core.jit import device, in_place
+from slam_backend.core.validation import Float32Array, FloatArray, IntArray
+from slam_backend.fastslam._kernels.layout import ACT, BEGIN, COUNT, END, GIVEN, MIN_DEPTH, MOVED, NAMED
+
+
+@in_place
+def extent(points: FloatArray) -> tuple[float, float]:
+    """Return the smallest depth Z and the largest coordinate, by magnitude, of points (n, 3), camera frame.
+
+    Both are NaN if any number is.
+    """
+    nearest, farthest = np.inf, 0.0
+    for n in range(len(points)):
+        nearest = min(nearest, points[n, 2])
+        for c in range(3):
+            if math.isnan(points[n, c]):
+                return np.nan, np.nan
+            farthest = max(farthest, abs(points[n, c]))
+    return nearest, farthest
+
+
+@in_place
+def to_robot_axes(points: FloatArray, sightings: FloatArray) -> None:
+    """Turn measured points (n, 3) from camera axes to the robot's: x ahead, y left, z up.
+
+    They are written into `sightings` (n, 9), relative to the camera centre, followed by zeros.
+    """
+    for i in range(len(points)):
+        sightings[i, 0], sightings[i, 1], sightings[i, 2] = points[i, 2], -points[i, 0], -points[i, 1]
+        for c in range(3, 9):
+            sightings[i, c] = 0.0
+
+
+@in_place
+def noises_to_robot_axes(covariances: FloatArray, sightings: FloatArray) -> None:
+    """Turn covariances (n, 3, 3) of measured points likewise, into the last six columns, upper triangles by rows."""
+    for i in range(len(covariances)):
+        own, noise = covariances[i], sightings[i, 3:]
+        noise[0], noise[1], noise[2] = own[2, 2], -own[2, 0], -own[2, 1]
+        noise[3], noise[4], noise[5] = own[0, 0], own[0, 1], own[1, 1]
+
+
+@device
+@in_place
+def _are_within(vectors: Float32Array, limit: float) -> bool:
+    """Return whether no component of vectors (n, d) is larger, by magnitude, or NaN."""
+    within, most = True, np.float32(limit)
+    for i in range(len(vectors)):
+        for j in range(vectors.shape[1]):
+            within &= abs(vectors[i, j]) <= most
+    return within
+
+
+@in_place
+def read_team(
+    moves: FloatArray, points: FloatArray, looks: Float32Array, ends: IntArray, farthest_move: float,
+    farthest_point: float, largest_look: float, table: IntArray, sightings: FloatArray,
+) -> bool:  # fmt: skip
+    """Write what N robots read that have all moved and looked, without covariances and names, if nothing is amiss.
+
+    Args:
+        moves: (N, 3) [m, m, rad] odometry.
+        points: (n, 3) [m], camera frames, one robot's after the other's.
+        looks: (n, d) their descriptors.
+        ends: (N,) where the points of each end.
+        farthest_move: [m, rad] limit to the odometry.
+        farthest_point: [m] limit to coordinates.
+        largest_look: Limit to components of descriptors.
+        table, sightings: (N, 6), (n, 9), written as in `StepInput`.
+
+    Returns:
+        Whether ends rise up to n, numbers are within their limits, and depths begin at `MIN_DEPTH`. If not, what is
+        written means nothing.
+    """
+    begin = 0
+    for robot in range(len(moves)):
+        for c in range(3):
+            if not abs(moves[robot, c]) <= farthest_move:  # NaN is not
+                return False
+        end, turn = ends[robot], table[robot]
+        if end < begin:
+            return False
+        turn[ACT], turn[BEGIN], turn[END], turn[GIVEN], turn[NAMED], turn[COUNT] = MOVED, begin, end, 0, 0, end - begin
+        begin = end
+    to_robot_axes(points, sightings)
+    nearest, farthest = extent(points)
+    near = nearest >= MIN_DEPTH and farthest <= farthest_point
+    return begin == len(points) and near and _are_within(looks, largest_look)

@@ -1,0 +1,286 @@
+"""The landmarks' own EKFs at a known pose, for all lanes of a block (Eqs. 5-10; Algorithm 1, l. 30-37)."""
+
+import numpy as np
+
+from slam_backend.core.jit import device, lanes, lanes_inlined, room
+from slam_backend.core.simd_math import cofactors_cancel, inverted, inverted_by_parts, quadratic_form
+from slam_backend.core.validation import FloatArray, Int32Array, IntArray
+from slam_backend.fastslam._kernels.candidates import mask_of
+from slam_backend.fastslam._kernels.layout import (
+    COS,
+    DEPTH,
+    LANES,
+    MIN_DEPTH,
+    N00,
+    N01,
+    N02,
+    N11,
+    N12,
+    N22,
+    Q_D,
+    R0,
+    R1,
+    R2,
+    SIN,
+    TILE,
+    X,
+    Y,
+)
+from slam_backend.fastslam._kernels.map_storage import tile_of
+from slam_backend.fastslam._kernels.measurement_model import count_likelihood, innovate
+
+FLAT = 1e-12  # where cofactors keep less, S has eigenvalues in a ratio of a million, and K R loses its digits
+YOUNG = 4  # a landmark seen up to so many times is updated by the iterated EKF: its depth is still vague
+
+
+@lanes_inlined
+def _congruent(
+    m00: float, m01: float, m02: float, m10: float, m11: float, m12: float, m20: float, m21: float, m22: float,
+    a00: float, a01: float, a02: float, a11: float, a12: float, a22: float,
+) -> tuple[float, float, float, float, float, float]:  # fmt: skip
+    """Return M A M^T (6) of a symmetric A (6)."""
+    h00, h01, h02 = m00 * a00 + m01 * a01 + m02 * a02, m00 * a01 + m01 * a11 + m02 * a12, (
+        m00 * a02 + m01 * a12 + m02 * a22
+    )  # fmt: skip
+    h10, h11, h12 = m10 * a00 + m11 * a01 + m12 * a02, m10 * a01 + m11 * a11 + m12 * a12, (
+        m10 * a02 + m11 * a12 + m12 * a22
+    )  # fmt: skip
+    h20, h21, h22 = m20 * a00 + m21 * a01 + m22 * a02, m20 * a01 + m21 * a11 + m22 * a12, (
+        m20 * a02 + m21 * a12 + m22 * a22
+    )  # fmt: skip
+    return (
+        h00 * m00 + h01 * m01 + h02 * m02, h00 * m10 + h01 * m11 + h02 * m12, h00 * m20 + h01 * m21 + h02 * m22,
+        h10 * m10 + h11 * m11 + h12 * m12, h10 * m20 + h11 * m21 + h12 * m22, h20 * m20 + h21 * m21 + h22 * m22,
+    )  # fmt: skip
+
+
+@lanes_inlined
+def _updated(
+    work: FloatArray, tile: FloatArray, i: int, i00: float, i01: float, i02: float, i11: float, i12: float, i22: float,
+    match: bool, walk: float, flat: bool,
+) -> None:  # fmt: skip
+    """Update a landmark where `match`, S^-1 given (Eqs. 8-10), and let it walk: Sigma + walk I.
+
+    `flat` (a constant) says that K has lost digits which K R cannot do without: then by Joseph's form.
+    """
+    p00, p01, p02 = tile[3 * LANES + i], tile[4 * LANES + i], tile[5 * LANES + i]
+    p11, p12, p22 = tile[6 * LANES + i], tile[7 * LANES + i], tile[8 * LANES + i]
+    n00, n01, n02 = work[N00 + i], work[N01 + i], work[N02 + i]
+    n11, n12, n22 = work[N11 + i], work[N12 + i], work[N22 + i]
+    rx, ry, rz = work[R0 + i], work[R1 + i], work[R2 + i]
+    k00, k01, k02 = p00 * i00 + p01 * i01 + p02 * i02, p00 * i01 + p01 * i11 + p02 * i12, (
+        p00 * i02 + p01 * i12 + p02 * i22
+    )  # Eq. 8  # fmt: skip
+    k10, k11, k12 = p01 * i00 + p11 * i01 + p12 * i02, p01 * i01 + p11 * i11 + p12 * i12, (
+        p01 * i02 + p11 * i12 + p12 * i22
+    )  # fmt: skip
+    k20, k21, k22 = p02 * i00 + p12 * i01 + p22 * i02, p02 * i01 + p12 * i11 + p22 * i12, (
+        p02 * i02 + p12 * i12 + p22 * i22
+    )  # fmt: skip
+    tile[i] += k00 * rx + k01 * ry + k02 * rz if match else 0.0  # Eq. 9
+    tile[LANES + i] += k10 * rx + k11 * ry + k12 * rz if match else 0.0
+    tile[2 * LANES + i] += k20 * rx + k21 * ry + k22 * rz if match else 0.0
+    if flat:
+        a00, a01, a02, a11, a12, a22 = _congruent(
+            1.0 - k00, -k01, -k02, -k10, 1.0 - k11, -k12, -k20, -k21, 1.0 - k22, p00, p01, p02, p11, p12, p22
+        )
+        b00, b01, b02, b11, b12, b22 = _congruent(
+            k00, k01, k02, k10, k11, k12, k20, k21, k22, n00, n01, n02, n11, n12, n22
+        )
+        tile[3 * LANES + i] = a00 + b00 + walk if match else p00
+        tile[4 * LANES + i] = a01 + b01 if match else p01
+        tile[5 * LANES + i] = a02 + b02 if match else p02
+        tile[6 * LANES + i] = a11 + b11 + walk if match else p11
+        tile[7 * LANES + i] = a12 + b12 if match else p12
+        tile[8 * LANES + i] = a22 + b22 + walk if match else p22
+        return
+    # Eq. 10, (I - K) Sigma, written as K R: no difference of nearly equal numbers, and made symmetric.
+    q01 = 0.5 * (k00 * n01 + k01 * n11 + k02 * n12 + k10 * n00 + k11 * n01 + k12 * n02)
+    q02 = 0.5 * (k00 * n02 + k01 * n12 + k02 * n22 + k20 * n00 + k21 * n01 + k22 * n02)
+    q12 = 0.5 * (k10 * n02 + k11 * n12 + k12 * n22 + k20 * n01 + k21 * n11 + k22 * n12)
+    tile[3 * LANES + i] = k00 * n00 + k01 * n01 + k02 * n02 + walk if match else p00
+    tile[4 * LANES + i] = q01 if match else p01
+    tile[5 * LANES + i] = q02 if match else p02
+    tile[6 * LANES + i] = k10 * n01 + k11 * n11 + k12 * n12 + walk if match else p11
+    tile[7 * LANES + i] = q12 if match else p12
+    tile[8 * LANES + i] = k20 * n02 + k21 * n12 + k22 * n22 + walk if match else p22
+
+
+@lanes_inlined
+def _sum(work: FloatArray, tile: FloatArray, i: int) -> tuple[float, float, float, float, float, float]:
+    """Return S = Sigma + R (Eq. 7)."""
+    return (
+        tile[3 * LANES + i] + work[N00 + i], tile[4 * LANES + i] + work[N01 + i], tile[5 * LANES + i] + work[N02 + i],
+        tile[6 * LANES + i] + work[N11 + i], tile[7 * LANES + i] + work[N12 + i], tile[8 * LANES + i] + work[N22 + i],
+    )  # fmt: skip
+
+
+@lanes_inlined
+def _inverse_of_sum(
+    work: FloatArray, tile: FloatArray, i: int, flat: bool
+) -> tuple[float, float, float, float, float, float, float]:
+    """Return S^-1 and |S|; `flat` (a constant) says that cofactors cancel."""
+    a, b, c, d, e, f = _sum(work, tile, i)
+    return inverted_by_parts(a, b, c, d, e, f) if flat else inverted(a, b, c, d, e, f)
+
+
+@device
+@lanes
+def _any_flat(work: FloatArray, tile: FloatArray) -> bool:
+    """Tell whether S is flat in any lane."""
+    count = 0
+    for i in range(LANES):
+        a, b, c, d, e, f = _sum(work, tile, i)
+        count += 1 if cofactors_cancel(a, b, c, d, e, f, FLAT) else 0
+    return count > 0
+
+
+@lanes_inlined
+def _update(work: FloatArray, tile: FloatArray, mask: FloatArray, walk: float, flat: bool) -> None:
+    """Do what `update` does."""
+    for i in range(LANES):
+        i00, i01, i02, i11, i12, i22, _ = _inverse_of_sum(work, tile, i, flat)
+        match = mask[i] > 0.0 and work[DEPTH + i] >= MIN_DEPTH
+        _updated(work, tile, i, i00, i01, i02, i11, i12, i22, match, walk, flat)
+
+
+@device
+@lanes
+def update(work: FloatArray, tile: FloatArray, mask: FloatArray, walk: float) -> None:
+    """At a known pose: update the landmark where `mask` is 1 and it lies ahead of the camera (Eqs. 5-10).
+
+    Args:
+        walk: Variance [m^2] by which the landmark may have moved, along each axis, when it is seen the next time.
+    """
+    if _any_flat(work, tile):
+        _update(work, tile, mask, walk, True)
+    else:
+        _update(work, tile, mask, walk, False)
+
+
+@lanes_inlined
+def _gate_and_update(
+    work: FloatArray, tile: FloatArray, record: FloatArray, chosen: FloatArray, seen: Int32Array, q: float,
+    admit: FloatArray, gate: float, walk: float, flat: bool,
+) -> None:  # fmt: skip
+    """Do what `gate_and_update` does."""
+    for i in range(LANES):
+        i00, i01, i02, i11, i12, i22, det = _inverse_of_sum(work, tile, i, flat)
+        distance = quadratic_form(i00, i01, i02, i11, i12, i22, work[R0 + i], work[R1 + i], work[R2 + i])
+        depth = work[DEPTH + i]
+        match = admit[i] > 0.0 and distance <= gate and depth >= MIN_DEPTH
+        _updated(work, tile, i, i00, i01, i02, i11, i12, i22, match, walk, flat)
+        count_likelihood(work, i, match, distance, det, depth)
+        record[Q_D + i] = distance
+        chosen[i] = q if match else chosen[i]
+        seen[i] += np.int32(1) if match else np.int32(0)
+
+
+@device
+@lanes
+def gate_and_update(
+    work: FloatArray, tile: FloatArray, record: FloatArray, chosen: FloatArray, seen: Int32Array, q: float,
+    admit: FloatArray, gate: float, walk: float,
+) -> None:  # fmt: skip
+    """At a known pose: where admitted and inside the gate, weigh and update the landmark (Eqs. 5-11).
+
+    Args:
+        chosen: (LANES,) becomes q where the lane matched.
+        seen: (LANES,) is counted up there.
+        admit: (LANES,) 1 where the lane may match.
+        record: Row Q_D is written.
+        walk: As in `update`.
+    """
+    if _any_flat(work, tile):
+        _gate_and_update(work, tile, record, chosen, seen, q, admit, gate, walk, True)
+    else:
+        _gate_and_update(work, tile, record, chosen, seen, q, admit, gate, walk, False)
+
+
+@device
+@lanes
+def find_young(seen: Int32Array, mask: FloatArray, young: FloatArray) -> int:
+    """Write 1 where a matched landmark was seen a few times only; return how many those are."""
+    count = 0
+    for i in range(len(seen)):
+        on = mask[i] > 0.0 and seen[i] <= YOUNG
+        young[i] = 1.0 if on else 0.0
+        count += 1 if on else 0
+    return count
+
+
+@device
+@lanes
+def relinearise(work: FloatArray, tile: FloatArray, before: FloatArray) -> None:
+    """Refer the innovation, taken at the means in `tile`, to those in `before`, which come back (iterated EKF)."""
+    for i in range(LANES):
+        work[R0 + i] += tile[i] - before[i]
+        work[R1 + i] += tile[LANES + i] - before[LANES + i]
+        work[R2 + i] += tile[2 * LANES + i] - before[2 * LANES + i]
+    for j in range(TILE):
+        tile[j] = before[j]
+
+
+@device
+@lanes
+def count_matches(seen: Int32Array, mask: FloatArray) -> None:
+    for i in range(len(seen)):
+        seen[i] += np.int32(1) if mask[i] > 0.0 else np.int32(0)
+
+
+@device
+@lanes
+def update_matched(
+    work: FloatArray, match: FloatArray, mask: FloatArray, values: FloatArray, counts: Int32Array, row_of: IntArray,
+    block: int, points: FloatArray, noises: FloatArray, given: bool, camera: FloatArray, starts: IntArray,
+    slots: IntArray, walk: float,
+) -> None:  # fmt: skip
+    """At a known pose: update the landmarks that the lanes of one block matched, young ones by the iterated EKF."""
+    padded, first = counts.shape[1], block * LANES
+    young, before = room(LANES), room(TILE)
+    for b in range(len(starts) - 1):
+        for q in range(starts[b], starts[b + 1]):
+            if mask_of(match[b], float(q), mask) == 0:
+                continue
+            row = row_of[slots[q]]
+            tile, seen = values[tile_of(padded, row, block)], counts[row, first : first + LANES]
+            num_young = find_young(seen, mask, young)
+            count_matches(seen, mask)
+            innovate(work, tile, points, noises, b, given, camera)
+            if num_young > 0:
+                for j in range(TILE):
+                    before[j] = tile[j]
+                update(work, tile, young, 0.0)
+                innovate(work, tile, points, noises, b, given, camera)
+                relinearise(work, tile, before)
+            update(work, tile, mask, walk)
+
+
+@device
+@lanes
+def new_landmark(
+    work: FloatArray, values: FloatArray, counts: Int32Array, row: int, block: int, points: FloatArray,
+    noises: FloatArray, n: int, given: bool, camera: FloatArray, mask: FloatArray, walk: float,
+) -> None:  # fmt: skip
+    """Write mean and covariance of a landmark first seen from a known pose (Algorithm 1, l. 30-31 corrected).
+
+    All lanes of the block are written; counts become 1 where `mask` is, and 0 elsewhere: those do not hold it.
+    """
+    tile = values[tile_of(counts.shape[1], row, block)]
+    seen = counts[row, block * LANES : (block + 1) * LANES]
+    ahead, left, up = camera[4] + points[n, 0], camera[5] + points[n, 1], camera[6] + points[n, 2]
+    for i in range(LANES):
+        c, s = work[COS + i], work[SIN + i]
+        tile[i] = work[X + i] + c * ahead - s * left
+        tile[LANES + i] = work[Y + i] + s * ahead + c * left
+        tile[2 * LANES + i] = up
+    innovate(work, tile, points, noises, n, given, camera)
+    for i in range(LANES):  # l. 31 *: G^-1 R G^-T
+        tile[3 * LANES + i] = work[N00 + i] + walk
+        tile[4 * LANES + i] = work[N01 + i]
+        tile[5 * LANES + i] = work[N02 + i]
+        tile[6 * LANES + i] = work[N11 + i] + walk
+        tile[7 * LANES + i] = work[N12 + i]
+        tile[8 * LANES + i] = work[N22 + i] + walk
+    for i in range(len(seen)):
+        seen[i] = np.int32(1) if mask[i] > 0.0 else np.int32(0)

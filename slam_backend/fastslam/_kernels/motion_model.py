@@ -1,0 +1,222 @@
+"""Motion of all lanes of a block: predicted with its covariance, sampled, or carried on blindly (Eq. 4)."""
+
+import math
+
+from slam_backend.core.jit import device, lanes, lanes_inlined
+from slam_backend.core.simd_math import sine_cosine, wrapped
+from slam_backend.core.validation import FloatArray
+from slam_backend.fastslam._kernels.layout import (
+    C00,
+    C01,
+    C10,
+    C11,
+    C20,
+    C21,
+    C22,
+    COS,
+    DRAW0,
+    DRAW1,
+    DRAW2,
+    LANES,
+    N00,
+    N01,
+    N02,
+    N11,
+    N12,
+    N22,
+    SIN,
+    T0,
+    WIDE,
+    X0,
+    Y0,
+    T,
+    X,
+    Y,
+)
+
+WIDE_HEADING = 0.03  # [rad]; where the heading is less sure, one step of Gauss-Newton is not enough
+ZERO_PIVOT = 1e-12  # relative to the variance: below it a direction is taken to be exact
+
+
+@device
+@lanes
+def load_rows(work: FloatArray, low: int, rows: FloatArray, first: int) -> None:
+    """Copy a block of rows (c, P), from lane `first` on, into the rows of the workspace from `low` on."""
+    for c in range(len(rows)):
+        source, target = rows[c, first : first + LANES], work[low + c * LANES : low + (c + 1) * LANES]
+        for i in range(LANES):
+            target[i] = source[i]
+
+
+@device
+@lanes
+def store_rows(work: FloatArray, low: int, rows: FloatArray, first: int) -> None:
+    """Copy rows of the workspace from `low` on into a block of rows (c, P), from lane `first` on."""
+    for c in range(len(rows)):
+        source, target = work[low + c * LANES : low + (c + 1) * LANES], rows[c, first : first + LANES]
+        for i in range(LANES):
+            target[i] = source[i]
+
+
+@device
+@lanes
+def prior(
+    work: FloatArray, poses: FloatArray, means: FloatArray, covariances: FloatArray, blind: bool, first: int
+) -> None:
+    """Write a block's poses before the motion into rows X0 .. T0, their covariances into rows N00 .. N22.
+
+    They are N(x^, P^) where the robot is blind, else the samples, exact.
+    """
+    if blind:
+        load_rows(work, X0, means, first)
+        load_rows(work, N00, covariances, first)
+    else:
+        load_rows(work, X0, poses, first)
+        for j in range(N00, N22 + LANES):
+            work[j] = 0.0
+
+
+@device
+@lanes
+def predict(work: FloatArray, move: FloatArray, sigmas: FloatArray) -> None:
+    """Move the poses in rows X0 .. N22 to the predicted x0, and write a factor C of its covariance P0 (Eq. 4).
+
+    C = T L with L the lower Cholesky factor of T^T P0 T, where T is the turn by the predicted heading. Rows N00 .. N22
+    hold T^T P0 T afterwards, COS and SIN the turn.
+
+    Args:
+        move: (3,) u, previous robot frame.
+        sigmas: (3,) standard deviations of u.
+    """
+    dx, dy, turn = move[0], move[1], move[2]
+    v0, v1, v2 = sigmas[0] ** 2, sigmas[1] ** 2, sigmas[2] ** 2
+    for i in range(LANES):
+        s, c = sine_cosine(work[T0 + i])
+        ox, oy = c * dx - s * dy, s * dx + c * dy
+        work[X0 + i] += ox
+        work[Y0 + i] += oy
+        work[T0 + i] += turn
+        p00, p01, p02 = work[N00 + i], work[N01 + i], work[N02 + i]
+        p11, p12, p22 = work[N11 + i], work[N12 + i], work[N22 + i]
+        # F = [[1, 0, -oy], [0, 1, ox], [0, 0, 1]]
+        q00 = p00 - 2.0 * oy * p02 + oy * oy * p22 + c * c * v0 + s * s * v1
+        q01 = p01 + ox * p02 - oy * p12 - ox * oy * p22 + c * s * (v0 - v1)
+        q02 = p02 - oy * p22
+        q11 = p11 + 2.0 * ox * p12 + ox * ox * p22 + s * s * v0 + c * c * v1
+        q12 = p12 + ox * p22
+        # Factorised in the robot's axes, T^T P0 T: how the map frame happens to be turned plays no part.
+        s, c = sine_cosine(work[T0 + i])
+        work[N00 + i] = c * c * q00 + 2.0 * c * s * q01 + s * s * q11
+        work[N01 + i] = c * s * (q11 - q00) + (c * c - s * s) * q01
+        work[N02 + i] = c * q02 + s * q12
+        work[N11 + i] = s * s * q00 - 2.0 * c * s * q01 + c * c * q11
+        work[N12 + i] = c * q12 - s * q02
+        work[N22 + i] = p22 + v2
+        work[COS + i], work[SIN + i] = c, s
+        work[WIDE + i] = 1.0 if p22 + v2 > WIDE_HEADING**2 else 0.0
+    for i in range(LANES):
+        _factorise(work, i)
+
+
+@device
+@lanes
+def _to_map_axes(work: FloatArray) -> None:
+    """Turn the covariance in rows N00 .. N22 from the robot's axes to the map's: T P T^T."""
+    for i in range(LANES):
+        c, s = work[COS + i], work[SIN + i]
+        r00, r01, r02 = work[N00 + i], work[N01 + i], work[N02 + i]
+        r11, r12 = work[N11 + i], work[N12 + i]
+        work[N00 + i] = c * c * r00 - 2.0 * c * s * r01 + s * s * r11
+        work[N01 + i] = c * s * (r00 - r11) + (c * c - s * s) * r01
+        work[N02 + i] = c * r02 - s * r12
+        work[N11 + i] = s * s * r00 + 2.0 * c * s * r01 + c * c * r11
+        work[N12 + i] = s * r02 + c * r12
+
+
+@lanes_inlined
+def _factorise(work: FloatArray, i: int) -> None:
+    """Write C = T L, L L^T the covariance in rows N00 .. N22; a vanishing pivot gives L a column of zeros."""
+    q00, q11, q22 = work[N00 + i], work[N11 + i], work[N22 + i]
+    c, s = work[COS + i], work[SIN + i]
+    l00 = math.sqrt(q00 if q00 > 0.0 else 0.0)
+    inverse = 1.0 / l00 if q00 > 0.0 else 0.0
+    l10, l20 = work[N01 + i] * inverse, work[N02 + i] * inverse
+    rest = q11 - l10 * l10
+    rest = rest if rest > ZERO_PIVOT * q11 else 0.0
+    l11 = math.sqrt(rest)
+    inverse = 1.0 / l11 if rest > 0.0 else 0.0
+    l21 = (work[N12 + i] - l20 * l10) * inverse
+    rest = q22 - l20 * l20 - l21 * l21
+    work[C00 + i], work[C01 + i] = c * l00 - s * l10, -s * l11
+    work[C10 + i], work[C11 + i] = s * l00 + c * l10, c * l11
+    work[C20 + i], work[C21 + i] = l20, l21
+    work[C22 + i] = math.sqrt(rest if rest > ZERO_PIVOT * q22 else 0.0)
+
+
+@device
+@lanes
+def enter_pose(work: FloatArray, poses: FloatArray, first: int) -> None:
+    load_rows(work, X, poses, first)
+    for i in range(LANES):
+        work[SIN + i], work[COS + i] = sine_cosine(work[T + i])
+
+
+@device
+@lanes
+def take_draws(work: FloatArray, normals: FloatArray, first: int) -> None:
+    """Write a block's normal draws (M, 3) into the rows DRAW0 .. DRAW2, zeros for surplus lanes."""
+    for i in range(LANES):
+        m = first + i
+        for c in range(3):
+            work[DRAW0 + c * LANES + i] = normals[m, c] if m < len(normals) else 0.0
+
+
+@device
+@lanes
+def sample_motion(
+    work: FloatArray, poses: FloatArray, first: int, odometry: FloatArray, sigmas: FloatArray, normals: FloatArray
+) -> None:
+    """Replace poses by draws from p(x_t | x_{t-1}, u_t), each particle from its own past (Eq. 4)."""
+    take_draws(work, normals, first)
+    enter_pose(work, poses, first)
+    for i in range(LANES):
+        dx = odometry[0] + work[DRAW0 + i] * sigmas[0]
+        dy = odometry[1] + work[DRAW1 + i] * sigmas[1]
+        c, s = work[COS + i], work[SIN + i]
+        poses[0, first + i] = work[X + i] + (c * dx - s * dy)
+        poses[1, first + i] = work[Y + i] + (s * dx + c * dy)
+        poses[2, first + i] = wrapped(work[T + i] + odometry[2] + work[DRAW2 + i] * sigmas[2])
+
+
+@device
+@lanes
+def take_as_exact(poses: FloatArray, means: FloatArray, covariances: FloatArray) -> None:
+    """Write N(x^, P^), (3, P) and (6, P), of poses (3, P) that are exactly where their particles have them."""
+    for c in range(3):
+        for m in range(poses.shape[1]):
+            means[c, m] = poses[c, m]
+    covariances[:] = 0.0
+
+
+@device
+@lanes
+def move_blind(
+    poses: FloatArray, means: FloatArray, covariances: FloatArray, blind: bool, odometry: FloatArray,
+    sigmas: FloatArray, normals: FloatArray, work: FloatArray,
+) -> None:  # fmt: skip
+    """Move a robot that sees nothing: each particle's N(x^, P^) is propagated, and its sample moves by itself.
+
+    Args:
+        poses: (3, P) the samples; replaced.
+        means, covariances: (3, P), (6, P) N(x^, P^), written; read if `blind`, else particles start from their samples.
+        odometry, sigmas, normals: As in `update_fastslam1`.
+        work: Working space.
+    """
+    for block in range(poses.shape[1] // LANES):
+        first = block * LANES
+        prior(work, poses, means, covariances, blind, first)
+        predict(work, odometry, sigmas)
+        _to_map_axes(work)
+        store_rows(work, X0, means, first)
+        store_rows(work, N00, covariances, first)
+        sample_motion(work, poses, first, odometry, sigmas, normals)

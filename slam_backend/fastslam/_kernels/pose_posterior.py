@@ -1,0 +1,228 @@
+"""The pose given its matches: Gauss-Newton in xi, and the Gaussian from which it is sampled."""
+
+import math
+
+from slam_backend.core.jit import device, lanes, lanes_inlined
+from slam_backend.core.simd_math import inverted, log_of, quadratic_form, sine_cosine, wrapped
+from slam_backend.core.validation import FloatArray
+from slam_backend.fastslam._kernels.layout import (
+    C00,
+    C01,
+    C10,
+    C11,
+    C20,
+    C21,
+    C22,
+    COS,
+    DRAW0,
+    DRAW1,
+    DRAW2,
+    G0,
+    G1,
+    G2,
+    J00,
+    J01,
+    J02,
+    J11,
+    J12,
+    J22,
+    LANES,
+    Q_D,
+    QG0,
+    QG1,
+    QG2,
+    QJ00,
+    QJ01,
+    QJ02,
+    QJ11,
+    QJ12,
+    QJ22,
+    SIN,
+    SPREAD00,
+    SPREAD01,
+    SPREAD02,
+    SPREAD11,
+    SPREAD12,
+    SPREAD22,
+    T0,
+    WIDE,
+    X0,
+    XI0,
+    XI1,
+    XI2,
+    Y0,
+    T,
+    X,
+    Y,
+)
+from slam_backend.fastslam._kernels.measurement_model import total_log_likelihood
+
+
+@device
+@lanes
+def begin_pose(work: FloatArray) -> None:
+    """Start from xi = 0, at the predicted pose, whose turn is in rows COS and SIN already."""
+    for i in range(LANES):
+        work[XI0 + i] = 0.0
+        work[XI1 + i] = 0.0
+        work[XI2 + i] = 0.0
+        work[X + i] = work[X0 + i]
+        work[Y + i] = work[Y0 + i]
+        work[T + i] = work[T0 + i]
+
+
+@device
+@lanes
+def place(work: FloatArray) -> None:
+    """Write the pose rows X .. SIN of x0 + C xi."""
+    for i in range(LANES):
+        xi0, xi1, xi2 = work[XI0 + i], work[XI1 + i], work[XI2 + i]
+        theta = work[T0 + i] + work[C20 + i] * xi0 + work[C21 + i] * xi1 + work[C22 + i] * xi2
+        work[X + i] = work[X0 + i] + work[C00 + i] * xi0 + work[C01 + i] * xi1
+        work[Y + i] = work[Y0 + i] + work[C10 + i] * xi0 + work[C11 + i] * xi1
+        work[T + i] = theta
+        work[SIN + i], work[COS + i] = sine_cosine(theta)
+
+
+@device
+@lanes
+def clear_sums(work: FloatArray) -> None:
+    """Start the system of xi from its prior N(0, I)."""
+    for i in range(LANES):
+        work[J00 + i] = 1.0
+        work[J01 + i] = 0.0
+        work[J02 + i] = 0.0
+        work[J11 + i] = 1.0
+        work[J12 + i] = 0.0
+        work[J22 + i] = 1.0
+        work[G0 + i] = work[XI0 + i]
+        work[G1 + i] = work[XI1 + i]
+        work[G2 + i] = work[XI2 + i]
+
+
+@lanes_inlined
+def add_terms(
+    work: FloatArray, i: int, on: bool, w: float, j00: float, j01: float, j02: float, j11: float, j12: float,
+    j22: float, g0: float, g1: float, g2: float,
+) -> None:  # fmt: skip
+    """Where `on`, add a match's share of the Gauss-Newton system, times w; elsewhere it may be NaN."""
+    work[J00 + i] += w * j00 if on else 0.0
+    work[J01 + i] += w * j01 if on else 0.0
+    work[J02 + i] += w * j02 if on else 0.0
+    work[J11 + i] += w * j11 if on else 0.0
+    work[J12 + i] += w * j12 if on else 0.0
+    work[J22 + i] += w * j22 if on else 0.0
+    work[G0 + i] += w * g0 if on else 0.0
+    work[G1 + i] += w * g1 if on else 0.0
+    work[G2 + i] += w * g2 if on else 0.0
+
+
+@device
+@lanes
+def sum_matches(work: FloatArray, record: FloatArray, weights: FloatArray) -> None:
+    """Add a candidate's share of the Gauss-Newton system, times `weights` (LANES)."""
+    for i in range(LANES):
+        add_terms(
+            work, i, weights[i] > 0.0, weights[i],
+            record[QJ00 + i], record[QJ01 + i], record[QJ02 + i], record[QJ11 + i], record[QJ12 + i], record[QJ22 + i],
+            record[QG0 + i], record[QG1 + i], record[QG2 + i],
+        )  # fmt: skip
+
+
+@device
+@lanes
+def robust_weights(record: FloatArray, chosen: FloatArray, q: float, gate: float, weights: FloatArray) -> int:
+    """Write Cauchy's weights 1 / (1 + D / gate) where the lane chose candidate q, else 0; return how many chose it."""
+    count = 0
+    for i in range(len(chosen)):
+        on = chosen[i] == q
+        weights[i] = 1.0 / (1.0 + record[Q_D + i] / gate) if on else 0.0
+        count += 1 if on else 0
+    return count
+
+
+@device
+@lanes
+def any_wide(work: FloatArray) -> int:
+    count = 0
+    for i in range(LANES):
+        count += 1 if work[WIDE + i] > 0.0 else 0
+    return count
+
+
+@device
+@lanes
+def step_pose(work: FloatArray, only_wide: bool) -> None:
+    """Take one step of Gauss-Newton from the sums: xi <- xi - J^-1 G, with covariance J^-1."""
+    for i in range(LANES):
+        go = work[WIDE + i] > 0.0 or not only_wide
+        i00, i01, i02, i11, i12, i22, _ = inverted(
+            work[J00 + i], work[J01 + i], work[J02 + i], work[J11 + i], work[J12 + i], work[J22 + i]
+        )
+        g0, g1, g2 = work[G0 + i], work[G1 + i], work[G2 + i]
+        work[XI0 + i] -= i00 * g0 + i01 * g1 + i02 * g2 if go else 0.0
+        work[XI1 + i] -= i01 * g0 + i11 * g1 + i12 * g2 if go else 0.0
+        work[XI2 + i] -= i02 * g0 + i12 * g1 + i22 * g2 if go else 0.0
+        work[SPREAD00 + i] = i00 if go else work[SPREAD00 + i]
+        work[SPREAD01 + i] = i01 if go else work[SPREAD01 + i]
+        work[SPREAD02 + i] = i02 if go else work[SPREAD02 + i]
+        work[SPREAD11 + i] = i11 if go else work[SPREAD11 + i]
+        work[SPREAD12 + i] = i12 if go else work[SPREAD12 + i]
+        work[SPREAD22 + i] = i22 if go else work[SPREAD22 + i]
+
+
+@device
+@lanes
+def posterior(work: FloatArray, log_likelihood: FloatArray, first: int) -> None:
+    """Weigh by the predictive likelihood and sample the pose, from the sums of pass B (Laplace's formula).
+
+    Rows DRAW0 .. DRAW2 hold what is drawn. Rows X0 .. T0 then hold the mean x^, SPREAD00 .. SPREAD22 the covariance
+    P^, X .. SIN the sample, theta wrapped.
+
+    Args:
+        log_likelihood: (P,), added to from lane `first` on.
+    """
+    own = log_likelihood[first : first + LANES]
+    for i in range(LANES):
+        i00, i01, i02, i11, i12, i22, det = inverted(
+            work[J00 + i], work[J01 + i], work[J02 + i], work[J11 + i], work[J12 + i], work[J22 + i]
+        )
+        g0, g1, g2 = work[G0 + i], work[G1 + i], work[G2 + i]
+        xi0, xi1, xi2 = work[XI0 + i], work[XI1 + i], work[XI2 + i]
+        gain = quadratic_form(i00, i01, i02, i11, i12, i22, g0, g1, g2)
+        own[i] += total_log_likelihood(work, i) - 0.5 * (xi0 * xi0 + xi1 * xi1 + xi2 * xi2 - gain + log_of(det))
+        xi0 -= i00 * g0 + i01 * g1 + i02 * g2
+        xi1 -= i01 * g0 + i11 * g1 + i12 * g2
+        xi2 -= i02 * g0 + i12 * g1 + i22 * g2
+        c00, c01, c10, c11 = work[C00 + i], work[C01 + i], work[C10 + i], work[C11 + i]
+        c20, c21, c22 = work[C20 + i], work[C21 + i], work[C22 + i]
+        x0, y0, t0 = work[X0 + i], work[Y0 + i], work[T0 + i]
+        work[X0 + i] = x0 + c00 * xi0 + c01 * xi1
+        work[Y0 + i] = y0 + c10 * xi0 + c11 * xi1
+        work[T0 + i] = t0 + c20 * xi0 + c21 * xi1 + c22 * xi2
+        # P^ = C J^-1 C^T
+        h00, h01 = c00 * i00 + c01 * i01, c00 * i01 + c01 * i11
+        h10, h11 = c10 * i00 + c11 * i01, c10 * i01 + c11 * i11
+        h20, h21, h22 = (
+            c20 * i00 + c21 * i01 + c22 * i02, c20 * i01 + c21 * i11 + c22 * i12, c20 * i02 + c21 * i12 + c22 * i22
+        )  # fmt: skip
+        work[SPREAD00 + i] = h00 * c00 + h01 * c01
+        work[SPREAD01 + i] = h10 * c00 + h11 * c01
+        work[SPREAD02 + i] = h20 * c00 + h21 * c01
+        work[SPREAD11 + i] = h10 * c10 + h11 * c11
+        work[SPREAD12 + i] = h20 * c10 + h21 * c11
+        work[SPREAD22 + i] = h20 * c20 + h21 * c21 + h22 * c22
+        n0, n1, n2 = work[DRAW0 + i], work[DRAW1 + i], work[DRAW2 + i]
+        l00 = math.sqrt(i00)
+        l10, l20 = i01 / l00, i02 / l00
+        l11 = math.sqrt(i11 - l10 * l10)
+        l21 = (i12 - l20 * l10) / l11
+        l22 = math.sqrt(i22 - l20 * l20 - l21 * l21)
+        xi0 += l00 * n0
+        xi1 += l10 * n0 + l11 * n1
+        xi2 += l20 * n0 + l21 * n1 + l22 * n2
+        theta = t0 + c20 * xi0 + c21 * xi1 + c22 * xi2
+        work[X + i] = x0 + c00 * xi0 + c01 * xi1
+        work[Y + i] = y0 + c10 * xi0 + c11 * xi1
+        work[T + i] = wrapped(theta)
+        work[SIN + i], work[COS + i] = sine_cosine(theta)

@@ -1,0 +1,205 @@
+"""Whether a landmark exists: log-odds that grow when it is seen, and fall when it is expected in view and not seen.
+
+The idea of using what is not seen is that of Montemerlo and Thrun (2003), "Simultaneous Localization and Mapping with
+Unknown Data Association Using FastSLAM", IEEE Int. Conf. on Robotics and Automation: each landmark of each particle
+carries the log-odds of its existence, a binary Bayes filter with a constant for a sighting and one for a miss. Here the
+constants follow from a detection model: with P(seen | it exists and is expected in view) = d and P(something is taken
+for it | it does not exist) = f,
+
+    sighting: + log(d / f)          miss: + log((1 - d) / (1 - f)).
+
+Log-odds stop at a cap, so that a landmark that was seen a thousand times can still be found to be gone. The filter's
+loops over landmarks and particles are in `fastslam/_kernels/existence.py`.
+"""
+
+from dataclasses import dataclass
+from math import exp, floor, log
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_backend.core.validation import MOST, FloatArray, IntArray, bad_argument, check_float, check_int, known_names
+from slam_backend.fastslam._kernels import existence as kernels
+from slam_backend.fastslam.particle_maps import ParticleMaps
+from slam_backend.models.camera import StereoCamera
+
+
+@known_names
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ExistenceModel:
+    """How likely landmarks are seen, and when they are given up.
+
+    Attributes:
+        detection: d. Share of frames in which a right landmark that is expected in view is matched. What hides
+            landmarks and is not in the model (walls, other robots, measurements that are rejected) lowers it; too high
+            a value deletes good landmarks.
+        false_alarm: f. Share of frames in which something is matched to a landmark that does not exist.
+        prior: Probability that a landmark exists once it has been measured for the first time.
+        delete_below: A landmark less probable than this is deleted.
+        cap: Landmarks never become more probable than this.
+        margin_px: Landmarks nearer than this to the border of the image are not expected in view [px].
+        range_share: Nor are those farther than this share of the camera's largest range.
+        nearest: Nor are those whose depth is below this [m]: a stereo pair does not see them.
+        frame_limit: Largest number of measurements that the sensor reports in a frame; None: it reports all. Of E
+            landmarks expected in view, each is then seen with probability d min(1, limit / E).
+    """
+
+    detection: float = 0.8
+    false_alarm: float = 0.05
+    prior: float = 0.5
+    delete_below: float = 0.01
+    cap: float = 0.999
+    margin_px: float = 8.0
+    range_share: float = 0.9
+    nearest: float = 0.3
+    frame_limit: int | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("detection", "false_alarm", "prior", "delete_below", "cap"):
+            value = check_float(f"existence.{name}", getattr(self, name), "Give a probability.", above=0.0)
+            if value >= 1.0:
+                raise bad_argument(f"existence.{name}", "a number < 1", value, "Nothing is certain.")
+        ascending = (("false_alarm", "detection"), ("delete_below", "prior"), ("prior", "cap"))
+        for lower, upper in ascending:
+            if getattr(self, lower) >= getattr(self, upper):
+                expected = f"a number > {lower} ({getattr(self, lower):g})"
+                raise bad_argument(f"existence.{upper}", expected, getattr(self, upper), "Check which is which.")
+        check_float("existence.margin_px", self.margin_px, "Use 0 for the whole image.", at_least=0.0)
+        check_float("existence.range_share", self.range_share, "Use 1 for the whole range.", above=0.0, at_most=1.0)
+        check_float("existence.nearest", self.nearest, "Use 0 for all points ahead.", at_least=0.0)
+        if self.frame_limit is not None:
+            check_int("existence.frame_limit", self.frame_limit, 1, "Use None if the sensor reports all it sees.", MOST)
+
+    @property
+    def log_odds_prior(self) -> float:
+        """Log-odds of a new landmark."""
+        return _log_odds(self.prior)
+
+    @property
+    def log_odds_floor(self) -> float:
+        """Below these log-odds a landmark is deleted."""
+        return _log_odds(self.delete_below)
+
+    @property
+    def log_odds_cap(self) -> float:
+        """Log-odds stop here."""
+        return _log_odds(self.cap)
+
+    def increments(self, expected: int = 1) -> tuple[float, float]:
+        """Return what a sighting and a miss add to the log-odds, in a frame with `expected` landmarks in view.
+
+        A landmark that is seen gets the first, whether it was expected or not: where it was not, a sighting says more,
+        not less. One that is expected and not seen gets the second; any other keeps its log-odds.
+
+        >>> sighting, miss = ExistenceModel(detection=0.9, false_alarm=0.1).increments()
+        >>> round(sighting, 3), round(miss, 3)          # log 9 and -log 9
+        (2.197, -2.197)
+        """
+        seen = self.detection
+        if self.frame_limit is not None and expected > self.frame_limit:
+            # Seen less often than a false one would be, a landmark tells nothing any more.
+            seen = max(seen * self.frame_limit / expected, self.false_alarm)
+        return log(seen / self.false_alarm), log((1.0 - seen) / (1.0 - self.false_alarm))
+
+    def misses_to_delete(self, log_odds: float) -> int:
+        """Return after how many misses in a row, and no sooner, a landmark of these log-odds is deleted."""
+        return max(0, floor((log_odds - self.log_odds_floor) / -self.increments()[1]) + 1)
+
+    def deletion_bound(self, looks: int) -> float:
+        """Return a bound on the probability that a right landmark, expected in view so many times, is ever deleted.
+
+        A landmark that exists and is seen with probability `detection` has log-odds l with E exp(-l) constant; by
+        Ville's inequality they ever fall by h with probability at most exp(-h). A landmark starts at its prior, and
+        once more whenever it leaves the cap, at most `looks` times:
+
+            exp(floor - prior) + looks exp(floor - cap).
+        """
+        from_prior = exp(self.log_odds_floor - self.log_odds_prior)
+        return min(1.0, from_prior + looks * exp(self.log_odds_floor - self.log_odds_cap))
+
+    def view(self, camera: StereoCamera) -> "View":
+        """Return where landmarks are expected to be seen by a camera.
+
+        Raises:
+            ValueError: If the margin leaves nothing of the image, or the range ends before `nearest`.
+        """
+        side, rise = 0.5 * camera.width - self.margin_px, 0.5 * camera.height - self.margin_px
+        if min(side, rise) <= 0.0:
+            expected = f"a number < {0.5 * min(camera.width, camera.height):g}, half of the image"
+            raise bad_argument("existence.margin_px", expected, self.margin_px, "Leave some of the image.")
+        reach = self.range_share * camera.max_range
+        if reach <= self.nearest:
+            cure = "Leave some of the range."
+            raise bad_argument("existence.nearest", f"a number < {reach:g}, the range", self.nearest, cure)
+        return View(self.nearest, side / camera.focal_px, rise / camera.focal_px, reach * reach)
+
+
+class View(NamedTuple):
+    """Where landmarks are expected to be seen: bounds relative to a camera, for compiled loops.
+
+    Attributes:
+        nearest: Least depth [m].
+        side: Largest |lateral| / depth [-].
+        rise: Largest |vertical| / depth [-].
+        reach_squared: Largest squared distance [m^2].
+    """
+
+    nearest: float
+    side: float
+    rise: float
+    reach_squared: float
+
+
+def _log_odds(probability: float) -> float:
+    """Return log p / (1 - p) of a probability in (0, 1)."""
+    return log(probability / (1.0 - probability))
+
+
+class ExistenceStep:
+    """An existence model together with the camera that sees the landmarks.
+
+    Args:
+        model: How likely landmarks are seen, and when they are given up.
+        camera: The filter's.
+    """
+
+    def __init__(self, model: ExistenceModel, camera: StereoCamera) -> None:
+        self._model = model
+        self._view = model.view(camera)
+        self._mount = np.array(camera.mount)
+        self._bounds = (model.log_odds_floor, model.log_odds_cap)
+        self._near = 2.0 * float(np.sqrt(self._view.reach_squared))
+
+    def weigh(
+        self, maps: ParticleMaps, poses: FloatArray, best: int, found: NDArray[np.int32], new_slots: IntArray
+    ) -> IntArray:
+        """Update the log-odds after one robot's frame, which may be empty; particles drop what is too improbable.
+
+        Args:
+            maps: Changed; the landmarks that the frame started begin at the prior.
+            poses: (3, P) the robot's sampled poses [m, m, rad], map frame.
+            best: The most probable particle before the step: what it has around the robot is looked at.
+            found: (n, P) slot to which each particle gave each measurement of the frame, -1 = none.
+            new_slots: (n,) slot of the landmark that each measurement started, -1 = none.
+
+        Returns:
+            Slots that no particle holds any more. They are to be released once nobody asks for their ids.
+        """
+        maps.start_odds(new_slots)
+        view = self._view
+        seen_from = (poses, np.cos(poses[2]), np.sin(poses[2]), self._mount)
+        slots = kernels.landmarks_told_of(
+            maps.ids, maps.row_of, maps.map_of, maps.maps, maps.blocks, maps.counts, maps.num_particles, best,
+            *seen_from, self._near, view.nearest, view.side, view.reach_squared, found, new_slots,
+        )  # fmt: skip
+        if not len(slots):
+            return slots
+        maps.refresh(slots)
+        pose = np.ascontiguousarray(poses[:, best])
+        store = (maps.row_of, maps.blocks, maps.counts)
+        expected = kernels.count_expected(slots, *store, best, pose, self._mount, *view)
+        return kernels.weigh_existence(
+            slots, kernels.mark_seen(slots, len(maps.ids), found), maps.odds, *store,
+            *seen_from, *view, *self._model.increments(expected), *self._bounds,
+        )  # fmt: skip

@@ -1,0 +1,439 @@
+"""Landmarks of all particles: storage, lazy resampling, and the map of the best particle.
+
+A *slot* is one landmark of the joint map; its values lie in a *row* of `values` and `counts`, one entry per particle. A
+resampling moves no row. Instead each slot says by which *ancestor map* its row is to be read: particle m's values are
+those at `maps[map_of[slot], m]`; map 0 stands for the identity. Slots last brought up to date at the same time share a
+map, and a resampling composes the maps in use with its own ancestors: O(maps M) small integers in place of O(N M)
+landmarks. A frame touches only its candidates: their rows are copied, through their maps, to free ones, and from then
+on every particle's values are at its own place. So no two particles ever share what one of them writes.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_backend.core.jit import LINE
+from slam_backend.core.validation import FloatArray, IntArray
+from slam_backend.fastslam import _kernels
+from slam_backend.fastslam._kernels import LANES
+from slam_backend.fastslam._kernels import existence as _existence_kernels
+from slam_backend.fastslam._kernels.layout import FREE_SLOTS, IDENTITIES, IDS, LAST_SEEN, MAP_OF, ROW_OF
+from slam_backend.maps.landmark_map import OutlineRows
+
+
+def aligned(shape: tuple[int, ...], dtype: Any) -> Any:
+    """Return an array, yet to be written, that starts at a cache line: vectors that straddle two are slow."""
+    kind = np.dtype(dtype)
+    size = math.prod(shape) * kind.itemsize
+    raw = np.empty(size + LINE, dtype=np.uint8)
+    start = -raw.ctypes.data % LINE
+    return raw[start : start + size].view(kind).reshape(shape)
+
+
+def aligned_zeros(shape: tuple[int, ...], dtype: Any) -> Any:
+    """Return zeros of a shape and a numpy type that start at a cache line."""
+    array = aligned(shape, dtype)
+    array.fill(0)
+    return array
+
+
+def _num_heads(descriptor_size: int) -> int:
+    """Return how many components of a descriptor are compared first: half where they are many.
+
+    Descriptors of one building have much in common: by a quarter of 64 three landmarks in four would still be in
+    question, by half of them one in thirty.
+    """
+    return descriptor_size // 2 if descriptor_size >= 32 and descriptor_size % 2 == 0 else descriptor_size
+
+
+class MapStore:
+    """Landmark Gaussians, counts, descriptors and names of all particles; `_particle_maps` says how they are read.
+
+    Args:
+        num_particles: M.
+        log_odds_prior: Of the existence of a new landmark; None: existence is not kept.
+
+    Attributes:
+        padded: P, M rounded up to whole blocks of lanes.
+        values: (rows * 9 * P,) float64 [m, m^2], map frame, each row
+            [block][x, y, z, Sxx, Sxy, Sxz, Syy, Syz, Szz][lane].
+        counts: (rows, P) int32. How often the particle matched the landmark, its start included; 0: it lacks it.
+        table: (6, slots) int64. Per slot `row_of`, `map_of`, `ids`, `identities` and `last_seen`; and the stack
+            `free_slots`.
+        maps: (maps, P) int32. users: (maps,) int64, how many slots read by each.
+        odds: (slots, P) float64. Log-odds that the landmark exists, read through its map as a row is; (0, P) without.
+        descriptors: (slots, d) float32. heads: (h, slots) every (d / h)-th component of them, `FAR` where free.
+        free_rows: A stack; `tops` = (its height, that of the free slots, the name of the next landmark).
+    """
+
+    def __init__(self, num_particles: int, log_odds_prior: float | None = None) -> None:
+        self.log_odds_prior = log_odds_prior
+        self._clear(num_particles)
+
+    def _clear(self, num_particles: int) -> None:
+        """Hold nothing, for M particles."""
+        self.num_particles = num_particles
+        self.padded = -(-num_particles // LANES) * LANES
+        self.values: FloatArray = aligned((0,), np.float64)
+        self.counts: NDArray[np.int32] = aligned((0, self.padded), np.int32)
+        self.odds: FloatArray = aligned((0, self.padded), np.float64)
+        self.maps: NDArray[np.int32] = np.zeros((1, self.padded), dtype=np.int32)
+        self.users: IntArray = np.zeros(1, dtype=np.int64)
+        self.table: IntArray = np.zeros((6, 0), dtype=np.int64)
+        self.descriptors: NDArray[np.float32] = np.zeros((0, 0), dtype=np.float32)
+        self.heads: NDArray[np.float32] = np.zeros((0, 0), dtype=np.float32)
+        self._free_maps = 0
+        self.free_rows: IntArray = np.zeros(0, dtype=np.int64)
+        self.tops: IntArray = np.zeros(3, dtype=np.int64)
+
+    @property
+    def row_of(self) -> IntArray:
+        """(slots,) row of each slot. A view, as the others."""
+        return np.asarray(self.table[ROW_OF])
+
+    @property
+    def map_of(self) -> IntArray:
+        """(slots,) the ancestor map by which each is to be read."""
+        return np.asarray(self.table[MAP_OF])
+
+    @property
+    def ids(self) -> IntArray:
+        """(slots,) stable names of the landmarks, -1 = free slot."""
+        return np.asarray(self.table[IDS])
+
+    @property
+    def identities(self) -> IntArray:
+        """(slots,) the caller's own names, -1 = none."""
+        return np.asarray(self.table[IDENTITIES])
+
+    @property
+    def last_seen(self) -> IntArray:
+        """(slots,) steps of the smoother in which the most probable particle matched landmarks last, 0 = never."""
+        return np.asarray(self.table[LAST_SEEN])
+
+    @property
+    def free_slots(self) -> IntArray:
+        """(slots,) a stack of free slots."""
+        return np.asarray(self.table[FREE_SLOTS])
+
+    @property
+    def next_id(self) -> int:
+        """The name that the next landmark will get."""
+        return int(self.tops[2])
+
+    @property
+    def nbytes(self) -> int:
+        """Memory held [bytes]."""
+        arrays = (
+            self.values, self.counts, self.maps, self.users, self.table, self.descriptors, self.heads, self.free_rows,
+            self.odds,
+        )  # fmt: skip
+        return sum(array.nbytes for array in arrays)
+
+    @property
+    def blocks(self) -> FloatArray:
+        """`values` as (rows, blocks, 9, lanes). A view."""
+        return self.values.reshape(-1, self.padded // LANES, 9, LANES)
+
+    def used_slots(self) -> IntArray:
+        """Return the slots that hold a landmark of at least one particle, by ascending id."""
+        used = np.flatnonzero(self.ids >= 0)
+        return used[np.argsort(self.ids[used])]
+
+    # ------------------------------------------------------------------ room
+
+    def make_room(self, new: int, descriptor_size: int) -> None:
+        """See to it that `new` landmarks can start, and a row is left to bring landmarks up to date.
+
+        Args:
+            new: How many at most.
+            descriptor_size: d of the landmarks; that of the map, if there are any.
+        """
+        rows, slots, _ = self.tops.tolist()
+        if slots < new:
+            self._grow_slots(max(64, len(self.ids), new - slots), descriptor_size)
+        if rows < new + 1:
+            self._grow_rows(max(64, len(self.counts), new + 1))
+
+    def _begin(self, new: int, descriptor_size: int) -> None:
+        """Begin with `new` landmarks in the lowest slots and rows, yet to be written; arrays with room are used again.
+
+        New ones have room for half as many landmarks more: the first to come shall not move all.
+
+        Args:
+            new: How many.
+            descriptor_size: d.
+        """
+        if min(len(self.ids), len(self.counts)) < new or self.descriptors.shape[1] != descriptor_size:
+            self._clear(self.num_particles)
+            if new or descriptor_size:
+                self._grow_slots(max(64, new), descriptor_size)
+                self._grow_rows(max(64, new + new // 2 + 1))
+        slots, rows = len(self.ids), len(self.counts)
+        self.row_of[:new], self.map_of[:new] = np.arange(new), 0
+        self.ids[new:] = self.identities[new:] = -1
+        self.users[:], self._free_maps = 0, len(self.users) - 1
+        self.free_rows[: rows - new] = np.arange(rows - 1, new - 1, -1)  # the lowest is taken first
+        self.free_slots[: slots - new] = np.arange(slots - 1, new - 1, -1)
+        self.tops[:2] = rows - new, slots - new
+
+    def _grow_slots(self, extra: int, descriptor_size: int) -> None:
+        """Provide so many more slots, with room for descriptors of that size."""
+        old = len(self.ids)
+        table = np.zeros((len(self.table), old + extra), dtype=np.int64)
+        table[:, :old], table[IDS, old:], table[IDENTITIES, old:] = self.table, -1, -1
+        descriptors = aligned_zeros((old + extra, descriptor_size), np.float32)
+        if old and self.descriptors.shape[1]:
+            descriptors[:old] = self.descriptors
+        self.descriptors = descriptors
+        heads = aligned((_num_heads(descriptor_size), old + extra), np.float32)
+        heads[:] = _kernels.FAR
+        if old and len(self.heads):
+            heads[:, :old] = self.heads
+        self.heads = heads
+        if self.log_odds_prior is not None:
+            odds = aligned_zeros((old + extra, self.padded), np.float64)
+            odds[:old] = self.odds
+            self.odds = odds
+        top = int(self.tops[1])
+        # The lowest is taken first once the old ones are gone.
+        table[FREE_SLOTS, :extra] = np.arange(old + extra - 1, old - 1, -1)
+        table[FREE_SLOTS, extra : extra + top] = self.free_slots[:top]
+        self.table = table
+        self.tops[1] = extra + top
+
+    def _grow_rows(self, extra: int) -> None:
+        """Provide so many more rows, written as a whole when they are taken."""
+        old, padded = len(self.counts), self.padded
+        values = aligned(((old + extra) * 9 * padded,), np.float64)
+        values[: len(self.values)] = self.values
+        counts = aligned((old + extra, padded), np.int32)
+        counts[:old] = self.counts
+        self.values, self.counts = values, counts
+        top = int(self.tops[0])
+        free = np.empty(old + extra, dtype=np.int64)
+        free[:extra] = np.arange(old + extra - 1, old - 1, -1)
+        free[extra : extra + top] = self.free_rows[:top]
+        self.free_rows = free
+        self.tops[0] = extra + top
+
+    def _set_heads(self, n: int) -> None:
+        """Write the heads of the first n slots; the others are free."""
+        if len(self.heads):
+            self.heads[:, :n] = self.descriptors[:n, :: self.descriptors.shape[1] // len(self.heads)].T
+            self.heads[:, n:] = _kernels.FAR
+
+
+MAX_MAPS = 512  # slots whose map is the oldest are brought up to date rather than keep more maps than this
+MAPS_KEPT = (  # in a state
+    "num_particles", "values", "counts", "odds", "maps", "map_of", "ids", "identities", "last_seen", "descriptors",
+    "next_id",
+)  # fmt: skip
+
+
+class ParticleMaps(MapStore):
+    """The landmarks of all particles, each of which has its own values of them.
+
+    Args:
+        num_particles: M.
+        log_odds_prior: Of the existence of a new landmark; None: existence is not kept.
+    """
+
+    # ------------------------------------------------------------------ resampling
+
+    def resample(self, ancestors: IntArray, of_robots: FloatArray, of_particles: FloatArray) -> int:
+        """Let each particle become a copy of its ancestor, weighed alike; return the most probable one.
+
+        Args:
+            ancestors: (M,) ascending.
+            of_robots, of_particles: What else particles hold, see `FilterArrays`.
+        """
+        if not self._free_maps:
+            self._make_maps()
+        self._free_maps, best = _kernels.resample(
+            ancestors, of_robots, of_particles, self.counts, self.table, self.maps, self.users, self.free_rows,
+            self.tops, self.heads, np.empty((3, len(ancestors)), np.uint32),
+        )  # fmt: skip
+        return best
+
+    def _make_maps(self) -> None:
+        """Provide a free map, by one more or by bringing slots up to date."""
+        if len(self.users) > MAX_MAPS:
+            self._refresh_oldest()
+        else:
+            extra = max(16, len(self.users))
+            self.maps = np.concatenate([self.maps, np.zeros((extra, self.padded), dtype=np.int32)])
+            self.users = np.concatenate([self.users, np.zeros(extra, dtype=np.int64)])
+
+    def _refresh_oldest(self) -> None:
+        """Bring up to date the slots of the maps with the fewest users, a quarter of them."""
+        order = np.argsort(np.where(self.users[1:] > 0, self.users[1:], np.iinfo(np.int64).max))
+        chosen = order[: MAX_MAPS // 4] + 1
+        self.refresh(np.flatnonzero(np.isin(self.map_of, chosen) & (self.ids >= 0)))
+
+    def refresh(self, slots: IntArray) -> None:
+        """Bring slots up to date: afterwards they are read in place."""
+        if not self.tops[0]:
+            self._grow_rows(64)
+        self.carry_odds(slots)
+        _kernels.refresh(
+            slots, self.values, self.counts, self.row_of, self.map_of, self.maps, self.users, self.free_rows, self.tops
+        )
+
+    # ------------------------------------------------------------------ existence
+
+    def carry_odds(self, slots: IntArray) -> None:
+        """Bring the log-odds of slots up to date, just before a kernel does so with all else that they hold."""
+        if self.log_odds_prior is not None:
+            _kernels.carry_odds(slots, self.odds, self.map_of, self.maps)
+
+    def start_odds(self, new_slots: IntArray) -> None:
+        """Give landmarks that were just started their prior; -1 among `new_slots` stands for none."""
+        self.odds[new_slots[new_slots >= 0]] = self.log_odds_prior
+
+    def odds_of_particle(self, m: int, slots: IntArray) -> FloatArray:
+        """Return the log-odds (n,) of the slots (n,) of particle m. A copy."""
+        return np.asarray(self.odds[slots, np.where(self.map_of[slots] > 0, self.maps[self.map_of[slots], m], m)])
+
+    def dense_odds(self, slots: IntArray) -> FloatArray | None:
+        """Return the log-odds (n, M) of slots (n,) in all particles, None where existence is not kept. A copy."""
+        if self.log_odds_prior is None:
+            return None
+        self.refresh(slots)
+        return self.odds[slots][:, : self.num_particles]
+
+    def release(self, slots: IntArray) -> None:
+        """Forget the landmarks of slots (n,), up to date, that no particle holds."""
+        _existence_kernels.release(
+            slots, self.ids, self.row_of, self.heads, self.free_rows, self.free_slots, self.tops, _kernels.FAR
+        )
+
+    # ------------------------------------------------------------------ reading and writing whole maps
+
+    def of_particle(self, m: int, slots: IntArray) -> tuple[FloatArray, NDArray[np.int32]]:
+        """Return values (n, 9) and counts (n,) of the slots (n,) of particle m. Copies."""
+        places = np.where(self.map_of[slots] > 0, self.maps[self.map_of[slots], m], m)
+        rows = self.row_of[slots]
+        blocks = self.blocks
+        return blocks[rows, places // LANES, :, places % LANES], self.counts[rows, places]
+
+    def dense(self, slots: IntArray) -> tuple[FloatArray, NDArray[np.int32]]:
+        """Return values (n, 9, M) and counts (n, M) of slots (n,) in all particles. Copies."""
+        self.refresh(slots)
+        rows, m = self.row_of[slots], self.num_particles
+        blocks = self.blocks[rows]
+        values = blocks.transpose(0, 2, 1, 3).reshape(len(rows), 9, self.padded)[:, :, :m]
+        return np.ascontiguousarray(values), self.counts[rows, :m]
+
+    def load_names(
+        self, counts: NDArray[np.integer[Any]], descriptors: NDArray[np.float32], ids: IntArray, identities: IntArray,
+        next_id: int, odds: FloatArray | None = None, last_seen: IntArray | None = None,
+    ) -> None:  # fmt: skip
+        """Replace all landmarks by these but for the values: the first n of `blocks` are then to be written.
+
+        Args:
+            counts: (n, M), or (n, 1) where all particles have the same; 0 where a particle lacks the landmark. Each
+                landmark is held by a particle.
+            descriptors: (n, d) float32.
+            ids, identities: (n,) int64. Stable names, and the caller's own, -1 = none.
+            next_id: The name that the next landmark will get.
+            odds: (n, M) float64, log-odds of existence; None: where existence is kept, landmarks get the prior.
+            last_seen: (n,) int64, see `MapStore`; None: never.
+        """
+        n, m = len(ids), self.num_particles
+        self._begin(n, descriptors.shape[1] if n else self.descriptors.shape[1])
+        self.tops[2] = next_id
+        self.counts[:n, :m], self.counts[:n, m:] = counts, 0
+        self.ids[:n], self.identities[:n], self.last_seen[:n] = ids, identities, 0 if last_seen is None else last_seen
+        self.descriptors[:n] = descriptors
+        if self.log_odds_prior is not None:
+            self.odds[:n, :m] = self.log_odds_prior if odds is None else odds
+        self._set_heads(n)
+
+    # ------------------------------------------------------------------ snapshots
+
+    def get_state(self) -> dict[str, Any]:
+        """Return all that decides how the maps go on, compact and shared with nothing."""
+        used = self.used_slots()
+        of, rows = self.map_of[used], self.row_of[used]
+        live, first = np.unique(of[of > 0], return_index=True)
+        live = live[np.argsort(first)]  # by their first users: equal maps give equal states
+        number = np.zeros(len(self.users), dtype=np.int64)
+        number[live] = np.arange(1, len(live) + 1)
+        return {
+            "num_particles": self.num_particles,
+            "values": np.take(self.values.reshape(-1, 9 * self.padded), rows, axis=0),
+            "counts": np.take(self.counts, rows, axis=0),
+            "odds": None if self.log_odds_prior is None else np.take(self.odds, used, axis=0),
+            "maps": np.take(self.maps, live, axis=0),
+            "map_of": number[of],
+            "ids": self.ids[used],
+            "identities": self.identities[used],
+            "last_seen": self.last_seen[used],
+            "descriptors": self.descriptors[used],
+            "next_id": self.next_id,
+        }
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Go on as the maps that gave `state`; rows already allocated are used again."""
+        n, m, maps = len(state["ids"]), int(state["num_particles"]), state["maps"]
+        if m != self.num_particles:
+            self._clear(m)
+        self._begin(n, state["descriptors"].shape[1])
+        self.values.reshape(-1, 9 * self.padded)[:n] = state["values"]
+        self.counts[:n] = state["counts"]
+        if self.log_odds_prior is not None:
+            self.odds[:n] = state["odds"]
+        for name in ("map_of", "ids", "identities", "last_seen", "descriptors"):
+            getattr(self, name)[:n] = state[name]
+        self._set_heads(n)
+        self.maps = np.concatenate([np.zeros((1, self.padded), dtype=np.int32), maps])
+        self.users = np.bincount(state["map_of"], minlength=len(maps) + 1).astype(np.int64)
+        self.users[0], self._free_maps = 0, 0
+        self.tops[2] = state["next_id"]
+
+
+def write_outline(maps: ParticleMaps, m: int, min_count: int, rows: OutlineRows, first: int) -> int:
+    """Write the outline of `best_map`, which takes the same: the same landmarks in the same order.
+
+    Args:
+        maps: Of all particles.
+        m: Which of them.
+        min_count: What it measured fewer times is left out.
+        rows: Written to, as far as there are rows.
+        first: From this row on.
+
+    Returns:
+        The row after the last, be it there or not.
+    """
+    last, ascending = _kernels.outline(maps.table, maps.maps, maps.values, maps.counts, m, min_count, *rows, first)
+    if not ascending:
+        order = first + np.argsort(rows.names[first:last, 1])
+        for column in rows:
+            column[first:last] = column[order]
+    return last
+
+
+def slots_held(maps: ParticleMaps, m: int, min_count: int) -> IntArray:
+    """Return the slots (n,) of `best_map`, which takes the same, by ascending id."""
+    slots, ascending = _kernels.hold(maps.table, maps.maps, maps.counts, m, min_count)
+    return slots if ascending else slots[np.argsort(maps.ids[slots])]
+
+
+def best_map(maps: ParticleMaps, m: int, min_count: int) -> tuple[FloatArray, FloatArray, Any, IntArray, IntArray]:
+    """Return what one particle holds, by ascending id.
+
+    Args:
+        maps: Of all particles.
+        m: Which of them.
+        min_count: What it measured fewer times is left out.
+
+    Returns:
+        Means (n, 3) [m], covariances (n, 3, 3) [m^2], map frame, descriptors (n, d) float32, counts (n,) and ids (n,):
+        all fresh.
+    """
+    slots = slots_held(maps, m, min_count)
+    means, covariances, times, names = _kernels.gather(slots, maps.table, maps.maps, maps.values, maps.counts, m)
+    return means, covariances, maps.descriptors[slots], times, names

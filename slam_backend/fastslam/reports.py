@@ -1,0 +1,308 @@
+"""Reports of filters and teams: associations, pose estimates, step reports, merge events. All frozen."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal, NamedTuple, Self
+
+import numpy as np
+
+from slam_backend.core.validation import BoolArray, FloatArray, IntArray
+from slam_backend.fastslam._kernels import STOOD
+from slam_backend.fastslam._kernels.layout import ASSOCIATED, COUNT, CREATED, REJECTED
+from slam_backend.fastslam.step_input import UNHEARD, StepInput, Turn
+
+
+class Findings(NamedTuple):
+    """What became of N robots' measurements in one step; nobody writes to it when the step is over.
+
+    Attributes:
+        told: (2, n) int64. Of all measurements used, one robot's after the other's: the landmark that each was taken
+            for, and that which it created, as in `StepReport`.
+        turns: Of each robot, as in `StepInput`.
+        masks: By robot which of its measurements were used, as there.
+    """
+
+    told: IntArray
+    turns: Sequence[Turn]
+    masks: Mapping[int, BoolArray]
+
+    @classmethod
+    def none_yet(cls, inputs: StepInput) -> Self:
+        """Return room for what becomes of some readings; until it is written all measurements are rejected."""
+        told = np.empty((2, len(inputs.sightings)), np.int64)
+        told.fill(REJECTED)
+        return cls(told, inputs.turns, inputs.masks)
+
+    @classmethod
+    def gathered(cls, associations: Sequence[IntArray], created: Sequence[IntArray]) -> Self:
+        """Return those of robots of each of which both are known, (n_i,) ids."""
+        told = np.stack([np.concatenate(associations), np.concatenate(created)])
+        turns, begin = [], 0
+        for own in associations:
+            turns.append((STOOD, begin, begin + len(own), False, False, len(own)))
+            begin += len(own)
+        return cls(told, turns, {})
+
+    def close(self) -> None:
+        """Let nobody write to it any more: reports and journals share it."""
+        self.told.setflags(write=False)
+
+    def num_given(self, row: int) -> int:
+        """Return how many measurements a robot was given, used or not."""
+        return max(self.turns[row][COUNT], 0)
+
+    def associated(self, row: int) -> IntArray:
+        """Return what the measurements (n_i,) of a robot were taken for; there are none of robot -1. A copy."""
+        return self._cut(row, ASSOCIATED)
+
+    def created(self, row: int) -> IntArray:
+        """Return likewise which landmarks they created."""
+        return self._cut(row, CREATED)
+
+    def names_associated(self, row: int) -> list[int]:
+        """Return the landmarks that measurements of a robot were taken for, in their order."""
+        return self._names(row, ASSOCIATED)
+
+    def names_created(self, row: int) -> list[int]:
+        """Return likewise the landmarks that they created."""
+        return self._names(row, CREATED)
+
+    def _names(self, row: int, kind: int) -> list[int]:
+        """Return the names among what became of the measurements of a robot."""
+        _, begin, end, _, _, _ = self.turns[row] if row >= 0 else UNHEARD
+        found: list[int] = self.told[kind, begin:end].tolist()
+        return [name for name in found if name != REJECTED]
+
+    def _cut(self, row: int, kind: int) -> IntArray:
+        """Return what became of the measurements of a robot, -1 for those that were not used."""
+        _, begin, end, _, _, _ = self.turns[row] if row >= 0 else UNHEARD
+        used: IntArray = self.told[kind, begin:end].copy()
+        if row not in self.masks:
+            return used
+        every: IntArray = np.full(len(self.masks[row]), REJECTED)
+        every[self.masks[row]] = used
+        return every
+
+
+if TYPE_CHECKING:
+    from slam_backend.maps.alignment import Alignment
+
+
+class PoseEstimate(NamedTuple):
+    """A Gaussian summary of a robot's pose.
+
+    Attributes:
+        mean: (3,) float64 [m, m, rad].
+        covariance: (3, 3) float64 [m, m, rad].
+    """
+
+    mean: FloatArray
+    covariance: FloatArray
+
+
+class PoseEstimates(NamedTuple):
+    """Gaussian summaries of the poses of several robots, all in one frame or each in its own.
+
+    Attributes:
+        means: (K, 3) float64 [m, m, rad].
+        covariances: (K, 3, 3) float64 [m, m, rad].
+    """
+
+    means: FloatArray
+    covariances: FloatArray
+
+    def copy(self) -> "PoseEstimates":
+        """Return the same in arrays of their own."""
+        return PoseEstimates(self.means.copy(), self.covariances.copy())
+
+    def of(self, robot: int) -> PoseEstimate:
+        """Return that of one robot. A copy."""
+        return PoseEstimate(self.means[robot].copy(), self.covariances[robot].copy())
+
+
+class StepReport(NamedTuple):
+    """What one step of `FastSlam` did.
+
+    Attributes:
+        findings: What became of the measurements; `associations` and `created` are cut out of it.
+        rows: Of each robot there, -1: none.
+        num_created: Measurements that created a landmark in at least one particle.
+        num_new: Landmarks created by the most probable particle.
+        num_matched: Measurements that the most probable particle matched to landmarks it held.
+        num_rejected: Measurements of which it made nothing: held back, in the dead zone, or named -1 by the caller.
+        ess: Effective sample size after this step's weights, before resampling, in [1, M].
+        nis: Mean of the squared Mahalanobis innovations (3 degrees of freedom, ideal 3) over the measurements that
+            the most probable particle matched, without those it had predicted behind the camera; NaN if there is none.
+        resampled: Whether the particles were resampled.
+        rejuvenation: What came of drawing particles anew from smoothed paths; None: it was not tried in this step.
+    """
+
+    findings: Findings
+    rows: tuple[int, ...]
+    num_created: int
+    num_new: int
+    num_matched: int
+    num_rejected: int
+    ess: float
+    nis: float
+    resampled: bool
+    rejuvenation: "RejuvenationReport | None" = None
+
+    @property
+    def associations(self) -> tuple[IntArray, ...]:
+        """Per robot (n_i,) int64. Id of the landmark to which the most probable particle gave each measurement.
+
+        That is the id of a new one if it made one; -1 = rejected. Copies.
+        """
+        return tuple([self.findings.associated(row) for row in self.rows])
+
+    @property
+    def created(self) -> tuple[IntArray, ...]:
+        """Per robot (n_i,) int64. Id of the landmark that the measurement created in at least one particle.
+
+        -1 if none did. A landmark stems from exactly one measurement. Copies.
+        """
+        return tuple([self.findings.created(row) for row in self.rows])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RejuvenationReport:
+    """What came of an attempt to rejuvenate a filter.
+
+    Attributes:
+        reason: Why the old particles stay; "" if there are new ones.
+        ess: Effective sample size of the importance weights of whole paths, in [1, M]; NaN if it did not come to that.
+        iterations: Of the smoother.
+        num_keys: Key poses that it keeps.
+    """
+
+    reason: str
+    ess: float
+    iterations: int
+    num_keys: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MergeEvent:
+    """An attempt to align two groups' maps, a merge, or the undoing of one.
+
+    Attributes:
+        step: Number of the team's step (the first is 0).
+        kind: What happened.
+        robots_a: The group whose map frame stays.
+        robots_b: The other group.
+        alignment: `map` of group a from `map` of group b, as found; refused attempts carry the reason.
+        bent: Of an attempt: the alignment of the maps as the filters had bent them, where these were straightened then
+            and `alignment` is that of the straight ones; else None.
+        doubt: For an attempt whose maps align, the uncertainty of the motion between them over the particles of the
+            merge, relative to what a merge has to be sure of; beyond 1 it may wait. NaN if that was not asked.
+    """
+
+    step: int
+    kind: Literal["attempt", "merge", "undo"]
+    robots_a: tuple[int, ...]
+    robots_b: tuple[int, ...]
+    alignment: "Alignment"
+    bent: "Alignment | None" = None
+    doubt: float = float("nan")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Renaming:
+    """How landmark ids of two groups became ids of their joint map.
+
+    Attributes:
+        robots_a: Group a before the merge; its landmark ids stay.
+        robots_b: Group b before the merge.
+        ids_b: (k, 2) int64. Rows (id in b's map, id in the joint map); fused landmarks carry the id of a.
+        maps: Numbers of a's map, of b's and of the joint one. The first two are kept until their `MapDropped`: an undo
+            takes them up again as they were.
+    """
+
+    robots_a: tuple[int, ...]
+    robots_b: tuple[int, ...]
+    ids_b: IntArray
+    maps: tuple[int, int, int]
+
+
+@dataclass(frozen=True, slots=True)
+class MapCopied:
+    """A filter forked: map number `copy` begins as what map number `source` is now."""
+
+    source: int
+    copy: int
+
+
+@dataclass(frozen=True, slots=True)
+class MapDropped:
+    """Map number `number` is gone for good."""
+
+    number: int
+
+
+class LandmarksCreated(NamedTuple):
+    """What a robot read in a step created landmarks in a map.
+
+    Attributes:
+        number: Of the map.
+        robot: Who read it.
+        step: When it was read; with a replay that is earlier than the step of the report.
+        ids: (n,) int64. Id of the landmark that each of its measurements created, -1 = none.
+    """
+
+    number: int
+    robot: int
+    step: int
+    ids: IntArray
+
+
+@dataclass(frozen=True, slots=True)
+class MergeUndone:
+    """A merge was taken back: two maps are taken up again as they were before it, and the joint one ends.
+
+    Attributes:
+        maps: Numbers of a's map, of b's and of the joint one, as in its `Renaming`.
+    """
+
+    maps: tuple[int, int, int]
+
+
+MapEntry = MapCopied | MapDropped | LandmarksCreated | MergeUndone | Renaming
+
+
+class TeamReport(NamedTuple):
+    """What one step of `TeamSlam` did.
+
+    Attributes:
+        step: Number of this step (the first is 0).
+        findings: What became of the measurements; `associations` and `created` are cut out of it.
+        groups: The groups after this step.
+        events: This step's attempts, merges and undos, in order.
+        renamings: One for each merge of this step, in order; apply them after `created`.
+        maps: Per robot the number of the map that it goes by after this step. Before the first step they are 0, 1, ...
+        entries: All that happened to maps in this step, in order, replays and `created` included: whoever keeps books
+            on landmarks goes by these.
+        oldest_step: Steps from this one on may still be taken in again; 1 + `step` if none.
+        rejuvenations: For each filter of which something is to be told the robots that go by it, and what came of
+            drawing its particles anew in this step, or what its smoother could not make sense of.
+    """
+
+    step: int
+    findings: Findings
+    groups: tuple[tuple[int, ...], ...]
+    events: tuple[MergeEvent, ...]
+    renamings: tuple[Renaming, ...]
+    maps: tuple[int, ...]
+    entries: tuple[MapEntry, ...]
+    oldest_step: int
+    rejuvenations: tuple[tuple[tuple[int, ...], RejuvenationReport], ...] = ()
+
+    @property
+    def associations(self) -> tuple[IntArray, ...]:
+        """Per robot (n_i,) int64, as in `StepReport`, ids in the robot's map BEFORE this step's merges and undos."""
+        return tuple([self.findings.associated(robot) for robot in range(len(self.maps))])
+
+    @property
+    def created(self) -> tuple[IntArray, ...]:
+        """Per robot (n_i,) int64, as in `StepReport`, ids likewise."""
+        return tuple([self.findings.created(robot) for robot in range(len(self.maps))])

@@ -1,0 +1,318 @@
+"""`RobotLog`: all that one robot did and measured in a run, kept compactly for a smoother."""
+
+from bisect import bisect_left
+from collections.abc import Iterator, Mapping
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from slam_backend.core.validation import FloatArray, IntArray, bad_argument, check_array, check_choice, check_int
+from slam_backend.fastslam._kernels.layout import COVERED, DID, LOGGED, MOTION, MOVED, NAME, PLACED, THOUGHT, USED
+from slam_backend.fastslam._kernels.run_log import write_rows
+from slam_backend.smoother.log_arrays import EXACT, ODOMETRY, REJECTED, STOOD, LogArrays, LogStep, join
+
+ROWS = 256  # of a chunk: so many steps,
+MEASUREMENTS = 2048  # and so many measurements, unless one frame alone has more
+NO_MOTION = np.zeros(3)
+NO_POINTS = np.empty((0, 3))
+NO_IDS = np.empty(0, dtype=np.int64)
+
+
+class RobotLog:
+    """An append-only log of one robot: odometry or exact poses, the points it measured, and what they were taken for.
+
+    Steps lie in chunks. A finished chunk is never written again: snapshots and copies share it, so that they cost
+    O(number of chunks) and a copy of the last, unfinished one, however long the run. A step takes 42 bytes, a
+    measurement 32; covariances (48) are stored only in chunks where they came.
+
+    Example:
+        >>> log = RobotLog()
+        >>> log.append(0, points=np.array([[2.0, 0.0, 0.1]]), ids=np.array([7]))       # the first frame
+        >>> log.append(1, odometry=np.array([0.1, 0.0, 0.02]))                         # it only moved
+        >>> len(log), log.num_measurements, log.arrays().starts.tolist()
+        (2, 1, [0, 1, 1])
+    """
+
+    __slots__ = ("_chunks", "_covariances", "_given", "_ids", "_kinds", "_last", "_motions",
+                 "_num_measurements", "_num_rows", "_points", "_starts", "_steps")  # fmt: skip
+
+    def __init__(self) -> None:
+        self._chunks: list[LogArrays] = []
+        self._last = -1
+        self._open(MEASUREMENTS)
+
+    def _open(self, capacity: int) -> None:
+        """Start an empty chunk with room for `capacity` measurements."""
+        self._num_rows = self._num_measurements = 0
+        self._steps = np.empty(ROWS, dtype=np.int64)
+        self._kinds = np.empty(ROWS, dtype=np.int8)
+        self._motions = np.empty((ROWS, 3))
+        self._given = np.empty(ROWS, dtype=np.bool_)
+        self._starts = np.zeros(ROWS + 1, dtype=np.int64)
+        self._points = np.empty((capacity, 3))
+        self._ids = np.empty(capacity, dtype=np.int64)
+        self._covariances: FloatArray | None = None
+
+    # ------------------------------------------------------------------ writing
+
+    def append(
+        self,
+        step: int,
+        odometry: FloatArray | None = None,
+        pose: FloatArray | None = None,
+        points: FloatArray = NO_POINTS,
+        ids: IntArray = NO_IDS,
+        covariances: FloatArray | None = None,
+    ) -> None:
+        """Add a step. Order and shapes are checked; the numbers are those that a filter has accepted.
+
+        Args:
+            step: Its index in the run, above that of the step before.
+            odometry: (3,) [m, m, rad], motion since the last step, previous robot frame. None: it stood.
+            pose: (3,) [m, m, rad], own start frame, if it was given as exact; odometry is then ignored, as in the
+                filter.
+            points: (n, 3) [m], robot axes, relative to the camera centre. All that was measured, rejected ones as well:
+                a smoother may find their landmarks.
+            ids: (n,) landmarks by the most probable particle, -1 = rejected.
+            covariances: (n, 6) [m^2], robot axes, upper triangles by rows (xx, xy, xz, yy, yz, zz). None: the camera
+                model.
+
+        Raises:
+            ValueError: If steps go back or shapes disagree; the log is then as before.
+        """
+        n = len(ids)
+        motion = odometry if pose is None else pose
+        if (
+            step <= self._last
+            or points.shape != (n, 3)
+            or (motion is not None and motion.shape != (3,))
+            or (covariances is not None and covariances.shape != (n, 6))
+        ):
+            raise self._refusal(step, odometry, pose, points, ids, covariances)
+        start, t = self._num_measurements, self._num_rows
+        if t == ROWS or (start and start + n > MEASUREMENTS):
+            self._chunks.append(self._unfinished())
+            self._open(max(MEASUREMENTS, n))
+            start = t = 0
+        elif n > len(self._ids):  # one huge frame after steps that have none
+            self._points, self._ids = np.empty((n, 3)), np.empty(n, dtype=np.int64)
+        end = start + n
+        self._steps[t] = step
+        self._kinds[t] = STOOD if motion is None else ODOMETRY if pose is None else EXACT
+        self._motions[t] = NO_MOTION if motion is None else motion
+        self._given[t] = covariances is not None
+        self._starts[t + 1] = end
+        if n:
+            self._points[start:end] = points
+            self._ids[start:end] = ids
+            if covariances is not None or self._covariances is not None:
+                self._room_for_covariances()[start:end] = np.nan if covariances is None else covariances
+        self._num_rows, self._num_measurements, self._last = t + 1, end, step
+
+    def extend(self, robot: int, steps: IntArray, noted: FloatArray, measured: FloatArray) -> None:
+        """Add the steps in which one of K robots did or measured anything, as `append` does one by one.
+
+        Args:
+            robot: Which.
+            steps: (T,) their indices in the run.
+            noted, measured: (T, K, 10), (n, 10). Of all steps, as in a `Journal`.
+
+        Raises:
+            ValueError: If steps go back; the log then holds no more than the steps before.
+        """
+        k = 0
+        while k < len(steps):
+            if self._covariances is None and steps[k] > self._last:
+                most = min(MEASUREMENTS, len(self._ids))
+                k, self._num_rows, self._num_measurements = write_rows(
+                    robot, k, steps, noted, measured, most, self._num_rows, self._num_measurements,
+                    self._steps, self._kinds, self._motions, self._given, self._starts, self._points, self._ids,
+                )  # fmt: skip
+                if self._num_rows:
+                    self._last = int(self._steps[self._num_rows - 1])
+            if k < len(steps):  # what cannot stand there yet
+                self._append_turn(k, robot, steps, noted, measured)
+                k += 1
+
+    def _append_turn(self, k: int, robot: int, steps: IntArray, noted: FloatArray, measured: FloatArray) -> None:
+        """Append what a robot did and measured in step k, if it did; the others are as of `extend`."""
+        note = noted[k, robot]
+        if not note[LOGGED]:
+            return
+        begin = int(noted[:k, :, USED].sum() + noted[k, :robot, USED].sum())
+        own = measured[begin : begin + int(note[USED])]
+        move = note[MOTION:THOUGHT] if note[DID] in (MOVED, PLACED) else None
+        pose = move if note[DID] == PLACED else None
+        spreads = own[:, 3:NAME] if note[COVERED] else None
+        self.append(int(steps[k]), move, pose, own[:, :3], own[:, NAME].astype(np.int64), spreads)
+
+    def _refusal(self, step: int, odometry: Any, pose: Any, points: Any, ids: Any, covariances: Any) -> ValueError:
+        """Say what is wrong with a step; told apart only then, for `append` is in the filter's loop."""
+        if step <= self._last:
+            return bad_argument("step", f"an int > {self._last}", step, "Log steps in order, each once.")
+        n = len(ids)
+        per_id, motion = "Give one row per id.", "Give (x, y, theta)."
+        wanted = {
+            "points": (points, (n, 3), per_id),
+            "covariances": (covariances, (n, 6), per_id),
+            "pose": (pose, (3,), motion),
+            "odometry": (odometry, (3,), motion),
+        }
+        name = next(key for key, (value, shape, _) in wanted.items() if value is not None and value.shape != shape)
+        value, shape, cure = wanted[name]
+        return bad_argument(name, f"an array of shape {shape}", f"shape {value.shape}", cure)
+
+    def _room_for_covariances(self) -> FloatArray:
+        """Return the open chunk's covariances, NaN where none were given."""
+        if self._covariances is None:
+            self._covariances = np.full((len(self._ids), 6), np.nan)
+        return self._covariances
+
+    def _unfinished(self, first: int = 0) -> LogArrays:
+        """Return a copy of the open chunk from a row on, no longer than what it holds."""
+        t, start = self._num_rows, int(self._starts[first])
+        measured = slice(start, self._num_measurements)
+        return LogArrays(
+            steps=self._steps[first:t].copy(),
+            kinds=self._kinds[first:t].copy(),
+            motions=self._motions[first:t].copy(),
+            given=self._given[first:t].copy(),
+            starts=self._starts[first : t + 1] - start,
+            points=self._points[measured].copy(),
+            ids=self._ids[measured].copy(),
+            covariances=None if self._covariances is None else self._covariances[measured].copy(),
+        )
+
+    # ------------------------------------------------------------------ reading
+
+    def __len__(self) -> int:
+        """Return the number of steps logged."""
+        return sum(map(len, self._chunks)) + self._num_rows
+
+    @property
+    def last_step(self) -> int:
+        """Index of the last step logged, -1 if there is none."""
+        return self._last
+
+    @property
+    def num_measurements(self) -> int:
+        """Measurements logged, rejected ones included."""
+        return sum(len(chunk.ids) for chunk in self._chunks) + self._num_measurements
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all arrays, the room of the open chunk included; shared chunks count in full."""
+        arrays = (self._steps, self._kinds, self._motions, self._given, self._starts, self._points, self._ids,
+                  self._covariances)  # fmt: skip
+        open_bytes = sum(array.nbytes for array in arrays if array is not None)
+        return open_bytes + sum(chunk.nbytes for chunk in self._chunks)
+
+    def arrays(self, since: int = 0) -> LogArrays:
+        """Return all steps with an index of at least `since` as flat arrays; cost O(what is returned + one chunk)."""
+        check_int("since", since, 0, "Use 0 for the whole run.")
+        first = len(self._chunks)
+        while first > 0 and self._chunks[first - 1].steps[-1] >= since:
+            first -= 1
+        if first == len(self._chunks):
+            return self._unfinished(bisect_left(self._steps, since, 0, self._num_rows))
+        return join([*self._chunks[first:], self._unfinished()]).since(since)
+
+    @property
+    def has_exact_poses(self) -> bool:
+        """Whether a pose was given as exact in any step."""
+        return any(
+            (kinds == EXACT).any() for kinds in (*(c.kinds for c in self._chunks), self._kinds[: self._num_rows])
+        )
+
+    def num_since(self, since: int) -> int:
+        """Return how many steps there are with an index of at least `since`; cost O(number of chunks with such)."""
+        count = self._num_rows - bisect_left(self._steps, since, 0, self._num_rows)
+        for chunk in reversed(self._chunks):
+            if chunk.steps[-1] < since:
+                break
+            count += len(chunk) - bisect_left(chunk.steps, since)
+        return count
+
+    def __iter__(self) -> Iterator[LogStep]:
+        """Return the steps in order, as the log stands when the loop begins."""
+        for chunk in [*self._chunks, self._unfinished()]:
+            yield from map(chunk.row, range(len(chunk)))
+
+    # ------------------------------------------------------------------ copies
+
+    def copy(self) -> "RobotLog":
+        """Return a log that goes on by itself; finished chunks are shared."""
+        return _restored(self.get_state())
+
+    __copy__ = copy
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "RobotLog":
+        return self.copy()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _restored, (self.get_state(),)
+
+    def renamed(
+        self, old_ids: ArrayLike, new_ids: ArrayLike, others: Literal["reject", "keep"] = "reject"
+    ) -> "RobotLog":
+        """Return a copy in which landmarks bear other names, as after a merge of maps.
+
+        Args:
+            old_ids: (k,) int64 >= 0, each once. Names in this log.
+            new_ids: (k,) int64 >= -1. Their names in the copy; -1 rejects their measurements.
+            others: What becomes of names that are not in `old_ids`. "reject": -1, for the name of a landmark that died
+                before a merge means nothing, or something else, in the joint map. "keep": they stay.
+
+        Returns:
+            The copy; its finished chunks share all but the ids with this log.
+
+        Raises:
+            ValueError: If lengths disagree, an old name comes twice, or a name is too low.
+        """
+        old: IntArray = check_array("old_ids", old_ids, (None,), "Give landmark ids.", dtype=np.int64)
+        new: IntArray = check_array("new_ids", new_ids, old.shape, "Give one per old id.", dtype=np.int64)
+        for name, values, least in (("old_ids", old, 0), ("new_ids", new, REJECTED)):
+            if len(values) and values.min() < least:
+                raise bad_argument(name, f"ids >= {least}", int(values.min()), "Give landmark ids.")
+        unique, order = np.unique(old, return_index=True)
+        if len(unique) < len(old):
+            raise bad_argument("old_ids", "each id once", old.tolist(), "Give one new name per landmark.")
+        keep = check_choice("others", others, ("reject", "keep")) == "keep"
+        state = self.get_state()
+        chunks = tuple(chunk.renamed(unique, new[order], keep) for chunk in state["chunks"])
+        return _restored({"chunks": chunks, "unfinished": state["unfinished"].renamed(unique, new[order], keep)})
+
+    def get_state(self) -> dict[str, Any]:
+        """Return the log as it stands; finished chunks are shared and cannot be written, the rest is a copy."""
+        return {"chunks": tuple(self._chunks), "unfinished": self._unfinished()}
+
+    def set_state(self, state: Mapping[str, Any]) -> None:
+        """Go on exactly as the log that gave `state`.
+
+        Raises:
+            ValueError: If `state` is not one of `get_state`.
+        """
+        for name in ("chunks", "unfinished"):
+            if name not in state:
+                raise bad_argument("state", "a dict from RobotLog.get_state", f"no {name!r}", "Pass it unchanged.")
+        last: LogArrays = state["unfinished"]
+        t, n = len(last), len(last.ids)
+        self._chunks = list(state["chunks"])
+        self._open(max(MEASUREMENTS, n))
+        self._num_rows, self._num_measurements = t, n
+        self._steps[:t], self._kinds[:t], self._motions[:t], self._given[:t] = (
+            last.steps, last.kinds, last.motions, last.given
+        )  # fmt: skip
+        self._starts[: t + 1], self._points[:n], self._ids[:n] = last.starts, last.points, last.ids
+        if last.covariances is not None:
+            self._room_for_covariances()[:n] = last.covariances
+        newest = last if t else self._chunks[-1] if self._chunks else None
+        self._last = -1 if newest is None else int(newest.steps[-1])
+
+
+def _restored(state: Mapping[str, Any]) -> RobotLog:
+    """Build a log from `get_state`, as copying does."""
+    log = RobotLog()
+    log.set_state(state)
+    return log

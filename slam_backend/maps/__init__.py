@@ -1,0 +1,1 @@
+"""Landmark maps: aligned, verified, fused."""

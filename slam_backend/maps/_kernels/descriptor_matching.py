@@ -1,0 +1,209 @@
+"""The compiled inner loops of matching by looks: descriptors a as rows (n, d), descriptors b as columns (d, m).
+
+The product of all with all is made block by block and never held as a whole. It is compiled here and not left to BLAS,
+whose threads stall for milliseconds when another process holds a core, and whose rounding depends on the machine.
+"""
+
+import numpy as np
+
+from slam_backend.core.jit import device, jit
+from slam_backend.core.validation import BoolArray, Float32Array, FloatArray, IntArray
+
+BLOCK = 256  # columns whose products are held at once: with 64 numbers each they fit a core's own cache
+HEAD = 40  # numbers of a descriptor that are compared first, enough to tell most apart; a multiple of four
+SLACK = np.float32(1e-5)  # of squared lengths, far more than sums of their products are rounded
+
+
+@device
+@jit
+def _squared_lengths(columns: Float32Array) -> Float32Array:
+    """Return the squared length (m,) of each column of `columns` (d, m)."""
+    result = np.zeros(columns.shape[1], np.float32)
+    for k in range(columns.shape[0]):
+        for j in range(columns.shape[1]):
+            result[j] += columns[k, j] * columns[k, j]
+    return result
+
+
+@device
+@jit
+def _add_products(
+    row: Float32Array, first: int, last: int, b_columns: Float32Array, start: int, stop: int, out: Float32Array
+) -> None:
+    """Add to `out` row . b over the numbers from `first` to `last`, for the columns b from `start` to `stop`."""
+    rest = (last - first) % 4
+    for k in range(first, last - rest, 4):  # four at a time: fewer trips to memory
+        a0, a1, a2, a3 = row[k], row[k + 1], row[k + 2], row[k + 3]
+        b0, b1 = b_columns[k, start:stop], b_columns[k + 1, start:stop]
+        b2, b3 = b_columns[k + 2, start:stop], b_columns[k + 3, start:stop]
+        for j in range(len(b0)):
+            out[j] += (a0 * b0[j] + a1 * b1[j]) + (a2 * b2[j] + a3 * b3[j])
+    for k in range(last - rest, last):
+        a0, b0 = row[k], b_columns[k, start:stop]
+        for j in range(len(b0)):
+            out[j] += a0 * b0[j]
+
+
+@device
+@jit
+def _squared_length(row: Float32Array, first: int) -> np.float32:
+    """Return the squared length of a row from its number `first` on."""
+    length = np.float32(0.0)
+    for k in range(first, len(row)):
+        length += row[k] * row[k]
+    return length
+
+
+@device
+@jit
+def _squared_distances(
+    row: Float32Array, b_columns: Float32Array, lengths_b: Float32Array, start: int, stop: int, out: Float32Array
+) -> None:
+    """Write |row|^2 + |b|^2 - 2 row . b for the columns b from `start` to `stop` of `b_columns` (d, m) to `out`."""
+    out[: stop - start] = np.float32(0.0)
+    _add_products(row, 0, len(row), b_columns, start, stop, out)
+    length = _squared_length(row, 0)
+    for j in range(stop - start):
+        out[j] = length + lengths_b[start + j] - np.float32(2.0) * out[j]
+
+
+@device
+@jit
+def _nearest(a: Float32Array, b_columns: Float32Array) -> tuple[IntArray, Float32Array, IntArray]:
+    """Return each a's nearest b (n,), its squared distance (n,), and each b's nearest a (m,); the first if equal."""
+    n, m = len(a), b_columns.shape[1]
+    nearest_b, nearest_a = np.zeros(n, np.int64), np.zeros(m, np.int64)
+    least_a, least_b = np.full(n, np.float32(np.inf)), np.full(m, np.float32(np.inf))
+    lengths_b = _squared_lengths(b_columns)
+    squares = np.empty(BLOCK, np.float32)
+    for start in range(0, m, BLOCK):
+        stop = min(start + BLOCK, m)
+        least, nearest = least_b[start:stop], nearest_a[start:stop]
+        for i in range(n):
+            _squared_distances(a[i], b_columns, lengths_b, start, stop, squares)
+            for j in range(stop - start):
+                square = squares[j]
+                if square < least_a[i]:
+                    least_a[i], nearest_b[i] = square, start + j
+                if square < least[j]:
+                    least[j], nearest[j] = square, i
+    return nearest_b, least_a, nearest_a
+
+
+@jit
+def mutual_pairs(a: Float32Array, b_columns: Float32Array, limit: float) -> IntArray:
+    """Return the pairs (k, 2) that are each other's nearest, up to a squared distance `limit`, by rising a."""
+    nearest_b, squares, nearest_a = _nearest(a, b_columns)
+    pairs = np.empty((len(a), 2), np.int64)
+    k = 0
+    for i in range(len(a)):
+        if nearest_a[nearest_b[i]] == i and squares[i] <= np.float32(limit):
+            pairs[k, 0], pairs[k, 1] = i, nearest_b[i]
+            k += 1
+    return pairs[:k]
+
+
+@jit
+def stands_out(
+    a: Float32Array,
+    partners: IntArray,
+    b_columns: Float32Array,
+    positions: FloatArray,
+    same_place: float,
+    ratio: float,
+) -> BoolArray:
+    """Tell which matches (k,) stand out, see `_matching.unlike_other_places`."""
+    passed = np.ones(len(a), np.bool_)
+    lengths_b = _squared_lengths(b_columns)
+    squares = np.empty(BLOCK, np.float32)
+    for i in range(len(a)):
+        partner = partners[i]
+        own = np.float32(0.0)
+        for k in range(a.shape[1]):
+            own += (a[i, k] - b_columns[k, partner]) ** 2
+        limit = np.float32(own / (ratio * ratio))
+        for start in range(0, b_columns.shape[1], BLOCK):
+            stop = min(start + BLOCK, b_columns.shape[1])
+            _squared_distances(a[i], b_columns, lengths_b, start, stop, squares)
+            for j in range(stop - start):
+                if squares[j] <= limit:
+                    apart = 0.0
+                    for axis in range(3):
+                        apart += (positions[start + j, axis] - positions[partner, axis]) ** 2
+                    if apart > same_place * same_place:
+                        passed[i] = False
+    return passed
+
+
+@device
+@jit
+def _alike(a: Float32Array, b_columns: Float32Array, limit: float, most: int) -> tuple[IntArray, IntArray, IntArray]:
+    """Return the b within a squared distance `limit` of each a (n, most), and how many each a (n,) and b (m,) has.
+
+    Most descriptors are told apart by their heads: a . b is at most that of the heads and the product of the tails'
+    lengths, and where no b can so be near the tails are not multiplied.
+    """
+    n, m, size = len(a), b_columns.shape[1], a.shape[1]
+    found = np.zeros((n, most), np.int64)
+    of_a, of_b = np.zeros(n, np.int64), np.zeros(m, np.int64)
+    head = min(HEAD, size)
+    lengths_b, tails_b = _squared_lengths(b_columns), np.sqrt(_squared_lengths(b_columns[head:]))
+    squares = np.empty(BLOCK, np.float32)
+    for start in range(0, m, BLOCK):
+        stop = min(start + BLOCK, m)
+        lengths, tails = lengths_b[start:stop], tails_b[start:stop]
+        for i in range(n):
+            length, tail = _squared_length(a[i], 0), np.sqrt(_squared_length(a[i], head))
+            squares[: stop - start] = np.float32(0.0)
+            _add_products(a[i], 0, head, b_columns, start, stop, squares)
+            if not _may_be_near(squares, length, tail, lengths, tails, np.float32(limit)):
+                continue
+            _add_products(a[i], head, size, b_columns, start, stop, squares)
+            for j in range(stop - start):
+                if length + lengths[j] - np.float32(2.0) * squares[j] <= limit:
+                    if of_a[i] < most:
+                        found[i, of_a[i]] = start + j
+                    of_a[i] += 1
+                    of_b[start + j] += 1
+    return found, of_a, of_b
+
+
+@device
+@jit
+def _may_be_near(
+    products: Float32Array, length: np.float32, tail: np.float32, lengths: Float32Array, tails: Float32Array,
+    limit: np.float32,
+) -> bool:  # fmt: skip
+    """Tell whether some b may be within a squared distance `limit` of a, by the products of heads (m,).
+
+    Args:
+        products: Of the head of a with those of all b.
+        length, tail: Squared length of a, and length of its tail; of the b (m,) likewise.
+        limit: No rounding lets a b above it seem to be near, for `SLACK` of the squared lengths is left to that.
+    """
+    near = 0
+    for j in range(len(lengths)):
+        whole = length + lengths[j]
+        near += whole - np.float32(2.0) * (products[j] + tail * tails[j]) <= limit + SLACK * whole
+    return near > 0
+
+
+@jit
+def num_alike(a: Float32Array, b_columns: Float32Array, limit: float) -> int:
+    """Return how many pairs are within a squared distance `limit`."""
+    return int(_alike(a, b_columns, limit, 0)[1].sum())
+
+
+@jit
+def pairs_alike(a: Float32Array, b_columns: Float32Array, limit: float, most: int) -> IntArray:
+    """Return the pairs (k, 2) within a squared distance `limit` of which neither has more than `most`, by rising a."""
+    found, of_a, of_b = _alike(a, b_columns, limit, most)
+    pairs = np.empty((found.size, 2), np.int64)
+    k = 0
+    for i in range(len(a)):
+        if of_a[i] <= most:
+            for j in found[i, : of_a[i]]:
+                if of_b[j] <= most:
+                    pairs[k, 0], pairs[k, 1] = i, j
+                    k += 1
+    return pairs[:k]

@@ -1,0 +1,224 @@
+"""The motion between two maps of unknown relative frame, or a reason why it is not known (Sec. 3.1)."""
+
+import math
+
+import numpy as np
+
+from slam_backend.core.validation import BoolArray, FloatArray, IntArray, bad_argument, check_choice
+from slam_backend.maps import _kernels as kernels
+from slam_backend.maps import initial_estimates as proposals
+from slam_backend.maps.alignment_types import REASONS, RIVAL_ANGLE, RIVAL_DISTANCE, Alignment, AlignmentOptions, Reason
+from slam_backend.maps.correspondences import candidates, match_table, too_many
+from slam_backend.maps.landmark_map import LandmarkMap
+from slam_backend.maps.verification import (
+    by_chance,
+    covariance_of,
+    extent,
+    fitting,
+    is_mirrored,
+    one_to_one,
+    recurs,
+    strongest_rival,
+    worst_bound,
+)
+from slam_backend.metrics import align_se2
+
+__all__ = [
+    "METHODS", "REASONS", "RIVAL_ANGLE", "RIVAL_DISTANCE", "Alignment", "AlignmentOptions", "Reason", "align_maps",
+    "candidate_matches", "propose_motion",
+]  # fmt: skip
+
+METHODS = ("ransac", "svd", "icp", "impicp", "gnc", "clique")
+
+
+def candidate_matches(map_a: LandmarkMap, map_b: LandmarkMap, options: AlignmentOptions) -> IntArray:
+    """Match landmarks by appearance, without regard to where they lie in the plane.
+
+    Those that stand out: each is the other's nearest descriptor, within the gate, clearly nearer than any landmark of
+    another place in either map. Beside them all pairs within the gate of landmarks that have few look-alikes: which of
+    them is meant, geometry has to tell, and that there are several is evidence, too. Heights agree, because planar
+    robots with one camera height share z (Sec. 3.1). Without appearance all pairs whose heights agree are candidates.
+
+    Args:
+        map_a: The one map.
+        map_b: The other, in any other planar frame.
+        options: Gates.
+
+    Returns:
+        (k, 2) int64 rows (index in map_a, index in map_b), by rising index in map_a, then in map_b. One-to-one where
+        all landmarks look different.
+
+    Raises:
+        ValueError: If the maps' descriptors differ in size, or there are too many pairs to try without appearance.
+    """
+    return candidates(map_a, map_b, options)[0]
+
+
+def align_maps(
+    map_a: LandmarkMap,
+    map_b: LandmarkMap,
+    method: str = "ransac",
+    rng: np.random.Generator | None = None,
+    options: AlignmentOptions | None = None,
+) -> Alignment:
+    """Estimate the planar motion between two maps from landmarks that look alike; refuse when in doubt.
+
+    Methods differ in where they begin (`propose_motion`). What follows is common to all: inliers within a Mahalanobis
+    gate, heights included, and weighted Gauss-Newton over them in turn until both rest, which is the maximum of the
+    likelihood; its covariance; the best alignment that differs; and the refusals.
+
+    Args:
+        map_a: The map whose frame the result leads to.
+        map_b: The other map.
+        method: `"ransac"`: search over pairs of candidate matches, each hypothesis locally optimised. `"svd"`: closed
+            form over all candidates. `"icp"`: pairs of closest landmarks, from there on. `"impicp"`: ICP from two
+            starts. `"gnc"`: truncated least squares by graduated non-convexity. `"clique"`: largest set of candidates
+            that agree pairwise. Sources are named in `_proposals` and `_clique_kernels`; `docs/alignment.md` compares.
+        rng: Order of the search; None: a fixed one. The same generator state gives the same result.
+        options: Gates and refusals; None: the defaults.
+
+    Returns:
+        The alignment, or a refusal with its reason. A refusal is cheap, a false merge is not.
+
+    Raises:
+        ValueError: If the method is unknown, the maps' descriptors differ in size or `rng` is no generator.
+    """
+    options, rng = _checked(map_a, map_b, method, rng, options)
+    if too_many(map_a, map_b, options):
+        return Alignment.refused("too many candidates")
+    matches, stands_out = candidates(map_a, map_b, options)
+    if len(matches) < options.min_inliers:
+        return Alignment.refused("too few candidates")
+    table = match_table(map_a, map_b, matches)
+    floor, gate = options.position_floor**2, options.position_gate
+    hypotheses = _search(table, rng, options)
+    start = _propose(method, map_a, map_b, matches, stands_out, table, hypotheses, options)
+    if start is None:
+        return Alignment.refused("too few inliers")
+    pose, members, variance = kernels.refine(table, start, floor, gate)
+    inside = fitting(table, matches, pose, floor, gate)
+    if not one_to_one(matches):  # of look-alikes that all fit, only the closest shapes the motion
+        members = np.zeros(len(matches), np.bool_)
+        pose, members[inside], variance = kernels.refine(table[inside], pose, floor, gate)
+        inside = fitting(table, matches, pose, floor, gate)
+    inliers = matches[inside]
+    if len(inliers) < options.min_inliers or by_chance(table, map_a, matches, pose, variance, options):
+        return Alignment.refused("too few inliers")
+    points_b = map_b.means[inliers[:, 1], :2]
+    ratio = strongest_rival(table, matches, hypotheses, pose, variance, points_b.mean(axis=0), options)
+    if ratio > options.max_ratio:
+        return Alignment.refused("ambiguous", ratio)
+    if options.appearance and any(
+        recurs(landmarks, rows, variance, options) for landmarks, rows in zip((map_a, map_b), inliers.T, strict=True)
+    ):
+        return Alignment.refused("ambiguous", ratio)
+    if is_mirrored(table, matches, pose, inside, options):
+        return Alignment.refused("mirrored", ratio)
+    if extent(points_b) < options.min_spread:
+        return Alignment.refused("poorly spread", ratio)
+    contradiction = kernels.unexplained(table, members, pose, variance)
+    covariance = covariance_of(kernels.information(table, members, pose, variance)[0] / contradiction)
+    influence = kernels.largest_influence(table, members, pose, variance)
+    missed, excess = worst_bound(covariance, influence, options)
+    if covariance is None or not excess <= 1.0:
+        return Alignment.refused("too uncertain", ratio, missed, excess)
+    return Alignment(True, "", pose[0], pose[1], pose[2], covariance, inliers, ratio)
+
+
+def propose_motion(
+    map_a: LandmarkMap,
+    map_b: LandmarkMap,
+    method: str,
+    rng: np.random.Generator | None = None,
+    options: AlignmentOptions | None = None,
+) -> FloatArray | None:
+    """Return a method's own estimate of the motion, before any refinement or refusal, as the paper compares them.
+
+    Args:
+        map_a: The map whose frame the result leads to.
+        map_b: The other map.
+        method: As in `align_maps`.
+        rng: Likewise.
+        options: Likewise.
+
+    Returns:
+        (3,) a_from_b [m, m, rad]; None if the candidates do not suffice for one.
+
+    Raises:
+        ValueError: As `align_maps`.
+    """
+    options, rng = _checked(map_a, map_b, method, rng, options)
+    matches, stands_out = candidates(map_a, map_b, options)
+    if len(matches) < 2:
+        return None
+    table = match_table(map_a, map_b, matches)
+    hypotheses = _search(table, rng, options) if method == "ransac" else np.empty((0, 5))
+    return _propose(method, map_a, map_b, matches, stands_out, table, hypotheses, options)
+
+
+def _checked(
+    map_a: LandmarkMap,
+    map_b: LandmarkMap,
+    method: str,
+    rng: np.random.Generator | None,
+    options: AlignmentOptions | None,
+) -> tuple[AlignmentOptions, np.random.Generator]:
+    """Return options and generator, or raise if an argument is of the wrong kind."""
+    check_choice("method", method, METHODS)
+    options = AlignmentOptions() if options is None else options
+    for name, value, kind in (
+        ("map_a", map_a, LandmarkMap), ("map_b", map_b, LandmarkMap), ("options", options, AlignmentOptions)
+    ):  # fmt: skip
+        if not isinstance(value, kind):
+            raise bad_argument(name, f"a {kind.__name__}", value, f"Build one: {kind.__name__}(...).")
+    rng = np.random.default_rng(0) if rng is None else rng
+    if not isinstance(rng, np.random.Generator):
+        raise bad_argument("rng", "a numpy.random.Generator or None", rng, "Give np.random.default_rng(seed).")
+    return options, rng
+
+
+def _propose(
+    method: str,
+    map_a: LandmarkMap,
+    map_b: LandmarkMap,
+    matches: IntArray,
+    stands_out: BoolArray,
+    table: FloatArray,
+    hypotheses: FloatArray,
+    options: AlignmentOptions,
+) -> FloatArray | None:
+    """Return the motion (3,) at which a method begins; None if it finds none.
+
+    Those that cannot choose among look-alikes begin with the candidates that stand out, where there are enough.
+    """
+    floor, gate = options.position_floor**2, options.position_gate
+    if method not in ("ransac", "clique") and np.count_nonzero(stands_out) >= options.min_inliers:
+        matches, table = matches[stands_out], table[stands_out]
+    if method == "ransac":
+        return hypotheses[hypotheses[:, 4].argmax(), :3].copy() if len(hypotheses) else None
+    if method == "gnc":
+        return proposals.graduated(table, floor, gate)
+    if method == "clique":
+        unlike = np.linalg.norm(map_a.descriptors[matches[:, 0]] - map_b.descriptors[matches[:, 1]], axis=1)
+        return proposals.consistent(table, matches, unlike, floor, gate)
+    if method == "impicp":
+        return proposals.two_starts(map_a, map_b, matches, table, floor, gate)
+    fit = align_se2(table[:, :2], table[:, 3:5])
+    return fit if method == "svd" else proposals.closest_points(map_a, map_b, fit)
+
+
+def _search(table: FloatArray, rng: np.random.Generator, options: AlignmentOptions) -> FloatArray:
+    """Return the hypotheses (h, 5) of a random search over pairs of candidates; over all of them if they are few."""
+    pairs = len(table) * (len(table) - 1) // 2
+    few = pairs <= options.max_samples
+    samples = rng.permutation(pairs) if few else rng.integers(0, pairs, options.max_samples)
+    return kernels.search(
+        table,
+        samples,
+        options.position_floor**2,
+        options.position_gate,
+        0.5 * options.min_spread,  # pairs that lie closer say little about the rotation
+        options.min_inliers,
+        options.max_ratio,
+        math.log(1.0 - options.success_probability),
+    )

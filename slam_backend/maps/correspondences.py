@@ -1,0 +1,155 @@
+"""Candidate correspondences of two maps, by descriptor, as the table that the kernels of alignment read."""
+
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_backend.core.packed_symmetric import OF_NINE
+from slam_backend.core.validation import BoolArray, Float32Array, FloatArray, IntArray, bad_argument
+from slam_backend.maps import _kernels as kernels
+from slam_backend.maps._kernels import descriptor_matching
+from slam_backend.maps.alignment_types import AlignmentOptions
+from slam_backend.maps.landmark_map import LandmarkMap
+
+MOST_PAIRS = 10_000  # candidates by geometry alone
+
+
+def too_many(map_a: LandmarkMap, map_b: LandmarkMap, options: AlignmentOptions) -> bool:
+    """Tell whether two maps have more pairs than are tried without appearance."""
+    return not options.appearance and len(map_a) * len(map_b) > MOST_PAIRS
+
+
+def candidates(map_a: LandmarkMap, map_b: LandmarkMap, options: AlignmentOptions) -> tuple[IntArray, BoolArray]:
+    """Return the candidates (k, 2), and which of them stand out (k,): these are one-to-one."""
+    if map_a.descriptors.shape[1] != map_b.descriptors.shape[1]:
+        raise bad_argument(
+            "map_b",
+            f"descriptors of size {map_a.descriptors.shape[1]}, as in map_a",
+            map_b.descriptors.shape[1],
+            "Describe the landmarks of both maps with the same front end.",
+        )
+    if too_many(map_a, map_b, options):
+        raise bad_argument(
+            "map_b", f"at most {MOST_PAIRS} pairs of landmarks without appearance", len(map_a) * len(map_b),
+            "Give smaller maps, or tell landmarks apart.",
+        )  # fmt: skip
+    if options.appearance:
+        clear = mutual_nearest(map_a.descriptors, map_b.descriptors, options.descriptor_gate)
+        for one, other, here, there in ((map_a, map_b, 0, 1), (map_b, map_a, 1, 0)):
+            descriptors, partners = one.descriptors[clear[:, here]], clear[:, there]
+            limits = (options.same_place, options.descriptor_ratio)
+            clear = clear[unlike_other_places(descriptors, partners, other.descriptors, other.means, *limits)]
+        alike = clear[:0]
+        if options.look_alikes:
+            alike = look_alikes(map_a.descriptors, map_b.descriptors, options.descriptor_gate, options.look_alikes)
+    else:
+        clear, alike = np.empty((0, 2), np.int64), np.argwhere(np.ones((len(map_a), len(map_b)), np.bool_))
+    names = np.concatenate([clear, alike]) @ np.array([max(len(map_b), 1), 1])
+    unique, first = np.unique(names, return_index=True)
+    matches = np.column_stack([unique // max(len(map_b), 1), unique % max(len(map_b), 1)])
+    stands_out = first < len(clear)
+    rows_a, rows_b = matches.T
+    climb = map_a.means[rows_a, 2] - map_b.means[rows_b, 2]
+    variance = map_a.covariances[rows_a, 2, 2] + map_b.covariances[rows_b, 2, 2] + options.position_floor**2
+    level = climb**2 <= options.position_gate * variance
+    return matches[level], stands_out[level]
+
+
+def may_suffice(descriptors_a: Float32Array, descriptors_b: Float32Array, options: AlignmentOptions) -> bool:
+    """Tell by descriptors (n, d), (m, d) alone whether two maps may have candidates enough for an alignment.
+
+    By appearance every candidate is a pair within the gate: so few of them are not worth making maps for.
+    """
+    if not options.appearance or descriptors_a.shape[1] != descriptors_b.shape[1]:
+        return True
+    return num_alike(descriptors_a, descriptors_b, options.descriptor_gate) >= options.min_inliers
+
+
+def match_table(map_a: LandmarkMap, map_b: LandmarkMap, matches: IntArray) -> FloatArray:
+    """Return the table of matched landmarks that the kernels of alignment read.
+
+    Args:
+        map_a, map_b: Both maps.
+        matches: (k, 2) int64 rows (row in a, row in b).
+
+    Returns:
+        (k, 18) float64: means of a and b [m], upper triangles of their covariances [m^2], each in its map's frame.
+    """
+    table = np.empty((len(matches), kernels.MATCH_COLUMNS))
+    for offset, source, rows in ((0, map_a, matches[:, 0]), (1, map_b, matches[:, 1])):
+        packed = source.covariances[rows].reshape(-1, 9).take(OF_NINE, axis=1)
+        table[:, 3 * offset : 3 * offset + 3] = source.means[rows]
+        table[:, 6 + 6 * offset : 12 + 6 * offset] = packed
+    return table
+
+
+Scalar = TypeVar("Scalar", bound=np.generic)
+
+
+def look_alikes(a: Float32Array, b: Float32Array, gate: float, most: int) -> IntArray:
+    """Pair all descriptors within `gate`, but none that so pairs with more than `most`: those tell nothing.
+
+    Args:
+        a: (n, d) float32 [-].
+        b: (m, d) float32 [-].
+        gate: Largest L2 distance of a pair [-].
+        most: Most partners of one.
+
+    Returns:
+        (k, 2) int64 rows (index in a, index in b), by rising index in a, then in b; k <= n `most`.
+    """
+    if not len(a) or not len(b):
+        return np.empty((0, 2), np.int64)
+    return descriptor_matching.pairs_alike(_fresh(a), _fresh(b.T), gate * gate, most)
+
+
+def num_alike(a: Float32Array, b: Float32Array, gate: float) -> int:
+    """Return how many pairs of descriptors (n, d) and (m, d) are no farther apart than `gate`."""
+    return descriptor_matching.num_alike(_fresh(a), _fresh(b.T), gate * gate) if len(a) and len(b) else 0
+
+
+def mutual_nearest(a: Float32Array, b: Float32Array, gate: float) -> IntArray:
+    """Pair descriptors that are each other's nearest and no farther apart than `gate`.
+
+    Args:
+        a: (n, d) float32 [-].
+        b: (m, d) float32 [-].
+        gate: Largest L2 distance of a pair [-].
+
+    Returns:
+        (k, 2) int64 rows (index in a, index in b), by rising index in a; no index appears twice.
+    """
+    if not len(a) or not len(b):
+        return np.empty((0, 2), np.int64)
+    return descriptor_matching.mutual_pairs(_fresh(a), _fresh(b.T), gate * gate)
+
+
+def unlike_other_places(
+    descriptors: Float32Array,
+    partners: IntArray,
+    others: Float32Array,
+    positions: FloatArray,
+    same_place: float,
+    ratio: float,
+) -> BoolArray:
+    """Tell which matches stand out from all landmarks that lie elsewhere (the ratio test).
+
+    Args:
+        descriptors: (k, d) float32 [-]. Of the matched landmarks in the one map.
+        partners: (k,) int64. Their partners in the other map.
+        others: (m, d) float32 [-]. All descriptors of the other map.
+        positions: (m, 3) float64 [m]. All positions in the other map.
+        same_place: Landmarks within this distance [m] of the partner do not compete: they may be its duplicates.
+        ratio: A match must be closer than this times the best competitor [-].
+
+    Returns:
+        (k,) mask of the matches that pass. Without any competitor a match passes.
+    """
+    arrays = _fresh(descriptors), _fresh(partners), _fresh(others.T), _fresh(positions)
+    return descriptor_matching.stands_out(*arrays, same_place, ratio)
+
+
+def _fresh(array: NDArray[Scalar]) -> NDArray[Scalar]:
+    """Return a copy of one kind of memory, because numba compiles a kernel again for each other kind."""
+    return np.array(array, order="C")

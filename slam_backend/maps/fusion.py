@@ -1,0 +1,201 @@
+"""Two maps whose frames are known to each other become one: Eqs. 13-17, corrected where the printed form is wrong."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from slam_backend.core.validation import FloatArray, IntArray, bad_argument, check_kind
+from slam_backend.geometry import rotate_covariances, rotation, transform_points
+from slam_backend.maps.alignment import Alignment
+from slam_backend.maps.landmark_map import LandmarkMap
+
+
+def fuse_landmarks(
+    mean1: ArrayLike, cov1: ArrayLike, mean2: ArrayLike, cov2: ArrayLike
+) -> tuple[FloatArray, FloatArray]:
+    """Fuse two independent estimates of the same landmarks (Eqs. 13-15).
+
+    Args:
+        mean1: (..., 3) float64 [m]. First estimates (mu_1).
+        cov1: (..., 3, 3) float64 [m^2], symmetric positive semi-definite (Sigma_1).
+        mean2: (..., 3) float64 [m]. Second estimates, same frame (mu_2).
+        cov2: (..., 3, 3) float64 [m^2]; Sigma_1 + Sigma_2 must be positive definite.
+
+    Returns:
+        Means (..., 3) and covariances (..., 3, 3), symmetric, equal to (Sigma_1^-1 + Sigma_2^-1)^-1.
+
+    Raises:
+        ValueError: If an argument is no such array, or both estimates are exact along one direction: they can only
+            contradict each other.
+
+    >>> fuse_landmarks([0.0, 0.0, 0.0], np.eye(3), [3.0, 0.0, 0.0], 2.0 * np.eye(3))[0].round(12).tolist()
+    [1.0, 0.0, 0.0]
+    """
+    mu1, mu2 = _estimate("mean1", mean1, (3,)), _estimate("mean2", mean2, (3,))
+    sigma1, sigma2 = _estimate("cov1", cov1, (3, 3)), _estimate("cov2", cov2, (3, 3))
+    try:
+        gain = _transposed(np.linalg.solve(sigma1 + sigma2, sigma1))  # Eq. 13
+    except np.linalg.LinAlgError as error:
+        cure = "Give each landmark some uncertainty in every direction."
+        raise bad_argument("cov1 + cov2", "positive definite matrices", "a singular one", cure) from error
+    mean = mu1 + (gain @ (mu2 - mu1)[..., None])[..., 0]  # Eq. 14, with mu2 - mu1: printed, it moves away from mu2
+    rest = np.eye(3) - gain
+    # Eq. 15, of Sigma_1 and not of mu_1, in the form that stays symmetric and positive whatever the rounding.
+    covariance = rest @ sigma1 @ _transposed(rest) + gain @ sigma2 @ _transposed(gain)
+    return mean, 0.5 * (covariance + _transposed(covariance))
+
+
+def _estimate(name: str, value: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
+    """Return `value` as an array whose last axes have a shape, or raise."""
+    expected = f"an array of shape (..., {', '.join(map(str, shape))})"
+    cure = "Give one row, or one matrix, per landmark."
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise bad_argument(name, expected, value, cure) from error
+    if array.shape[-len(shape) :] != shape:
+        raise bad_argument(name, expected, f"shape {array.shape}", cure)
+    return array
+
+
+def alignment_jacobian(theta: float, points_b: ArrayLike) -> FloatArray:
+    """Return how points moved from b to a react to (tx, ty, theta): J = [e_x, e_y, dR/dtheta p_b].
+
+    Args:
+        theta: Rotation of the alignment [rad].
+        points_b: (..., 3) float64 [m], frame b.
+
+    Returns:
+        (..., 3, 3): rows x, y, z; columns tx, ty, theta.
+    """
+    points = np.asarray(points_b, dtype=np.float64)
+    jacobian = np.zeros((*points.shape, 3))
+    jacobian[..., 0, 0] = jacobian[..., 1, 1] = 1.0
+    jacobian[..., :2, 2] = points[..., :2] @ rotation(theta + 0.5 * np.pi).T  # dR/dtheta is R turned on by 90 degrees
+    return jacobian
+
+
+def move_covariances(alignment: Alignment, points_b: ArrayLike, covariances_b: FloatArray) -> FloatArray:
+    """Express covariances of landmarks in frame a, the alignment's own uncertainty included (Eqs. 16-17).
+
+    Args:
+        alignment: A successful one, a from b.
+        points_b: (..., 3) float64 [m], frame b.
+        covariances_b: (..., 3, 3) float64 [m^2], frame b.
+
+    Returns:
+        (..., 3, 3): R Sigma R^T + J Sigma_align J^T.
+    """
+    jacobian = alignment_jacobian(alignment.theta, points_b)
+    # Eq. 16, as R Sigma R^T because p_a = R p_b + t, plus what the alignment itself does not know.
+    moved = rotate_covariances(alignment.theta, covariances_b) + jacobian @ alignment.covariance @ _transposed(jacobian)
+    return np.asarray(0.5 * (moved + _transposed(moved)))
+
+
+def fuse_descriptors(
+    descriptors1: NDArray[np.float32], counts1: ArrayLike, descriptors2: NDArray[np.float32], counts2: ArrayLike
+) -> NDArray[np.float32]:
+    """Average descriptors by their counts and restore their length, so that distances keep their meaning (Sec. 3.2).
+
+    Args:
+        descriptors1: (..., d) float32 [-].
+        counts1: (...) How many measurements each is made of.
+        descriptors2: (..., d) float32 [-].
+        counts2: (...) Likewise.
+
+    Returns:
+        (..., d) float32: along the weighted mean, as long as the weighted mean of the two lengths; opposite
+        descriptors that cancel leave the first.
+    """
+    one, two = np.asarray(descriptors1, dtype=np.float64), np.asarray(descriptors2, dtype=np.float64)
+    n1, n2 = np.asarray(counts1, dtype=np.float64)[..., None], np.asarray(counts2, dtype=np.float64)[..., None]
+    mean = (n1 * one + n2 * two) / (n1 + n2)
+    length1, length2, length = (np.linalg.norm(v, axis=-1, keepdims=True) for v in (one, two, mean))
+    wanted = (n1 * length1 + n2 * length2) / (n1 + n2)
+    cancelled = length <= 1e-9 * wanted
+    fused = np.where(cancelled, one, mean * (wanted / np.where(cancelled, 1.0, length)))
+    return np.asarray(fused, dtype=np.float32)
+
+
+def fuse_maps(map_a: LandmarkMap, map_b: LandmarkMap, alignment: Alignment) -> LandmarkMap:
+    """Merge map b into map a: inliers are fused, the other landmarks of b are moved and appended.
+
+    Args:
+        map_a: The map whose frame, order and ids stay.
+        map_b: The other map. Fused landmarks take the id of a; the others keep theirs, or get a fresh one above all
+            ids of both maps where a uses it already.
+        alignment: A successful one, of exactly these maps.
+
+    Returns:
+        A new map in a's frame: all of a's rows, then b's that were not fused. Counts are added.
+
+    Raises:
+        ValueError: If an argument is of another kind, the alignment was refused, names landmarks that do not exist or
+            the same one twice, or the descriptors differ in size.
+    """
+    check_kind("map_a", map_a, LandmarkMap), check_kind("map_b", map_b, LandmarkMap)
+    check_kind("alignment", alignment, Alignment, "Give what align_maps(map_a, map_b) returned.")
+    if not alignment.success:
+        cure = "Fuse maps only after a successful alignment."
+        raise bad_argument("alignment", "a successful alignment", f"a refusal: {alignment.reason}", cure)
+    if map_a.descriptors.shape[1] != map_b.descriptors.shape[1]:
+        expected = f"descriptors of size {map_a.descriptors.shape[1]}, as in map_a"
+        cure = "Describe the landmarks of both maps with the same front end."
+        raise bad_argument("map_b", expected, map_b.descriptors.shape[1], cure)
+    check_inliers(alignment.inliers, len(map_a), len(map_b))
+    rows_a, rows_b = alignment.inliers.T
+    means_b = transform_points(alignment.transform, map_b.means)
+    covariances_b = move_covariances(alignment, map_b.means, map_b.covariances)
+
+    means, covariances = map_a.means.copy(), map_a.covariances.copy()
+    means[rows_a], covariances[rows_a] = fuse_landmarks(
+        means[rows_a], covariances[rows_a], means_b[rows_b], covariances_b[rows_b]
+    )
+    descriptors, counts = map_a.descriptors.copy(), map_a.counts.copy()
+    descriptors[rows_a] = fuse_descriptors(
+        descriptors[rows_a], counts[rows_a], map_b.descriptors[rows_b], map_b.counts[rows_b]
+    )
+    counts[rows_a] += map_b.counts[rows_b]
+
+    added = np.setdiff1d(np.arange(len(map_b)), rows_b)
+    return LandmarkMap(
+        np.concatenate([means, means_b[added]]),
+        np.concatenate([covariances, covariances_b[added]]),
+        np.concatenate([descriptors, map_b.descriptors[added]]),
+        np.concatenate([counts, map_b.counts[added]]),
+        np.concatenate([map_a.ids, _fresh_ids(map_a.ids, map_b.ids, added)]),
+    )
+
+
+def check_inliers(inliers: IntArray, size_a: int, size_b: int) -> None:
+    """Raise unless the inliers pair existing landmarks one-to-one.
+
+    Args:
+        inliers: (k, 2) int64. Rows of either map.
+        size_a: Landmarks of the first map.
+        size_b: Landmarks of the second.
+
+    Raises:
+        ValueError: If a row lies outside or comes twice.
+    """
+    outside = (inliers < 0) | (inliers >= np.array([size_a, size_b]))
+    repeated = any(len(np.unique(column)) < len(column) for column in inliers.T)
+    if outside.any() or repeated:
+        expected = f"one-to-one pairs of rows below {size_a} and {size_b}"
+        got = "an index outside" if outside.any() else "a row that repeats"
+        raise bad_argument("alignment.inliers", expected, got, "Fuse the two maps that were aligned.")
+
+
+def _fresh_ids(ids_a: IntArray, ids_b: IntArray, added: IntArray) -> IntArray:
+    """Return ids for the rows `added` of b: their own, or new numbers where a uses them already."""
+    ids = ids_b[added].copy()
+    taken = np.isin(ids, ids_a)
+    first = 1 + max(ids_a.max(initial=-1), ids_b.max(initial=-1))
+    ids[taken] = first + np.arange(np.count_nonzero(taken))
+    return ids
+
+
+def _transposed(matrices: NDArray[Any]) -> FloatArray:
+    """Swap the last two axes."""
+    return np.asarray(matrices.swapaxes(-1, -2))

@@ -1,0 +1,113 @@
+"""Where an alignment begins: each method's own estimate of the motion, from candidate matches or from closeness alone.
+
+`svd` is the closed form over all candidates. `icp` is that of Besl and McKay (1992), which pairs each landmark with the
+closest, with far pairs left out as by Zhang (1994), because maps overlap only in part. `impicp` is the improved ICP of
+Ballesta et al. (2010), of which we know only the idea: two starts from two sets of matches, the better end is kept.
+`gnc` is graduated non-convexity with truncated least squares (Yang, Antonante, Tzoumas and Carlone 2020). `clique` is
+the largest set of candidates that agree pairwise (`_clique_kernels`).
+"""
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from slam_backend.core.validation import FloatArray, IntArray
+from slam_backend.geometry import transform_points
+from slam_backend.maps import _kernels as kernels
+from slam_backend.maps._kernels import max_clique as cliques
+from slam_backend.maps.landmark_map import LandmarkMap
+from slam_backend.metrics import align_se2
+
+ICP_ROUNDS = 50
+ICP_FAR = 3.0  # pairs farther apart than this times the median are left out
+GNC_FACTOR = 1.4  # growth of the control parameter per round (Yang et al., Sec. V)
+GNC_ROUNDS = 100
+MOST_IN_GRAPH = 1000  # candidates in a graph: a megabyte of pairs
+MAX_NODES = 20_000  # branchings of the search for a clique
+
+
+def closest_points(map_a: LandmarkMap, map_b: LandmarkMap, start: FloatArray) -> FloatArray:
+    """Return where iterated pairing with the closest landmark leads (ICP).
+
+    Args:
+        map_a: The map whose frame the result leads to.
+        map_b: The other.
+        start: (3,) First motion a_from_b [m, m, rad].
+    """
+    tree = KDTree(map_a.means)
+    pose, before = start, np.empty((0, 2), np.int64)
+    for _ in range(ICP_ROUNDS):
+        distances, rows_a = tree.query(transform_points(pose, map_b.means))
+        near = np.flatnonzero(distances <= ICP_FAR * np.median(distances))
+        pairs = np.column_stack([np.asarray(rows_a)[near], near])
+        if len(near) < 2 or np.array_equal(pairs, before):
+            break
+        pose = align_se2(map_a.means[pairs[:, 0], :2], map_b.means[pairs[:, 1], :2])
+        before = pairs
+    return pose
+
+
+def two_starts(
+    map_a: LandmarkMap, map_b: LandmarkMap, matches: IntArray, table: FloatArray, floor: float, gate: float
+) -> FloatArray:
+    """Return the better end of ICP from two starts: all candidates, and the half of them that look most alike.
+
+    The better end is the one that more candidates support, weighed by how well they fit.
+    """
+    unlike = np.linalg.norm(map_a.descriptors[matches[:, 0]] - map_b.descriptors[matches[:, 1]], axis=1)
+    closer = matches[unlike <= np.median(unlike)]
+    starts = (align_se2(map_a.means[some[:, 0], :2], map_b.means[some[:, 1], :2]) for some in (matches, closer))
+    ends = [closest_points(map_a, map_b, start) for start in starts]
+    scores = [np.maximum(0.0, 1.0 - kernels.squared_distances(table, end, floor) / gate).sum() for end in ends]
+    return ends[int(np.argmax(scores))]
+
+
+def graduated(table: FloatArray, floor: float, gate: float) -> FloatArray:
+    """Return the motion (3,) of truncated least squares, by graduated non-convexity.
+
+    Args:
+        table: (k, 18) candidates.
+        floor: Variance added to each residual [m^2].
+        gate: Squared residual c^2, in units of its variance, beyond which a match counts no more.
+    """
+    a, b = table[:, :2], table[:, 3:5]
+    # The solver inside is a closed form, which asks for one variance per match in place of a covariance.
+    variance = 0.5 * (table[:, 6] + table[:, 9] + table[:, 12] + table[:, 15]) + floor
+    weights = np.ones(len(table))
+    pose = align_se2(a, b, weights / variance)
+    squares = _squares(pose, a, b, variance)
+    if 2.0 * squares.max() <= gate:
+        return pose
+    mu = gate / (2.0 * squares.max() - gate)
+    for _ in range(GNC_ROUNDS):
+        low, high = mu / (mu + 1.0) * gate, (mu + 1.0) / mu * gate
+        between = np.sqrt(gate * mu * (mu + 1.0) / np.maximum(squares, 1e-300)) - mu  # Eq. 14 of Yang et al.
+        weights = np.where(squares >= high, 0.0, np.where(squares <= low, 1.0, between))
+        if np.count_nonzero(weights) < 2:
+            break
+        pose = align_se2(a, b, weights / variance)
+        squares = _squares(pose, a, b, variance)
+        if ((weights == 0.0) | (weights == 1.0)).all():
+            break
+        mu *= GNC_FACTOR
+    return pose
+
+
+def consistent(table: FloatArray, matches: IntArray, unlike: FloatArray, floor: float, gate: float) -> FloatArray:
+    """Return the motion (3,) fitted to the largest set of candidates whose distances agree pairwise.
+
+    Args:
+        table: (k, 18) candidates.
+        matches: (k, 2) their rows (a, b).
+        unlike: (k,) Distances of their descriptors: of too many candidates those that look most alike are taken.
+        floor: Variance added in each map [m^2].
+        gate: Of the test for agreement.
+    """
+    chosen = np.sort(np.argsort(unlike, kind="stable")[:MOST_IN_GRAPH])
+    agrees = cliques.agreement(table[chosen], matches[chosen], floor, gate)
+    members = chosen[cliques.largest_clique(agrees, MAX_NODES)]
+    return align_se2(table[members, :2], table[members, 3:5])
+
+
+def _squares(pose: FloatArray, a: FloatArray, b: FloatArray, variance: FloatArray) -> FloatArray:
+    """Return squared residuals (k,) over their variances."""
+    return np.asarray(((a - transform_points(pose, b)) ** 2).sum(axis=1) / variance)

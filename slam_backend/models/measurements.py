@@ -1,0 +1,127 @@
+"""What one robot's camera reports in one step: points, descriptors and, if the sensor knows them, covariances."""
+
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_backend.core.read_only import as_read_only
+from slam_backend.core.validation import FloatArray, IntArray, bad_argument, check_array
+from slam_backend.fastslam import _kernels
+
+LARGEST_DESCRIPTOR = 1e6  # of one component; squares of distances then stay far from the end of float32
+LEAST_VARIANCE, LARGEST_VARIANCE = 1e-14, 1e12  # [m^2]; log-weights then keep their differences in float64
+LARGEST_CONDITION = 1e8  # about 1 / sqrt(machine epsilon): with more, updates in float64 lose positive definiteness
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Measurements:
+    """The measurements z_t = (v_t, d_t) of one frame (Sec. 2.2).
+
+    Attributes:
+        points: (n, 3) float64 [m], camera frame (X right, Y down, Z ahead). Measured landmark positions (v_t).
+        descriptors: (n, d) float32 [-]. Appearance vectors (d_t); d is the same in all frames of a run.
+        covariances: None, or (n, 3, 3) float64 [m^2], camera frame. None: the camera model is evaluated at the
+            predicted point. Given: used as is.
+        extent: Bounds [m] that all points keep: none has a smaller depth Z, none a larger coordinate by magnitude.
+
+    Raises:
+        ValueError: If a shape is wrong, a number is not finite or a descriptor too large, or a covariance is not
+            positive definite, or so flat or small that arithmetic cannot keep it so.
+    """
+
+    points: FloatArray
+    descriptors: NDArray[np.float32]
+    covariances: FloatArray | None = field(default=None)
+    extent: tuple[float, float] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        cure = "Give one row per measured point."
+        points: Any = check_array("points", self.points, (None, 3), cure + " Drop points that are not finite.")
+        descriptors: Any = check_array("descriptors", self.descriptors, (len(points), None), cure, dtype=np.float32)
+        if descriptors.size and np.abs(descriptors).max() > LARGEST_DESCRIPTOR:
+            largest = float(np.abs(descriptors).max())
+            expected = f"numbers within +-{LARGEST_DESCRIPTOR:g}"
+            raise bad_argument("descriptors", expected, largest, "Scale them, best to unit length.")
+        object.__setattr__(self, "points", points)
+        object.__setattr__(self, "descriptors", descriptors)
+        if self.covariances is not None:
+            covariances: Any = check_array("covariances", self.covariances, (len(points), 3, 3), cure)
+            _check_covariances(covariances)
+            object.__setattr__(self, "covariances", covariances)
+        for name in ("points", "descriptors", "covariances"):
+            if (array := getattr(self, name)) is not None:
+                object.__setattr__(self, name, as_read_only(array))
+        object.__setattr__(self, "extent", _kernels.extent(self.points))
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Let copies and what was pickled be read-only, too: else the extent would not follow what is written there."""
+        return _restored, (self.points, self.descriptors, self.covariances, self.extent)
+
+    @classmethod
+    def empty(cls, descriptor_size: int = 64) -> "Measurements":
+        """Return a frame in which nothing was seen."""
+        return cls(np.empty((0, 3)), np.empty((0, descriptor_size), dtype=np.float32))
+
+
+class TeamMeasurements(NamedTuple):
+    """The frames of several robots in one piece, without covariances; cut out for who wants to look at one.
+
+    Nothing is checked before a filter takes them in.
+
+    Attributes:
+        points: (n, 3) float64 [m]. Each in the frame of its camera, robot by robot.
+        descriptors: (n, d) float32. Likewise.
+        ends: (K,) int64. Per robot where its points end; they begin where those before it end.
+    """
+
+    points: FloatArray
+    descriptors: NDArray[np.float32]
+    ends: IntArray
+
+    def of_each(self) -> list[Measurements]:
+        """Return the frame of each robot. They are read-only, and share memory with this, not to be written to then."""
+        ends = self.ends.tolist()
+        points, looks = as_read_only(self.points), as_read_only(self.descriptors)
+        cut = [(points[a:b], looks[a:b]) for a, b in zip([0, *ends[:-1]], ends, strict=True)]
+        return [_restored(own, described, None, _kernels.extent(own)) for own, described in cut]
+
+
+def _restored(
+    points: FloatArray, descriptors: NDArray[np.float32], covariances: FloatArray | None, extent: tuple[float, float]
+) -> Measurements:
+    """Return a frame of arrays that were checked before and that nobody else writes to."""
+    frame, put = object.__new__(Measurements), object.__setattr__
+    for name, value in zip(Measurements.__slots__, (points, descriptors, covariances, extent), strict=True):
+        put(frame, name, as_read_only(value) if isinstance(value, np.ndarray) and value.flags.writeable else value)
+    return frame
+
+
+def _check_covariances(covariances: FloatArray) -> None:
+    """Raise unless (n, 3, 3) are symmetric and positive definite with room for rounding."""
+    if not len(covariances):
+        return
+    scale = np.abs(covariances).max(axis=(1, 2), keepdims=True)
+    if (np.abs(covariances - covariances.transpose(0, 2, 1)) > 1e-6 * scale).any():
+        raise bad_argument("covariances", "symmetric matrices", "a different transpose", "Symmetrise them first.")
+    eigenvalues = np.linalg.eigvalsh(covariances)
+    least, largest = eigenvalues[:, 0], eigenvalues[:, 2]
+    if least.min() <= 0.0:
+        raise bad_argument(
+            "covariances",
+            "positive definite matrices",
+            "a smallest eigenvalue <= 0",
+            "Give every direction some noise, or pass None to use the camera model.",
+        )
+    if least.min() < LEAST_VARIANCE or largest.max() > LARGEST_VARIANCE:
+        got = float(least.min() if least.min() < LEAST_VARIANCE else largest.max())
+        expected = f"eigenvalues from {LEAST_VARIANCE:g} to {LARGEST_VARIANCE:g} m^2"
+        raise bad_argument("covariances", expected, got, "Check the units: metres squared.")
+    if (largest > LARGEST_CONDITION * least).any():
+        got = float((largest / least).max())
+        cure = "Raise the least variance: float64 cannot keep so flat a covariance positive definite."
+        raise bad_argument("covariances", f"ratios of eigenvalues up to {LARGEST_CONDITION:g}", got, cure)

@@ -1,0 +1,94 @@
+"""The odometry motion model p(x_t | x_{t-1}, u_t) that a filter assumes (Eq. 4)."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from slam_backend.core.jit import in_place
+from slam_backend.core.validation import FloatArray, check_float, known_names
+from slam_backend.geometry import compose
+
+LARGEST_SIGMA = 1e3  # [m, rad], or of either per metre or radian; beyond it nothing at all is known
+
+
+@known_names
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OdometryModel:
+    """Gaussian noise of an odometry reading u = (dx, dy, dtheta) in the robot's previous frame.
+
+    The variances of the three components are independent; each adds a part that grows with the motion to a floor.
+
+    Attributes:
+        sigma_along: Of dx, per metre travelled [m/m].
+        sigma_across: Of dy, per metre travelled [m/m].
+        sigma_heading: Of dtheta, per metre travelled [rad/m].
+        sigma_turn: Of dtheta, per radian turned [rad/rad].
+        floor_position: Of dx and dy, whatever the motion [m].
+        floor_heading: Of dtheta, whatever the motion [rad].
+    """
+
+    sigma_along: float = 0.05
+    sigma_across: float = 0.02
+    sigma_heading: float = np.pi / 90.0
+    sigma_turn: float = 0.02
+    floor_position: float = 3e-4
+    floor_heading: float = 3e-4
+
+    def __post_init__(self) -> None:
+        for name in ("sigma_along", "sigma_across", "sigma_heading", "sigma_turn", "floor_position", "floor_heading"):
+            cure = "Give a standard deviation."
+            check_float(f"motion.{name}", getattr(self, name), cure, at_least=0.0, at_most=LARGEST_SIGMA)
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether no odometry has any noise."""
+        of_motion = self.sigma_along, self.sigma_across, self.sigma_heading, self.sigma_turn
+        return not any((*of_motion, self.floor_position, self.floor_heading))
+
+    def sigmas(self, odometry: FloatArray) -> FloatArray:
+        """Return the standard deviations (3,) [m, m, rad] of an odometry reading (3,) [m, m, rad]."""
+        dx, dy, turn = odometry.tolist()
+        distance = math.hypot(dx, dy)
+        return np.array(
+            [
+                math.hypot(self.sigma_along * distance, self.floor_position),
+                math.hypot(self.sigma_across * distance, self.floor_position),
+                math.hypot(self.sigma_heading * distance, self.sigma_turn * turn, self.floor_heading),
+            ]
+        )
+
+    def variances(self, odometry: FloatArray) -> FloatArray:
+        """Return the variances (n, 3) [m^2, m^2, rad^2] of n odometry readings (n, 3), previous robot frames."""
+        result = np.empty((len(odometry), 3))
+        grown = self.sigma_along**2, self.sigma_across**2, self.sigma_heading**2
+        _write_variances(odometry, *grown, self.sigma_turn, self.floor_position**2, self.floor_heading**2, result)
+        return result
+
+    def sample(self, poses: FloatArray, odometry: FloatArray, rng: np.random.Generator) -> FloatArray:
+        """Draw x_t^[m] ~ p(x_t | x_{t-1}^[m], u_t), each particle from its own past (Eq. 4).
+
+        Args:
+            poses: (M, 3) float64 [m, m, rad], map frame.
+            odometry: (3,) float64 [m, m, rad], previous robot frame.
+            rng: Source of the draws.
+
+        Returns:
+            (M, 3) new poses, map frame.
+        """
+        noise = rng.standard_normal((len(poses), 3)) * self.sigmas(odometry)
+        return compose(poses, odometry + noise)  # Eq. 4
+
+
+@in_place
+def _write_variances(
+    odometry: FloatArray, along: float, across: float, heading: float, sigma_turn: float, floor_position: float,
+    floor_heading: float, result: FloatArray,
+) -> None:  # fmt: skip
+    """Write the variances (n, 3) of readings (n, 3); all but the sigma of turns are squares of what the model has."""
+    for n in range(len(odometry)):
+        dx, dy, turn = odometry[n, 0], odometry[n, 1], sigma_turn * odometry[n, 2]
+        square = dx * dx + dy * dy
+        result[n, 0] = along * square + floor_position
+        result[n, 1] = across * square + floor_position
+        result[n, 2] = heading * square + turn * turn + floor_heading

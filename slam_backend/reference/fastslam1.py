@@ -1,0 +1,49 @@
+"""One robot's turn as the paper has it: the pose comes from the odometry alone (Algorithm 1, l. 14-41)."""
+
+import numpy as np
+
+from slam_backend.core.validation import FloatArray
+from slam_backend.fastslam.options import FilterOptions
+from slam_backend.reference.measurement_model import Frame
+from slam_backend.reference.particles import NEW, REJECTED, Candidates, Landmarks, Turn, is_held
+from slam_backend.reference.pose_gaussian import PoseBelief
+
+
+def fastslam1_turn(
+    landmarks: Landmarks, pose: FloatArray, frame: Frame, candidates: Candidates, options: FilterOptions
+) -> Turn:
+    """Match, weigh and update one measurement after the other at the sampled pose.
+
+    Args:
+        landmarks: The particle's map; it is changed.
+        pose: (3,) [m, m, rad], map frame, as sampled from the motion model (Eq. 4).
+        frame: What the robot measured.
+        candidates: Per measurement the landmarks of the particle that may have caused it.
+        options: Of the filter.
+
+    Returns:
+        The choices, the pose as it was given, and the log-likelihood of the frame.
+    """
+    chosen: list[int] = []
+    distances: list[float] = []
+    total = 0.0
+    for b, possible in enumerate(candidates):
+        match, distance = REJECTED, np.nan
+        log_likelihood = frame.log_clutter(b, options.new_landmark_density)
+        for _, name in possible:  # l. 15-24, the nearest descriptor first
+            if options.one_to_one and name in chosen:
+                continue
+            gate = frame.compare(pose, landmarks[name], b)
+            if gate is not None and (frame.names is not None or gate.distance <= options.position_gate):
+                match, distance, log_likelihood = name, gate.distance, gate.log_density  # l. 39, before the update
+                break
+        if match == REJECTED:  # l. 28-32
+            if frame.names is None or not is_held(b, possible, chosen, frame.names):
+                match = NEW - b
+                landmarks[match] = frame.new_landmark(pose, b, options.landmark_walk)
+        else:  # l. 33-37
+            frame.update(pose, landmarks[match], b, options.landmark_walk)
+        chosen.append(match)
+        distances.append(distance)
+        total += log_likelihood
+    return Turn(PoseBelief.known(pose), pose, chosen, distances, total)

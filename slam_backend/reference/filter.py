@@ -1,0 +1,330 @@
+"""`PlainFastSlam`: the particle filter over the paths of K robots as Algorithm 1 has it, in Python, line by line.
+
+Random numbers are consumed in this order: for each robot that moved or measured one normal triple per particle, then
+the resampling.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from slam_backend.core.validation import (
+    FloatArray,
+    IntArray,
+    check_array,
+    check_choice,
+    check_int,
+    check_kind,
+    check_seed,
+)
+from slam_backend.fastslam.options import MOST_ROBOTS, FilterOptions
+from slam_backend.fastslam.reports import PoseEstimate, StepReport
+from slam_backend.fastslam.step_input import check_step
+from slam_backend.geometry import compose, wrap_angle
+from slam_backend.maps.landmark_map import LandmarkMap
+from slam_backend.models.measurements import Measurements
+from slam_backend.reference.existence import weigh_existence
+from slam_backend.reference.fastslam1 import fastslam1_turn
+from slam_backend.reference.fastslam2 import fastslam2_turn
+from slam_backend.reference.measurement_model import Frame, Landmark
+from slam_backend.reference.particles import NEW, Candidates, Particle, RobotStep, Turn, descendants, report_of
+from slam_backend.reference.pose_gaussian import PoseBelief, wrapped
+from slam_backend.resampling import RESAMPLING
+
+
+class PlainFastSlam:
+    """What `FastSlam` does, slowly: the same decisions, and the same numbers up to rounding, from the same seed.
+
+    Args:
+        num_robots: K.
+        options: As of `FastSlam`.
+        seed: Of the random stream.
+        initial_poses: (K, 3) [m, m, rad], map frame. None: all at the origin.
+
+    Raises:
+        ValueError: If an argument is out of its range; the text names it.
+
+    >>> slam = PlainFastSlam(1, FilterOptions(num_particles=7))
+    >>> slam.step([None], [Measurements([[0.0, 0.0, 2.0]], [[1.0, 0.0]])]).num_new
+    1
+    >>> slam.map().means.round(3).tolist()
+    [[2.0, 0.0, 0.0]]
+    """
+
+    def __init__(
+        self,
+        num_robots: int,
+        options: FilterOptions,
+        seed: int | np.random.SeedSequence | np.random.Generator = 0,
+        initial_poses: ArrayLike | None = None,
+    ) -> None:
+        k = check_int("num_robots", num_robots, 1, "Use at least one robot.", MOST_ROBOTS)
+        check_kind("options", options, FilterOptions)
+        given = np.zeros((k, 3)) if initial_poses is None else initial_poses
+        starts = check_array("initial_poses", given, (k, 3), "Give one pose (x, y, theta) per robot.")
+        poses = [wrapped(start) for start in starts]
+        self.options = options
+        self.rng = np.random.default_rng(check_seed(seed))
+        weight = -np.log(options.num_particles)
+        self.particles = [
+            Particle(list(poses), [PoseBelief.known(pose) for pose in poses], list(poses), weight)
+            for _ in range(options.num_particles)
+        ]
+        self.is_blind = [False] * k  # moved without measuring since its pose was last sampled
+        self.descriptors: dict[int, FloatArray] = {}  # by landmark, of the measurement that started it
+        self.identities: dict[int, int] = {}
+        self.next_id = 0
+        self._descriptor_size = 0
+        self._estimates = [self._mixture(robot) for robot in range(k)]
+
+    # ------------------------------------------------------------------ what it knows
+
+    @property
+    def weights(self) -> FloatArray:
+        """(M,) weights, summing to 1."""
+        return np.exp([particle.log_weight for particle in self.particles])
+
+    @property
+    def best_particle(self) -> int:
+        """Index of the most probable particle, by accumulated log-weight (Eq. 12)."""
+        return int(np.argmax([particle.path_log_weight for particle in self.particles]))
+
+    def pose(self, robot: int = 0) -> PoseEstimate:
+        """Return mean and covariance of a robot's pose, map frame, over all particles before they were sampled."""
+        return self._estimates[robot]
+
+    def map(self, estimate: Literal["best", "mixture"] = "best") -> LandmarkMap:
+        """Return the landmarks of the most probable particle, map frame, by ascending id.
+
+        Args:
+            estimate: "best": as that particle has them. "mixture": mean and covariance over all that hold them.
+        """
+        check_choice("estimate", estimate, ("best", "mixture"))
+        return self._map_of(self.particles[self.best_particle], estimate)
+
+    def _map_of(self, best: Particle, estimate: str) -> LandmarkMap:
+        """Return the landmarks that one particle holds, as `map` says."""
+        if not best.landmarks:
+            return LandmarkMap.empty(self._descriptor_size)
+        return landmark_map(best, self.particles if estimate == "mixture" else [best], self.descriptors)
+
+    # ------------------------------------------------------------------ one step
+
+    def step(
+        self,
+        odometry: Sequence[ArrayLike | None],
+        measurements: Sequence[Measurements | None],
+        identities: Sequence[ArrayLike | None] | None = None,
+        poses: Sequence[ArrayLike | None] | None = None,
+    ) -> StepReport:
+        """Move the robots, match what they see, weigh, update, and resample if needed.
+
+        Args:
+            odometry, measurements, identities, poses: As of `FastSlam.step`, one entry per robot.
+
+        Returns:
+            What was matched and created, as of `FastSlam.step`.
+
+        Raises:
+            ValueError: If an argument is ill-formed; the filter is then as before.
+        """
+        k = len(self.is_blind)
+        check_step(k, self._descriptor_size, self.options.camera, odometry, measurements, identities, poses)
+        moves, names, exact = _arrays(odometry, k), _arrays(identities, k, np.int64), _arrays(poses, k)
+        records = []
+        for robot, frame in enumerate(measurements):
+            records.append(self._step_robot(robot, moves[robot], frame, names[robot], exact[robot]))
+            if self.options.existence is not None and frame is not None:
+                best = self.particles[self.best_particle]  # weights change once all robots have had their turns
+                model, camera = self.options.existence, self.options.camera
+                weigh_existence(self.particles, best, robot, records[robot], model, camera)
+        for record in records:  # Algorithm 1, l. 9, in logarithms; weights of before are kept
+            for particle, value in zip(self.particles, record.log_likelihoods, strict=True):
+                particle.path_log_weight += value  # Eq. 12, along the ancestral line
+                particle.log_weight += value  # Eqs. 3, 11
+        log_weights = np.array([particle.log_weight for particle in self.particles])
+        log_weights -= log_weights.max()  # first, so that rounding is relative to the differences
+        log_weights -= np.log(np.sum(np.exp(log_weights)))
+        for particle, log_weight in zip(self.particles, log_weights, strict=True):
+            particle.log_weight = float(log_weight)
+        self._estimates = [self._mixture(robot) for robot in range(k)]
+        report = self._report(records, self.best_particle)
+        if report.resampled:
+            self._resample()
+        return report
+
+    def _step_robot(
+        self,
+        robot: int,
+        move: FloatArray | None,
+        seen: Measurements | None,
+        names: IntArray | None,
+        exact: FloatArray | None,
+    ) -> RobotStep:
+        """Take one robot's turn (l. 6-8) in all particles."""
+        size = 0 if seen is None else len(seen)
+        record = RobotStep(size, len(self.particles))
+        kept = [b for b in range(size) if names is None or names[b] >= 0]
+        if move is None and exact is None and not kept:
+            return record
+        frame = Frame(seen, kept, None if names is None else [int(names[b]) for b in kept], self.options.camera)
+        possible = self._candidates(frame)
+        normals = self.rng.standard_normal((len(self.particles), 3))
+        turns = [  # l. 13
+            self._turn(particle, robot, frame, possible, move, exact, normals[m])
+            for m, particle in enumerate(self.particles)
+        ]
+        lasting = self._name_new(turns, frame)
+        for m, turn in enumerate(turns):
+            record.associations[kept, m] = [lasting.get(name, name) for name in turn.chosen]
+            record.distances[kept, m] = turn.distances
+            record.log_likelihoods[m] = turn.log_likelihood
+        record.created[kept] = [lasting.get(NEW - b, -1) for b in range(len(kept))]
+        self.is_blind[robot] = self.options.proposal == "fastslam2" and not kept and exact is None
+        if kept:
+            self._descriptor_size = frame.descriptors.shape[1]
+            record.measured = True
+        return record
+
+    def _candidates(self, frame: Frame) -> Candidates:
+        """Return, for each measurement, the landmarks of all particles that may have caused it (l. 20)."""
+        held = sorted({name for particle in self.particles for name in particle.landmarks})
+        if not held:
+            return [[] for _ in range(len(frame))]
+        looks = np.array([self.descriptors[name] for name in held])
+        result: Candidates = []
+        for b in range(len(frame)):
+            squares = np.sum((looks - frame.descriptors[b]) ** 2, axis=1)
+            if frame.names is None:
+                possible = [e <= self.options.descriptor_gate**2 for e in squares]
+            else:
+                possible = [self.identities[name] == frame.names[b] for name in held]
+            result.append(sorted((float(e), name) for e, name, ok in zip(squares, held, possible, strict=True) if ok))
+        return result
+
+    def _turn(
+        self,
+        particle: Particle,
+        robot: int,
+        frame: Frame,
+        possible: Candidates,
+        move: FloatArray | None,
+        exact: FloatArray | None,
+        normals: FloatArray,
+    ) -> Turn:
+        """Let one particle live through one robot's step."""
+        options = self.options
+        sampled = particle.poses[robot]
+        prior = particle.posteriors[robot] if self.is_blind[robot] else PoseBelief.known(sampled)
+        if exact is not None:
+            sampled = compose(particle.starts[robot], exact)
+            prior = PoseBelief.known(sampled)
+        elif move is not None:
+            sigmas = options.motion.sigmas(move)
+            sampled = compose(sampled, move + sigmas * normals)  # l. 14, Eq. 4
+            prior = prior.moved(move, sigmas)
+        candidates = [[one for one in looks if one[1] in particle.landmarks] for looks in possible]
+        if options.proposal == "fastslam1":
+            turn = fastslam1_turn(particle.landmarks, sampled, frame, candidates, options)
+        elif len(frame):
+            is_exact = exact is not None
+            turn = fastslam2_turn(particle.landmarks, prior, frame, candidates, normals, options, is_exact)
+        else:
+            turn = Turn(prior, sampled, [], [], 0.0)
+        particle.posteriors[robot], particle.poses[robot] = turn.posterior, turn.pose
+        return turn
+
+    def _name_new(self, turns: list[Turn], frame: Frame) -> dict[int, int]:
+        """Give each landmark that at least one particle has started its lasting name, one per measurement."""
+        lasting = {}
+        for b in range(len(frame)):
+            if any(turn.chosen[b] == NEW - b for turn in turns):
+                lasting[NEW - b] = self.next_id
+                self.descriptors[self.next_id] = frame.descriptors[b]
+                self.identities[self.next_id] = -1 if frame.names is None else frame.names[b]
+                self.next_id += 1
+        for particle in self.particles:
+            particle.landmarks = {lasting.get(name, name): one for name, one in particle.landmarks.items()}
+        return lasting
+
+    # ------------------------------------------------------------------ all particles
+
+    def _mixture(self, robot: int) -> PoseEstimate:
+        """Return a robot's pose over all particles, map frame."""
+        return pose_mixture([particle.posteriors[robot] for particle in self.particles], self.weights)
+
+    def _report(self, records: list[RobotStep], best: int) -> StepReport:
+        """Tell what particle `best` did in this step."""
+        return report_of(records, best, self.weights, self.options.resample_threshold)
+
+    def _resample(self) -> None:
+        """Draw the particles anew in proportion to their weights; all that a particle holds is copied with it."""
+        ancestors = RESAMPLING[self.options.resampling](self.weights, self.rng)
+        self.particles = descendants(self.particles, ancestors)
+
+
+def _arrays(values: Sequence[ArrayLike | None] | None, k: int, dtype: Any = np.float64) -> list[NDArray[Any] | None]:
+    """Return one kind of reading of k robots as arrays, None where there is none."""
+    given = [None] * k if values is None else values
+    return [None if value is None else np.asarray(value, dtype) for value in given]
+
+
+def pose_mixture(beliefs: Sequence[PoseBelief], weights: FloatArray) -> PoseEstimate:
+    """Return mean and covariance of a weighted mixture of Gaussian poses; headings are averaged on the circle.
+
+    Args:
+        beliefs: M Gaussians, all in one frame.
+        weights: (M,) float64, summing to 1.
+    """
+    means = np.array([belief.mean for belief in beliefs])
+    theta = np.arctan2(weights @ np.sin(means[:, 2]), weights @ np.cos(means[:, 2]))
+    mean = np.array([weights @ means[:, 0], weights @ means[:, 1], wrap_angle(theta)])
+    covariance = np.zeros((3, 3))
+    for belief, weight in zip(beliefs, weights, strict=True):
+        offset = belief.mean - mean
+        offset[2] = wrap_angle(offset[2])
+        covariance += weight * (belief.covariance + np.outer(offset, offset))
+    return PoseEstimate(mean, covariance)
+
+
+def landmark_mixture(landmarks: Sequence[Landmark], weights: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the mixture of the particles' estimates of one landmark (Sec. 3.2, see `docs/errata.md`).
+
+    Args:
+        landmarks: Those of the particles that hold it (n).
+        weights: (n,) float64, of these particles; they are scaled to sum to 1.
+
+    Returns:
+        Mean mu (3,) [m] and covariance (3, 3) [m^2], sum w_m (Sigma_m + (mu_m - mu)(mu_m - mu)^T), map frame.
+    """
+    shares = weights / weights.sum()
+    mean: FloatArray = sum((share * one.mean for share, one in zip(shares, landmarks, strict=True)), np.zeros(3))
+    covariance = np.zeros((3, 3))
+    for share, one in zip(shares, landmarks, strict=True):
+        covariance += share * (one.covariance + np.outer(one.mean - mean, one.mean - mean))
+    return mean, covariance
+
+
+def landmark_map(best: Particle, holders: Sequence[Particle], descriptors: Mapping[int, FloatArray]) -> LandmarkMap:
+    """Return the landmarks of one particle, each as the mixture of what some particles hold of it.
+
+    Args:
+        best: Which says what landmarks there are, at least one, and how often they were measured.
+        holders: Whose estimates are mixed; `best` among them.
+        descriptors: (d,) by landmark.
+
+    Returns:
+        By ascending id, map frame.
+    """
+    names = sorted(best.landmarks)
+    found = []
+    for name in names:
+        sharers = [particle for particle in holders if name in particle.landmarks]
+        weights = np.exp([particle.log_weight for particle in sharers])
+        found.append(landmark_mixture([particle.landmarks[name] for particle in sharers], weights))
+    means, covariances = zip(*found, strict=True)
+    looks = np.array([descriptors[name] for name in names], np.float32)
+    counts = [best.landmarks[name].count for name in names]
+    return LandmarkMap(np.array(means), np.array(covariances), looks, np.array(counts), np.array(names))

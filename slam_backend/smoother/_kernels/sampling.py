@@ -1,0 +1,317 @@
+"""Samples of whole paths: Gaussian densities, draws from the factor, and many paths at a time in blocks of lanes."""
+
+import math
+
+import numpy as np
+
+from slam_backend.core.jit import fused, in_place, lanes, room
+from slam_backend.core.simd_math import log_of, sine_cosine
+from slam_backend.core.validation import FloatArray, IntArray
+from slam_backend.smoother._kernels.factors import _inverse
+from slam_backend.smoother._kernels.normal_equations import WEAK
+
+
+@fused
+def weigh_deviations(covariance: FloatArray, off: FloatArray, log_densities: FloatArray) -> bool:
+    """Write the logarithms of a Gaussian's density, up to a constant: 0 at its mean.
+
+    Of L L^T the covariance, the squares of L^-1 d add up to the squared distance of a deviation d.
+
+    Args:
+        covariance: (n, n), positive definite.
+        off: (n, M) deviations from the mean; changed: L^-1 times these.
+        log_densities: (M,), result.
+
+    Returns:
+        Whether the covariance is positive definite; if not, what is written means nothing.
+    """
+    lower, m = covariance.copy(), off.shape[1]
+    log_densities[:] = 0.0
+    for i in range(len(lower)):
+        row = lower[i]
+        for j in range(i):
+            for k in range(j):
+                row[j] -= row[k] * lower[j, k]
+            row[j] /= lower[j, j]
+            row[i] -= row[j] * row[j]
+            for p in range(m):
+                off[i, p] -= row[j] * off[j, p]
+        if not row[i] > 0.0:
+            return False
+        row[i] = math.sqrt(row[i])
+        scale = 1.0 / row[i]
+        for p in range(m):
+            off[i, p] *= scale
+            log_densities[p] -= 0.5 * off[i, p] * off[i, p]
+    return True
+
+
+@in_place
+def normalise(log_weights: FloatArray, weights: FloatArray) -> float:
+    """Write weights (M,) that sum to 1 from their logarithms (M,); return their effective sample size, 1 / sum w^2.
+
+    Where one is NaN, or infinitely large, all are NaN, as is the size.
+    """
+    top, total, squares = -math.inf, 0.0, 0.0
+    for log_weight in log_weights:
+        top = max(top, log_weight)
+    for i in range(len(weights)):
+        weights[i] = math.exp(log_weights[i] - top)
+        total += weights[i]
+    for i in range(len(weights)):
+        weights[i] /= total
+        squares += weights[i] * weights[i]
+    return 1.0 / squares
+
+
+@fused
+def draw(
+    draws: FloatArray, poses: FloatArray, columns: IntArray, keys: IntArray, starts: IntArray, blocks: FloatArray,
+    cross: FloatArray, pivots: FloatArray, values: FloatArray, order: IntArray, ranks: IntArray, tops: IntArray,
+    rows: IntArray, row_tops: IntArray, paths: FloatArray, log_densities: FloatArray,
+) -> None:  # fmt: skip
+    """Write M paths, the landmarks that come with them left out.
+
+    Of L L^T the information of all nodes, x = mode + L^-T z. A landmark that goes before all poses that see it is not
+    drawn, for no pose depends on it. Of the others' density what they have given the path is taken off: with S the
+    information of a landmark, X that between it and the poses, and d the deviations, S d_l + X^T d_x is what it
+    deviates from its conditional mean, times S.
+
+    Args:
+        draws: (D, 3, M) standard normal draws: of the nodes that are drawn, in the order of elimination. Changed: by
+            how much these deviate from the mode.
+        poses: (k, 3) of the mode.
+        columns, keys, starts, blocks, cross: As of `form`.
+        pivots, values: As `factorise` wrote them.
+        order, ranks, tops, rows, row_tops: As of `lay_out`.
+        paths: (k, 3, M), result.
+        log_densities: (M,), result: log of the density of each path, up to a constant.
+    """
+    num, m, num_landmarks = len(order), draws.shape[2], len(starts) - 1
+    num_poses = num - num_landmarks
+    places = np.empty(num, dtype=np.int64)  # of nodes among those that are drawn, by rank
+    log_densities[:] = 0.0
+    drawn = len(draws)
+    for j in range(num - 1, -1, -1):
+        if order[j] >= num_poses and row_tops[j] == row_tops[j + 1]:
+            continue
+        drawn -= 1
+        places[j] = drawn
+        own = draws[drawn]
+        for axis in range(3):
+            for i in range(m):
+                log_densities[i] -= 0.5 * own[axis, i] * own[axis, i]
+        for p in range(tops[j], tops[j + 1]):
+            v, y = values[p], draws[places[rows[p]]]
+            v0, v1, v2, v3, v4, v5, v6, v7, v8 = v[0], v[1], v[2], v[3], v[4], v[5], v[6], v[7], v[8]
+            for i in range(m):
+                own[0, i] -= v0 * y[0, i] + v3 * y[1, i] + v6 * y[2, i]
+                own[1, i] -= v1 * y[0, i] + v4 * y[1, i] + v7 * y[2, i]
+                own[2, i] -= v2 * y[0, i] + v5 * y[1, i] + v8 * y[2, i]
+        pivot = pivots[j]
+        i0, l10, i1, l20, l21, i2 = pivot[0], pivot[1], pivot[2], pivot[3], pivot[4], pivot[5]
+        for i in range(m):
+            x2 = own[2, i] * i2
+            x1 = (own[1, i] - l21 * x2) * i1
+            own[0, i], own[1, i], own[2, i] = (own[0, i] - l10 * x1 - l20 * x2) * i0, x1, x2
+    for b in range(len(columns)):
+        for axis in range(3):
+            for i in range(m):
+                paths[b, axis, i] = poses[b, axis]
+            if columns[b] >= 0:
+                deviations = draws[places[ranks[columns[b] // 3]]]
+                for i in range(m):
+                    paths[b, axis, i] += deviations[axis, i]
+    off, inverse = np.empty((3, m)), np.empty(6)
+    for landmark in range(num_landmarks):
+        node = num_poses + landmark
+        j = ranks[node]
+        if row_tops[j] == row_tops[j + 1]:
+            continue
+        s, own = blocks[node], draws[places[j]]
+        s0, s1, s2, s3, s4, s5 = s[0], s[1], s[2], s[3], s[4], s[5]
+        for i in range(m):
+            off[0, i] = s0 * own[0, i] + s1 * own[1, i] + s2 * own[2, i]
+            off[1, i] = s1 * own[0, i] + s3 * own[1, i] + s4 * own[2, i]
+            off[2, i] = s2 * own[0, i] + s4 * own[1, i] + s5 * own[2, i]
+        for q in range(starts[landmark], starts[landmark + 1]):
+            if columns[keys[q]] < 0:
+                continue
+            v, y = cross[q], draws[places[ranks[columns[keys[q]] // 3]]]
+            for axis in range(3):
+                v0, v1, v2 = v[0, axis], v[1, axis], v[2, axis]
+                for i in range(m):
+                    off[axis, i] += v0 * y[0, i] + v1 * y[1, i] + v2 * y[2, i]
+        _inverse(s, inverse)
+        t0, t1, t2, t3, t4, t5 = inverse[0], inverse[1], inverse[2], inverse[3], inverse[4], inverse[5]
+        for i in range(m):
+            o0, o1, o2 = off[0, i], off[1, i], off[2, i]
+            log_densities[i] += 0.5 * (t0 * o0 * o0 + t3 * o1 * o1 + t5 * o2 * o2)
+            log_densities[i] += t1 * o0 * o1 + t2 * o0 * o2 + t4 * o1 * o2
+
+
+LANES = 52  # as in the filter, which takes over tiles as they are
+
+# Rows of a block of poses and of the workspace of `replay`.
+PX, PY, COS, SIN, HEADING = (LANES * k for k in range(5))
+POSE_ROWS = 5
+A00, A01, A02, A11, A12, B0, B1, B2, ENERGY = (LANES * k for k in range(9))
+WORK_SIZE = 9 * LANES
+
+
+@lanes
+def to_lanes(poses: FloatArray, rows: FloatArray) -> None:
+    """Write paths in blocks of lanes; surplus lanes are copies of the first path.
+
+    Args:
+        poses: (k, 3, M) float64 [m, m, rad].
+        rows: (P / LANES * k * 5 * LANES,), result: x, y, cos, sin, heading of each block and key.
+    """
+    num_keys, num_paths = len(poses), poses.shape[2]
+    for block in range(len(rows) // (num_keys * POSE_ROWS * LANES)):
+        first = block * LANES
+        count = min(LANES, num_paths - first)
+        for key in range(num_keys):
+            base = (block * num_keys + key) * POSE_ROWS * LANES
+            row, pose = rows[base : base + POSE_ROWS * LANES], poses[key]
+            for i in range(count):
+                path = first + i
+                row[PX + i], row[PY + i], row[HEADING + i] = pose[0, path], pose[1, path], pose[2, path]
+            for i in range(count, LANES):
+                row[PX + i], row[PY + i], row[HEADING + i] = pose[0, 0], pose[1, 0], pose[2, 0]
+            for i in range(LANES):
+                row[SIN + i], row[COS + i] = sine_cosine(row[HEADING + i])
+
+
+@lanes
+def replay(
+    poses: FloatArray, num_keys: int, num_blocks: int, landmarks: FloatArray, keys: IntArray, starts: IntArray,
+    centres: FloatArray, infos: FloatArray, slopes: FloatArray, tiles: FloatArray, log_likelihood: FloatArray,
+) -> None:  # fmt: skip
+    """Give each path the landmarks that its sightings ask for, and the log-likelihood of these, up to a constant.
+
+    Args:
+        poses: (num_blocks * num_keys * 5 * LANES,) x, y, cos, sin, heading of each block and key.
+        num_keys, num_blocks: k, and the number of blocks of lanes.
+        landmarks: (l, 3) about which forms are evaluated, map frame.
+        keys, starts, centres, infos, slopes: Sightings, those of landmark i are starts[i] to starts[i + 1].
+        tiles: (l * num_blocks * 9 * LANES,), result: mean (3) and covariance (6) per lane; zeros for a landmark without
+            sightings.
+        log_likelihood: (num_blocks * LANES,), result.
+    """
+    log_likelihood[:] = 0.0
+    work = room(WORK_SIZE)
+    for block in range(num_blocks):  # one after the other, for the poses of one are as many as a cache holds
+        out = log_likelihood[block * LANES : (block + 1) * LANES]
+        for landmark in range(len(landmarks)):
+            first, last = starts[landmark], starts[landmark + 1]
+            x, y, z = landmarks[landmark, 0], landmarks[landmark, 1], landmarks[landmark, 2]
+            base = (landmark * num_blocks + block) * 9 * LANES
+            tile = tiles[base : base + 9 * LANES]
+            if first == last:
+                tile[:] = 0.0
+                continue
+            for i in range(WORK_SIZE):
+                work[i] = 0.0
+            for i in range(LANES):
+                work[A00 + i] = work[A11 + i] = WEAK
+            h = WEAK  # of the height: the same however a path turns
+            for q in range(first, last):
+                base = (block * num_keys + keys[q]) * POSE_ROWS * LANES
+                pose = poses[base : base + POSE_ROWS * LANES]
+                o0, o1, o2 = centres[q, 0], centres[q, 1], centres[q, 2]
+                n0, n1, n2, n3, n4, n5 = infos[q, 0], infos[q, 1], infos[q, 2], infos[q, 3], infos[q, 4], infos[q, 5]
+                g0, g1, g2 = slopes[q, 0], slopes[q, 1], slopes[q, 2]
+                for i in range(LANES):
+                    c, s = pose[COS + i], pose[SIN + i]
+                    dx, dy = x - pose[PX + i], y - pose[PY + i]
+                    u0, u1, u2 = c * dx + s * dy - o0, c * dy - s * dx - o1, z - o2
+                    l0 = n0 * u0 + n1 * u1 + n2 * u2
+                    l1 = n1 * u0 + n3 * u1 + n4 * u2
+                    l2 = n2 * u0 + n4 * u1 + n5 * u2
+                    work[ENERGY + i] += u0 * (0.5 * l0 - g0) + u1 * (0.5 * l1 - g1) + u2 * (0.5 * l2 - g2)  # (4)
+                    e0, e1 = l0 - g0, l1 - g1
+                    work[B0 + i] += c * e0 - s * e1
+                    work[B1 + i] += s * e0 + c * e1
+                    work[B2 + i] += l2 - g2
+                    work[A00 + i] += c * c * n0 - 2.0 * c * s * n1 + s * s * n3
+                    work[A01 + i] += c * s * (n0 - n3) + (c * c - s * s) * n1
+                    work[A02 + i] += c * n2 - s * n4
+                    work[A11 + i] += s * s * n0 + 2.0 * c * s * n1 + c * c * n3
+                    work[A12 + i] += s * n2 + c * n4
+                h += n5
+            for i in range(LANES):
+                a, b, d = work[A00 + i], work[A01 + i], work[A02 + i]
+                e, f = work[A11 + i], work[A12 + i]
+                p, q1, r = e * h - f * f, d * f - b * h, b * f - d * e
+                det = a * p + b * q1 + d * r
+                inverse = 1.0 / det
+                s00, s01, s02 = p * inverse, q1 * inverse, r * inverse
+                s11, s12, s22 = (a * h - d * d) * inverse, (b * d - a * f) * inverse, (a * e - b * b) * inverse
+                b0, b1, b2 = work[B0 + i], work[B1 + i], work[B2 + i]
+                m0 = s00 * b0 + s01 * b1 + s02 * b2
+                m1 = s01 * b0 + s11 * b1 + s12 * b2
+                m2 = s02 * b0 + s12 * b1 + s22 * b2
+                tile[i] = x - m0
+                tile[LANES + i] = y - m1
+                tile[2 * LANES + i] = z - m2
+                tile[3 * LANES + i], tile[4 * LANES + i], tile[5 * LANES + i] = s00, s01, s02
+                tile[6 * LANES + i], tile[7 * LANES + i], tile[8 * LANES + i] = s11, s12, s22
+                work[ENERGY + i] = 0.5 * (b0 * m0 + b1 * m1 + b2 * m2) - work[ENERGY + i]
+                work[A00 + i] = det
+            for i in range(LANES):
+                det = work[A00 + i]
+                log_det = log_of(det) if det > 0.0 else math.nan
+                out[i] += work[ENERGY + i] - 0.5 * log_det  # (6)
+
+
+@lanes
+def odometry_of_paths(
+    poses: FloatArray, num_keys: int, num_blocks: int, num_paths: int, previous: IntArray, mode: FloatArray,
+    motions: FloatArray, infos: FloatArray, lever: float, log_density: FloatArray, spreads: FloatArray,
+) -> None:  # fmt: skip
+    """Weigh paths by odometry, and say how rigid they are from each key to the next.
+
+    Args:
+        poses, num_keys, num_blocks: As in `replay`.
+        num_paths: M; the lanes after these are copies.
+        previous, motions, infos: (k,), (k, 3), (k, 3, 3) odometry from the previous key and its information.
+        mode: (k, 3) [m, m, rad] the most probable path.
+        lever: [m] At which an error of the heading counts.
+        log_density: (num_blocks * LANES,), result: log p(path given odometry) up to a constant.
+        spreads: (k,), result [m^2]: mean square of what the motion from the previous key differs from that of the mode.
+    """
+    log_density[:] = 0.0
+    squares = room(LANES)
+    for b in range(num_keys):
+        a = previous[b]
+        spreads[b] = 0.0
+        if a < 0:
+            continue
+        u0, u1, u2 = motions[b, 0], motions[b, 1], motions[b, 2]
+        c, s = math.cos(mode[a, 2]), math.sin(mode[a, 2])
+        dx, dy = mode[b, 0] - mode[a, 0], mode[b, 1] - mode[a, 1]
+        d0, d1, d2 = c * dx + s * dy - u0, c * dy - s * dx - u1, mode[b, 2] - mode[a, 2] - u2
+        w = infos[b]
+        w00, w01, w02, w11, w12, w22 = w[0, 0], w[0, 1], w[0, 2], w[1, 1], w[1, 2], w[2, 2]
+        total = 0.0
+        for block in range(num_blocks):
+            base_a, base_b = (block * num_keys + a) * POSE_ROWS * LANES, (block * num_keys + b) * POSE_ROWS * LANES
+            first = poses[base_a : base_a + POSE_ROWS * LANES]
+            second = poses[base_b : base_b + POSE_ROWS * LANES]
+            out = log_density[block * LANES : (block + 1) * LANES]
+            for i in range(LANES):
+                c, s = first[COS + i], first[SIN + i]
+                dx, dy = second[PX + i] - first[PX + i], second[PY + i] - first[PY + i]
+                r0, r1 = c * dx + s * dy - u0, c * dy - s * dx - u1
+                turn = second[HEADING + i] - first[HEADING + i] - u2
+                r2 = turn - 2.0 * math.pi * math.floor((turn + math.pi) / (2.0 * math.pi))
+                out[i] -= 0.5 * (w00 * r0 * r0 + w11 * r1 * r1 + w22 * r2 * r2) + (
+                    w01 * r0 * r1 + w02 * r0 * r2 + w12 * r1 * r2
+                )
+                r0, r1, r2 = r0 - d0, r1 - d1, turn - d2
+                r2 = r2 - 2.0 * math.pi * math.floor((r2 + math.pi) / (2.0 * math.pi))
+                squares[i] = r0 * r0 + r1 * r1 + lever * lever * r2 * r2
+            for i in range(min(LANES, num_paths - block * LANES)):
+                total += squares[i]
+        spreads[b] = total / num_paths

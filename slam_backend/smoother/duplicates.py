@@ -1,0 +1,141 @@
+"""Landmarks that a smoothed path reveals to be one: they look alike, lie in one place, and were never seen together."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_backend.core.blas import on_one_thread
+from slam_backend.core.jit import inlined, jit
+from slam_backend.core.packed_symmetric import UNPACK
+from slam_backend.core.validation import FloatArray, IntArray
+from slam_backend.smoother.graph import PathGraph
+from slam_backend.smoother.optimizer import Mode
+from slam_backend.smoother.sampling import Draws
+
+REACH = 0.5  # [m]; no duplicates are sought farther apart
+GATE = 7.81  # squared Mahalanobis distance, 95 % of 3 degrees of freedom
+
+
+def find_duplicates(
+    graph: PathGraph, mode: Mode, draws: Draws, descriptors: NDArray[np.float32], descriptor_gate: float
+) -> IntArray:
+    """Return rows (id to give up, id to keep), each landmark in at most one of them; the older id is kept.
+
+    The difference of two landmarks scatters by their own covariances and by the paths: both are in the draws.
+
+    Args:
+        graph: What was seen from which key.
+        mode: Of it.
+        draws: Paths with their landmarks.
+        descriptors: (l, d) by row of `graph.landmark_ids`; NaN for a landmark that is not to be touched.
+        descriptor_gate: L2 distance beyond which two do not look alike.
+    """
+    order, seen = mode.landmarks[:, 0].argsort(), mode.sightings
+    pairs = alike_pairs(order, mode.landmarks, descriptors, seen.keys, seen.starts, REACH, descriptor_gate)
+    if not len(pairs):
+        return pairs
+    taken: set[int] = set()
+    rows = []
+    for _, a, b in sorted(_together(draws, pairs)):
+        if a not in taken and b not in taken:
+            taken |= {a, b}
+            rows.append(sorted((int(graph.landmark_ids[a]), int(graph.landmark_ids[b])), reverse=True))
+    return np.array(rows, dtype=np.int64).reshape(-1, 2)
+
+
+@inlined
+def _squared_distance(a: NDArray[np.float32], b: NDArray[np.float32]) -> float:
+    """Return the squared L2 distance of two descriptors (d,)."""
+    total = 0.0
+    for i in range(len(a)):
+        total += (a[i] - b[i]) * (a[i] - b[i])
+    return total
+
+
+@inlined
+def _apart(a: IntArray, b: IntArray) -> bool:
+    """Return whether two ascending rows, have elements, and none in common."""
+    i, j = 0, 0
+    while i < len(a) and j < len(b):
+        if a[i] == b[j]:
+            return False
+        if a[i] < b[j]:
+            i += 1
+        else:
+            j += 1
+    return len(a) > 0 and len(b) > 0
+
+
+@jit
+def alike_pairs(
+    order: IntArray, landmarks: FloatArray, descriptors: NDArray[np.float32], keys: IntArray, starts: IntArray,
+    reach: float, gate: float,
+) -> IntArray:  # fmt: skip
+    """Return pairs (n, 2) of landmarks that lie near each other, look alike and have no key in common.
+
+    Args:
+        order: (l,) int64. The landmarks by ascending x.
+        landmarks: (l, 3) float64 [m].
+        descriptors: (l, d) float32. Two do not look alike if any number is NaN.
+        keys, starts: (s,), (l + 1,) int64. Key of each sighting, ascending for each landmark; those of landmark i are
+            starts[i] to starts[i + 1]. One that has none is in no pair.
+        reach: [m]. How far apart they may lie.
+        gate: L2 distance beyond which two do not look alike.
+    """
+    pairs, num = np.empty((16, 2), dtype=np.int64), 0
+    for i in range(len(order)):
+        for j in range(i + 1, len(order)):
+            a, b = min(order[i], order[j]), max(order[i], order[j])
+            dx, dy = landmarks[a, 0] - landmarks[b, 0], landmarks[a, 1] - landmarks[b, 1]
+            dz = landmarks[a, 2] - landmarks[b, 2]
+            if abs(dx) > reach:
+                break
+            if dx * dx + dy * dy + dz * dz > reach * reach:
+                continue
+            if not _squared_distance(descriptors[a], descriptors[b]) <= gate * gate:
+                continue
+            if _apart(keys[starts[a] : starts[a + 1]], keys[starts[b] : starts[b + 1]]):
+                if num == len(pairs):
+                    pairs = np.concatenate((pairs, np.empty_like(pairs)))
+                pairs[num, 0], pairs[num, 1] = a, b
+                num += 1
+    return pairs[:num]
+
+
+@on_one_thread
+def _together(draws: Draws, pairs: IntArray) -> list[tuple[float, int, int]]:
+    """Return those of the pairs (n, 2) that may lie in one place: squared distance, and which."""
+    found = []
+    for a, b in pairs.tolist():
+        distance = _distance(_values(draws, a), _values(draws, b))
+        if distance <= GATE:
+            found.append((distance, a, b))
+    return found
+
+
+def _values(draws: Draws, row: int) -> FloatArray:
+    """Return means and covariances (9, M) of one landmark."""
+    return np.asarray(draws.tiles[row].transpose(1, 0, 2).reshape(9, -1)[:, : draws.poses.shape[2]])
+
+
+def _distance(a: FloatArray, b: FloatArray) -> float:
+    """Return the squared Mahalanobis distance of two landmarks (9, M), paths included, at the first path."""
+    apart = a[:3] - b[:3]
+    scatter = apart[:, 1:] - apart[:, :1]
+    covariance = (a[3:, 0] + b[3:, 0])[UNPACK] + scatter @ scatter.T / max(scatter.shape[1], 1)
+    return float(apart[:, 0] @ np.linalg.solve(covariance, apart[:, 0]))
+
+
+def without_duplicates(graph: PathGraph, duplicates: IntArray) -> PathGraph:
+    """Return the graph in which each given-up landmark (rows of `find_duplicates`) is the one that is kept."""
+    if not len(duplicates):
+        return graph
+    row = {int(name): i for i, name in enumerate(graph.landmark_ids)}
+    new = np.arange(len(graph.landmark_ids))
+    known = [(row[int(old)], row[int(kept)]) for old, kept in duplicates if int(old) in row and int(kept) in row]
+    for old, kept in known:
+        new[old] = kept
+    return graph.with_columns(
+        point_landmarks=new[graph.point_landmarks],
+        frozen_landmarks=new[graph.frozen_landmarks],
+        aliases=np.concatenate([graph.aliases, duplicates]),
+    )

@@ -1,0 +1,203 @@
+"""`PathGraph`: key poses of all robots, the odometry between them, and what was measured there. It never changes."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_backend.core.validation import BoolArray, FloatArray, IntArray
+from slam_backend.geometry import between, wrap_angle
+from slam_backend.smoother._kernels import rename
+
+NONE = -1
+VAGUE = (1e4, 1e4, 10.0)  # variances [m^2, m^2, rad^2] of a start of which nothing is known
+LEVER = 3.0  # [m]; where an error of the heading between two keys is felt
+RIGID = 1e-4  # [m, rad]; starts that scatter less against each other do not move
+
+
+# The columns of a graph that go together, row by row.
+OF_KEYS = ("robots", "poses", "previous", "motions", "noises", "spreads", "slack")
+OF_FRAMES = ("frame_keys", "frame_offsets")
+OF_POINTS = ("points", "point_noises", "given", "point_frames", "point_landmarks")
+OF_FROZEN = ("frozen_keys", "frozen_landmarks", "centres", "infos", "slopes", "counts")
+OF_LANDMARKS = ("landmark_ids", "landmarks")
+
+
+def _empty(*shape: int) -> FloatArray:
+    """Return an array of its own with no rows."""
+    return np.zeros(shape)
+
+
+def _no_index() -> IntArray:
+    """Return an index of its own with no rows."""
+    return np.zeros(0, dtype=np.int64)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PathGraph:
+    """What a smoother knows of a run.
+
+    A *key* is a pose that is sought. A *frame* is where measurements were taken: it stands rigidly to its key. Raw
+    measurements of the newest keys are kept; those of older keys are condensed into frozen sightings.
+
+    Attributes:
+        robots: (k,) int64. Whose pose each key is, `NONE` for the origin; keys of a robot are in the order of time.
+        poses: (k, 3) float64 [m, m, rad], map frame. The last mode.
+        previous: (k,) int64. The key before, `NONE` where the pose is given: the origin, or a robot's start. A start
+            that is not known hangs on the origin, or on another robot's start.
+        motions: (k, 3) float64 [m, m, rad]. Odometry from the previous key, in its frame.
+        noises: (k, 3, 3) float64. Its covariance, likewise.
+        spreads: (k,) float64 [m^2]. How far the motion from the previous key scattered when that was last asked, or
+            as far as odometry says before that; see `LEVER`.
+        slack: (k,) float64 [m^2]. How much those poses may move against each other that stand rigidly to the key.
+        frame_keys, frame_offsets: (f,) int64, (f, 3) float64. Key of each frame, and the frame's pose seen from it.
+        points, point_noises, given: (n, 3), (n, 6), (n,) raw measurements, robot axes from the camera centre; their
+            covariances where the sensor gave them.
+        point_frames, point_landmarks: (n,) int64. Frame of each, and its row of `landmark_ids`.
+        frozen_keys, frozen_landmarks: (s,) int64. Of the frozen sightings.
+        centres, infos, slopes: (s, 3), (s, 6), (s, 3) float64. Their quadratic forms, see `_kernels`.
+        counts: (s,) int64. Measurements in each.
+        landmark_ids: (l,) int64. Names of the landmarks.
+        landmarks: (l, 3) float64 [m], map frame. The last mode.
+        aliases: (a, 2) int64. Rows (name, name it goes by): landmarks found to be one.
+        heads: (K,) int64. Key at the start of each robot.
+        tips: (K,) int64. Newest key of each robot.
+        latest: (K,) int64. Newest step of each robot's log that is taken in, -1 before the first.
+    """
+
+    robots: IntArray = field(default_factory=_no_index)
+    poses: FloatArray = field(default_factory=lambda: _empty(0, 3))
+    previous: IntArray = field(default_factory=_no_index)
+    motions: FloatArray = field(default_factory=lambda: _empty(0, 3))
+    noises: FloatArray = field(default_factory=lambda: _empty(0, 3, 3))
+    spreads: FloatArray = field(default_factory=lambda: _empty(0))
+    slack: FloatArray = field(default_factory=lambda: _empty(0))
+    frame_keys: IntArray = field(default_factory=_no_index)
+    frame_offsets: FloatArray = field(default_factory=lambda: _empty(0, 3))
+    points: FloatArray = field(default_factory=lambda: _empty(0, 3))
+    point_noises: FloatArray = field(default_factory=lambda: _empty(0, 6))
+    given: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
+    point_frames: IntArray = field(default_factory=_no_index)
+    point_landmarks: IntArray = field(default_factory=_no_index)
+    frozen_keys: IntArray = field(default_factory=_no_index)
+    frozen_landmarks: IntArray = field(default_factory=_no_index)
+    centres: FloatArray = field(default_factory=lambda: _empty(0, 3))
+    infos: FloatArray = field(default_factory=lambda: _empty(0, 6))
+    slopes: FloatArray = field(default_factory=lambda: _empty(0, 3))
+    counts: IntArray = field(default_factory=_no_index)
+    landmark_ids: IntArray = field(default_factory=_no_index)
+    landmarks: FloatArray = field(default_factory=lambda: _empty(0, 3))
+    aliases: IntArray = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
+    heads: IntArray
+    tips: IntArray
+    latest: IntArray
+
+    def __post_init__(self) -> None:
+        for column in vars(self).values():
+            column.setflags(write=False)
+
+    @classmethod
+    def at_starts(cls, starts: FloatArray) -> "PathGraph":
+        """Return the graph of K robots that stand at `starts` (K, 3) [m, m, rad], map frame, and have seen nothing."""
+        return cls.at_uncertain_starts(np.asarray(starts, dtype=np.float64)[:, :, None])
+
+    @classmethod
+    def at_uncertain_starts(cls, starts: FloatArray) -> "PathGraph":
+        """Return the graph of K robots whose starts particles may hold to be different, as after a merge.
+
+        A start on which all particles agree is given. Another is sought: nothing but measurements shall say where it
+        is, for what particles think of it stems from these. Where two robots' starts do not change against each other,
+        the second hangs on the first.
+
+        Args:
+            starts: (K, 3, M) float64 [m, m, rad], map frame.
+        """
+        k = len(starts)
+        loose = [i for i in range(k) if (starts[i] != starts[i, :, :1]).any()]
+        poses, previous, motions, noises = list(starts[:, :, 0]), [NONE] * k, [np.zeros(3)] * k, [np.zeros((3, 3))] * k
+        for place, i in enumerate(loose):
+            poses[i] = mean_pose(starts[i])
+            previous[i], motions[i], noises[i] = k, poses[i], np.diag(VAGUE)
+            for other in loose[:place]:
+                apart = between(starts[other].T, starts[i].T)
+                if np.abs(_turned(apart - apart[0])).max() < RIGID:
+                    previous[i], motions[i], noises[i] = other, apart[0], RIGID**2 * np.eye(3)
+                    break
+        extra = 1 if loose else 0
+        robots = np.concatenate([np.arange(k), np.full(extra, NONE)])
+        return cls(
+            robots=robots,
+            poses=np.array([*poses, *np.zeros((extra, 3))]),
+            previous=np.array([*previous, *[NONE] * extra], dtype=np.int64),
+            motions=np.array([*motions, *np.zeros((extra, 3))]),
+            noises=np.array([*noises, *np.zeros((extra, 3, 3))]),
+            spreads=np.zeros(k + extra),
+            slack=np.zeros(k + extra),
+            heads=np.arange(k),
+            tips=np.arange(k),
+            latest=np.full(k, -1),
+        )
+
+    def reordered(self, order: IntArray) -> "PathGraph":
+        """Return the graph in which robot i is the one that was `order[i]`; (K,) a permutation."""
+        robots = self.robots.copy()
+        robots[self.robots >= 0] = np.argsort(order)[self.robots[self.robots >= 0]]
+        return self.with_columns(
+            robots=robots, heads=self.heads[order], tips=self.tips[order], latest=self.latest[order]
+        )
+
+    def with_columns(self, **columns: NDArray[Any]) -> "PathGraph":
+        """Return the graph with some columns in place of its own, which cannot be written either from now on.
+
+        As `dataclasses.replace`, but that those that stay are not looked at anew.
+        """
+        assert columns.keys() <= vars(self).keys()
+        for column in columns.values():
+            column.setflags(write=False)
+        other = object.__new__(PathGraph)
+        vars(other).update(vars(self), **columns)
+        return other
+
+    def known_as(self, ids: IntArray) -> IntArray:
+        """Return the names by which landmarks `ids` (n,) int64 go, `aliases` applied."""
+        result = ids.copy()
+        rename(result, self.aliases)
+        return result
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return all arrays by name; they cannot be written."""
+        return dict(vars(self))
+
+    @property
+    def num_keys(self) -> int:
+        """Key poses, the starts included."""
+        return len(self.poses)
+
+    @property
+    def num_sightings(self) -> int:
+        """Frozen sightings, and raw measurements that may become some: what the effort of a rejuvenation grows with."""
+        return len(self.frozen_keys) + len(self.points)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all arrays."""
+        return sum(column.nbytes for column in vars(self).values())
+
+
+def mean_pose(poses: FloatArray) -> FloatArray:
+    """Return the mean (3,) of poses (3, n) [m, m, rad], headings by their mean direction."""
+    x, y, headings = poses
+    return np.array([x.mean(), y.mean(), np.arctan2(np.sin(headings).mean(), np.cos(headings).mean())])
+
+
+def scattered(poses: FloatArray) -> FloatArray:
+    """Return the covariance (3, 3) of poses (3, n) [m, m, rad] about their mean, at least that of `RIGID`."""
+    off = poses - mean_pose(poses)[:, None]
+    off[2] = wrap_angle(off[2])
+    return np.asarray(off @ off.T / off.shape[1] + RIGID**2 * np.eye(3))
+
+
+def _turned(poses: FloatArray) -> FloatArray:
+    """Return differences of poses (n, 3) with headings in [-pi, pi)."""
+    return np.column_stack([poses[:, :2], wrap_angle(poses[:, 2])])

@@ -1,0 +1,167 @@
+"""`LogArrays`: steps of one robot's run as flat, read-only arrays, the form in which a smoother takes them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final, NamedTuple
+from weakref import WeakSet
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_backend.core.validation import BoolArray, FloatArray, IntArray
+
+STOOD: Final = 0  # kinds of motion
+ODOMETRY: Final = 1
+EXACT: Final = 2
+REJECTED: Final = -1
+
+
+class LogStep(NamedTuple):
+    """One step of a log; its arrays are read-only views.
+
+    Attributes:
+        step: Index of the step in the run.
+        kind: STOOD, ODOMETRY or EXACT.
+        motion: (3,) [m, m, rad]. ODOMETRY: motion since the last step, previous robot frame; EXACT: the pose, own start
+            frame; STOOD: zeros.
+        points: (n, 3) [m], robot axes, relative to the camera centre.
+        covariances: (n, 6) [m^2] of the points, robot axes, upper triangles by rows; None: the camera model.
+        ids: (n,) landmarks, -1 = rejected.
+    """
+
+    step: int
+    kind: int
+    motion: FloatArray
+    points: FloatArray
+    covariances: FloatArray | None
+    ids: IntArray
+
+
+COLUMNS = ("steps", "kinds", "motions", "given", "starts", "points", "ids", "covariances")
+
+
+@dataclass(frozen=True, slots=True, weakref_slot=True, eq=False, kw_only=True)
+class LogArrays:
+    """T steps with n measurements in all. The arrays cannot be written.
+
+    Attributes:
+        steps: (T,) int64. Index of each step in the run, ascending; steps in which nothing happened may be left out.
+        kinds: (T,) int8. STOOD, ODOMETRY or EXACT.
+        motions: (T, 3) float64 [m, m, rad], by kind as in `LogStep`.
+        given: (T,) bool. Whether the measurements of a step came with covariances; else the camera model holds.
+        starts: (T + 1,) int64. Measurements of row t are starts[t] to starts[t + 1].
+        points: (n, 3) float64 [m], robot axes, relative to the camera centre.
+        ids: (n,) int64. Landmarks by the most probable particle of that step, -1 = rejected.
+        covariances: (n, 6) float64 [m^2], robot axes, upper triangles by rows; NaN where not given. None: all NaN.
+    """
+
+    steps: IntArray
+    kinds: NDArray[np.int8]
+    motions: FloatArray
+    given: BoolArray
+    starts: IntArray
+    points: FloatArray
+    ids: IntArray
+    covariances: FloatArray | None
+
+    def __post_init__(self) -> None:
+        for name in COLUMNS:
+            array = getattr(self, name)
+            if array is not None:
+                array.setflags(write=False)
+
+    def __len__(self) -> int:
+        return len(self.steps)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "LogArrays":
+        return self  # it cannot change
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _from_columns, (self._columns(),)  # a pickle alone would forget that the arrays are read-only
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the arrays."""
+        return sum(array.nbytes for array in self._columns().values() if array is not None)
+
+    def _columns(self) -> dict[str, Any]:
+        """Return all arrays by name."""
+        return {name: getattr(self, name) for name in COLUMNS}
+
+    def row(self, t: int) -> LogStep:
+        """Return row t, 0 <= t < T."""
+        at = slice(int(self.starts[t]), int(self.starts[t + 1]))
+        return LogStep(
+            int(self.steps[t]),
+            int(self.kinds[t]),
+            self.motions[t],
+            self.points[at],
+            self.covariances[at] if self.covariances is not None and self.given[t] else None,
+            self.ids[at],
+        )
+
+    def since(self, step: int) -> "LogArrays":
+        """Return the rows whose index in the run is at least `step`; all but `starts` share memory with these."""
+        t = int(np.searchsorted(self.steps, step))
+        first = int(self.starts[t])
+        return LogArrays(
+            steps=self.steps[t:],
+            kinds=self.kinds[t:],
+            motions=self.motions[t:],
+            given=self.given[t:],
+            starts=self.starts[t:] - first,
+            points=self.points[first:],
+            ids=self.ids[first:],
+            covariances=None if self.covariances is None else self.covariances[first:],
+        )
+
+    def renamed(self, old_ids: IntArray, new_ids: IntArray, keep_others: bool) -> "LogArrays":
+        """Return the same with landmark `old_ids[i]` called `new_ids[i]`; all but `ids` is shared.
+
+        Args:
+            old_ids: (k,) int64, strictly ascending.
+            new_ids: (k,) int64.
+            keep_others: Whether landmarks that are not in `old_ids` keep their names; else they are rejected.
+        """
+        ids = self.ids.copy() if keep_others else np.full_like(self.ids, REJECTED)
+        if len(old_ids):
+            at = np.minimum(np.searchsorted(old_ids, self.ids), len(old_ids) - 1)
+            known = old_ids[at] == self.ids
+            ids[known] = new_ids[at[known]]
+        return replace(self, ids=ids)
+
+
+_checked: WeakSet[LogArrays] = WeakSet()
+
+
+def has_been_checked(rows: Any) -> bool:
+    """Tell whether all of a log's arrays were looked at before: they cannot be written."""
+    return type(rows) is LogArrays and rows in _checked
+
+
+def note_checked(rows: LogArrays) -> None:
+    """Remember that all of a log's arrays were looked at."""
+    _checked.add(rows)
+
+
+def _from_columns(columns: dict[str, Any]) -> LogArrays:
+    """Build a log from its arrays, as unpickling does."""
+    return LogArrays(**columns)
+
+
+def join(parts: Sequence[LogArrays]) -> LogArrays:
+    """Chain at least one part in the order given; covariances are NaN for parts that have none."""
+    if len(parts) == 1:
+        return parts[0]
+    ends = np.cumsum([len(part.ids) for part in parts])
+    starts = [parts[0].starts] + [part.starts[1:] + end for part, end in zip(parts[1:], ends[:-1], strict=True)]
+    columns = {
+        name: np.concatenate([getattr(part, name) for part in parts])
+        for name in ("steps", "kinds", "motions", "given", "points", "ids")
+    }
+    covariances = None
+    if any(part.covariances is not None for part in parts):
+        covariances = np.concatenate(
+            [np.full((len(part.ids), 6), np.nan) if part.covariances is None else part.covariances for part in parts]
+        )
+    return LogArrays(starts=np.concatenate(starts), covariances=covariances, **columns)

@@ -1,0 +1,211 @@
+"""Whole paths sampled from the posterior of a smoother, their landmarks, and their importance weights.
+
+Where headings are uncertain, the poses of a path scatter on a banana, which no Gaussian of coordinates is. What is
+nearly Gaussian are the motions between poses (Long et al., The Banana Distribution Is Gaussian, RSS 2012): paths are
+sampled about the mode and then bent motion by motion.
+"""
+
+import math
+from typing import NamedTuple, Self
+
+import numpy as np
+
+from slam_backend.core.jit import jit
+from slam_backend.core.validation import FloatArray, IntArray
+from slam_backend.smoother import _kernels
+from slam_backend.smoother._kernels import LANES, POSE_ROWS
+from slam_backend.smoother.graph import LEVER, PathGraph
+from slam_backend.smoother.optimizer import Mode
+
+
+@jit
+def bend(mode: FloatArray, previous: IntArray, offsets: FloatArray) -> FloatArray:
+    """Return paths (k, 3, M) whose motions differ from those of the mode as offsets say to first order.
+
+    With r_b the first-order change of the motion from the previous pose a to b that the offsets of a and b make, and
+    m_b the motion of the mode, a path is x_b = x_a * (m_b + r_b). Both steps, offsets to r and r to x, are triangular
+    in the order of the keys with rotations on the diagonal: volumes, and so densities, stay as they are. Offsets of
+    zero give the mode.
+
+    Args:
+        mode: (k, 3) [m, m, rad], map frame.
+        previous: (k,) the key that each one's motion comes from, -1 where its pose is given. No circles.
+        offsets: (k, 3, M) [m, m, rad] from the mode, map frame; zeros where a pose is given.
+    """
+    k, m = len(mode), offsets.shape[2]
+    paths = np.empty(offsets.shape)
+    is_done = np.zeros(k, dtype=np.bool_)
+    line = np.empty(k, dtype=np.int64)
+    for key in range(k):
+        top, at = 0, key
+        while at >= 0 and not is_done[at]:  # up to what is known, and back
+            is_done[at] = True
+            line[top] = at
+            top += 1
+            at = previous[at]
+        for place in range(top - 1, -1, -1):
+            b = line[place]
+            a = previous[b]
+            if a < 0:
+                for i in range(m):
+                    for axis in range(3):
+                        paths[b, axis, i] = mode[b, axis] + offsets[b, axis, i]
+                continue
+            c, s = math.cos(mode[a, 2]), math.sin(mode[a, 2])
+            dx, dy, turn = mode[b, 0] - mode[a, 0], mode[b, 1] - mode[a, 1], mode[b, 2] - mode[a, 2]
+            ahead, left = c * dx + s * dy, c * dy - s * dx
+            for i in range(m):
+                ox, oy = offsets[b, 0, i] - offsets[a, 0, i], offsets[b, 1, i] - offsets[a, 1, i]
+                own_ahead = ahead + c * ox + s * oy + left * offsets[a, 2, i]
+                own_left = left + c * oy - s * ox - ahead * offsets[a, 2, i]
+                cos, sin = math.cos(paths[a, 2, i]), math.sin(paths[a, 2, i])
+                paths[b, 0, i] = paths[a, 0, i] + cos * own_ahead - sin * own_left  # (8), x
+                paths[b, 1, i] = paths[a, 1, i] + sin * own_ahead + cos * own_left  # (8), y
+                paths[b, 2, i] = paths[a, 2, i] + turn + offsets[b, 2, i] - offsets[a, 2, i]
+    return paths
+
+
+BENT_BELOW = 0.5  # share of M: where the sample size of straight paths is less, bent ones are tried
+
+
+class Draws(NamedTuple):
+    """M paths with the landmarks that each of them asks for.
+
+    Attributes:
+        poses: (k, 3, M) float64 [m, m, rad], map frame.
+        tiles: (l, P / LANES, 9, LANES) float64. Means (3) and covariances (6) of the landmarks, map frame, by lanes.
+        log_weights: (M,) float64. Importance weights, not normalised.
+        weights: (M,) float64. The same, summing to 1; NaN where one is not finite.
+        sample_size: Effective sample size of the weights, likewise.
+        spreads: (k,) float64 [m^2]. How far the motions from the keys before scatter, headings felt at `LEVER`.
+    """
+
+    poses: FloatArray
+    tiles: FloatArray
+    log_weights: FloatArray
+    weights: FloatArray
+    sample_size: float
+    spreads: FloatArray
+
+    @classmethod
+    def weighed(cls, poses: FloatArray, tiles: FloatArray, log_weights: FloatArray, spreads: FloatArray) -> Self:
+        """Return paths with their weights normalised; arguments as the attributes."""
+        weights = np.empty(len(log_weights))
+        sample_size = _kernels.normalise(log_weights, weights)
+        return cls(poses, tiles, log_weights, weights, sample_size, spreads)
+
+    @property
+    def landmarks(self) -> FloatArray:
+        """(l, 9, M) float64. Means and covariances. A copy."""
+        count, blocks = self.tiles.shape[:2]
+        rows = self.tiles.transpose(0, 2, 1, 3).reshape(count, 9, blocks * LANES)
+        return np.ascontiguousarray(rows[:, :, : self.poses.shape[2]])
+
+    def taken(self, ancestors: IntArray) -> "Draws":
+        """Return as many paths as there are ancestors (M',), each a copy of its ancestor, weighed alike."""
+        m = len(ancestors)
+        padded = np.concatenate([ancestors, np.repeat(ancestors[:1], -m % LANES)])  # surplus lanes are copies
+        blocks = len(padded) // LANES
+        tiles = self.landmarks[:, :, padded].reshape(len(self.tiles), 9, blocks, LANES).transpose(0, 2, 1, 3)
+        return Draws.weighed(self.poses[:, :, ancestors], np.ascontiguousarray(tiles), np.zeros(m), self.spreads)
+
+
+def draw_paths(graph: PathGraph, mode: Mode, num_particles: int, rng: np.random.Generator) -> Draws:
+    """Draw x^(i) from the Gaussian about the mode, and replay each path.
+
+    log w = log p(path given odometry) + log p(measurements given path) - log q(path). The first path is the mode. Where
+    the weights of these say that the posterior is no such Gaussian, the same paths are bent (`bending`), and of both
+    those are returned whose effective sample size is larger.
+
+    Args:
+        graph: Odometry and measurements.
+        mode: Of it, with the factor of its information.
+        num_particles: M >= 1.
+        rng: Source of the draws.
+    """
+    poses, log_proposals = mode.paths(num_particles, rng)
+    straight = _weighed(graph, mode, poses, log_proposals)
+    if straight.sample_size >= BENT_BELOW * num_particles:
+        return straight
+    bent = _weighed(graph, mode, bend(mode.poses, graph.previous, poses - mode.poses[:, :, None]), log_proposals)
+    return max(straight, bent, key=lambda draws: np.nan_to_num(draws.sample_size))
+
+
+def drawn_spreads(graph: PathGraph, mode: Mode, rng: np.random.Generator) -> FloatArray:
+    """Return how far the motions from the keys before scatter (k,) [m^2] over `LANES` paths, each to 14 % or so.
+
+    Args:
+        graph: Odometry and measurements.
+        mode: Of it, with the factor of its information.
+        rng: Source of the draws.
+    """
+    paths, _ = mode.paths(LANES, rng)
+    return weigh_odometry(graph, mode, lane_rows(paths), LANES)[1]
+
+
+def _weighed(graph: PathGraph, mode: Mode, poses: FloatArray, log_proposals: FloatArray) -> Draws:
+    """Replay paths (k, 3, M) and weigh them."""
+    num_paths = poses.shape[2]
+    rows = lane_rows(poses)
+    tiles, log_likelihood = replay(mode, rows, num_paths)
+    log_odometry, spreads = weigh_odometry(graph, mode, rows, num_paths)
+    return Draws.weighed(poses, tiles, log_likelihood + log_odometry - log_proposals, spreads)  # (2)
+
+
+def lane_rows(poses: FloatArray) -> FloatArray:
+    """Return paths as kernels take them, in blocks of lanes; surplus lanes are copies of the first path.
+
+    Args:
+        poses: (k, 3, M) float64 [m, m, rad], map frame.
+
+    Returns:
+        (P / LANES, k, 5, LANES) float64: x, y, cos, sin, heading.
+    """
+    k, _, m = poses.shape
+    rows = np.empty((-(-m // LANES), k, POSE_ROWS, LANES))
+    _kernels.to_lanes(poses, rows.reshape(-1))
+    return rows
+
+
+def replay(mode: Mode, rows: FloatArray, num_particles: int) -> tuple[FloatArray, FloatArray]:
+    """Return the landmarks of M paths, and log p(measurements given path) up to a constant.
+
+    Args:
+        mode: Sightings, linearised there.
+        rows: Of `lane_rows`.
+        num_particles: M.
+
+    Returns:
+        (l, P / LANES, 9, LANES) means and covariances in blocks of lanes, zeros where a landmark has no sighting; (M,).
+    """
+    blocks, k = rows.shape[:2]
+    seen = mode.sightings
+    tiles = np.empty((len(mode.landmarks), blocks, 9, LANES))
+    log_likelihood = np.empty(blocks * LANES)
+    _kernels.replay(
+        rows.reshape(-1), k, blocks, mode.landmarks, seen.keys, seen.starts, seen.centres, seen.infos, seen.slopes,
+        tiles.reshape(-1), log_likelihood,
+    )  # fmt: skip
+    return tiles, log_likelihood[:num_particles]
+
+
+def weigh_odometry(graph: PathGraph, mode: Mode, rows: FloatArray, num_particles: int) -> tuple[FloatArray, FloatArray]:
+    """Weigh M paths by the odometry.
+
+    Args:
+        graph: The odometry between keys.
+        mode: Motions are compared about those of the mode.
+        rows: Of `lane_rows`.
+        num_particles: M.
+
+    Returns:
+        (M,) log p(path given odometry) up to a constant, and (k,) [m^2] how far the motions from the keys before
+        scatter, headings felt at `LEVER`.
+    """
+    blocks, k = rows.shape[:2]
+    log_density, spreads = np.empty(blocks * LANES), np.empty(k)
+    _kernels.odometry_of_paths(
+        rows.reshape(-1), k, blocks, num_particles, graph.previous, mode.poses, graph.motions, mode.odometry_infos,
+        LEVER, log_density, spreads,
+    )  # fmt: skip
+    return log_density[:num_particles], spreads

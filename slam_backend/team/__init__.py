@@ -1,0 +1,1 @@
+"""Teams of filters: groups, communication, merges and their undoing."""

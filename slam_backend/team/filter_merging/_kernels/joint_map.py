@@ -1,0 +1,149 @@
+"""The compiled inner loops of a joint map: landmarks of both sides read where they lie, moved, fused, written in tiles.
+
+A landmark of a particle is nine numbers, x, y, z, Sxx, Sxy, Sxz, Syy, Syz, Szz, a number of lanes apart; `places` says
+where it begins. The number of lanes is always an argument: a compiled kernel would not notice that it changed in
+another file.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from slam_backend.core.jit import device, inlined, jit
+from slam_backend.core.validation import FloatArray, IntArray
+
+
+@jit
+def places(
+    slots: Any, row_of: Any, map_of: Any, maps: Any, counts: Any, chosen: Any, lanes: int
+) -> tuple[IntArray, IntArray]:
+    """Return where the landmarks of slots (n,) begin in the chosen particles (M,), and their counts: both (n, M)."""
+    where, times = np.empty((len(slots), len(chosen)), np.int64), np.empty((len(slots), len(chosen)), np.int64)
+    padded = counts.shape[1]
+    offsets = np.empty(padded, np.int64)  # of each particle in a row: a table, as divisions are dear
+    for m in range(padded):
+        offsets[m] = m // lanes * 9 * lanes + m % lanes
+    for i in range(len(slots)):
+        row, ancestors = row_of[slots[i]], map_of[slots[i]]
+        for p in range(len(chosen)):
+            m = maps[ancestors, chosen[p]] if ancestors > 0 else chosen[p]
+            where[i, p] = row * 9 * padded + offsets[m]
+            times[i, p] = counts[row, m]
+    return where, times
+
+
+@jit
+def read(values: Any, where: Any, lanes: int) -> FloatArray:
+    """Return the landmarks (n, 9, M) that begin at `where` (n, M)."""
+    result = np.empty((where.shape[0], 9, where.shape[1]))
+    for i in range(where.shape[0]):
+        for c in range(9):
+            for p in range(where.shape[1]):
+                result[i, c, p] = values[where[i, p] + c * lanes]
+    return result
+
+
+@inlined
+def _widened(values: Any, at: int, lanes: int, extra: float, scale: float, landmark: Any) -> None:
+    """Write a landmark to `landmark` (9,) with `extra` [m^2] added to its variances, all then times `scale`."""
+    for c in range(9):
+        landmark[c] = values[at + c * lanes]
+    for c in (3, 6, 8):
+        landmark[c] += extra
+    for c in range(3, 9):
+        landmark[c] *= scale
+
+
+@inlined
+def _move(landmark: Any, x: float, y: float, c: float, s: float) -> None:
+    """Move a landmark (9,) in place by a motion of which c, s are cosine and sine; its covariance by Eq. 16 *."""
+    px, py = landmark[0], landmark[1]
+    landmark[0], landmark[1] = c * px - s * py + x, s * px + c * py + y
+    xx, xy, xz, yy, yz = landmark[3], landmark[4], landmark[5], landmark[6], landmark[7]
+    landmark[3] = c * c * xx - 2.0 * c * s * xy + s * s * yy  # R Sigma R^T
+    landmark[4] = c * s * (xx - yy) + (c * c - s * s) * xy
+    landmark[5] = c * xz - s * yz
+    landmark[6] = s * s * xx + 2.0 * c * s * xy + c * c * yy
+    landmark[7] = s * xz + c * yz
+
+
+@device
+@jit
+def _fuse(one: FloatArray, two: FloatArray, work: FloatArray) -> bool:
+    """Fuse landmark `two` (9,) into `one` (9,), Eqs. 13-15 *, with room (5, 3, 3); False if their sum is singular."""
+    a, b, gain, rest, half = work[0], work[1], work[2], work[3], work[4]
+    entry = 3
+    for j in range(3):
+        for k in range(j, 3):
+            a[j, k] = a[k, j] = one[entry]
+            b[j, k] = b[k, j] = two[entry]
+            entry += 1
+    xx, xy, xz = one[3] + two[3], one[4] + two[4], one[5] + two[5]
+    yy, yz, zz = one[6] + two[6], one[7] + two[7], one[8] + two[8]
+    half[0, 0], half[0, 1], half[0, 2] = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
+    det = xx * half[0, 0] + xy * half[0, 1] + xz * half[0, 2]
+    if not det > 0.0:
+        return False
+    half[1, 1], half[1, 2], half[2, 2] = xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy
+    half[1, 0], half[2, 0], half[2, 1] = half[0, 1], half[0, 2], half[1, 2]
+    for j in range(3):
+        for k in range(3):
+            gain[j, k] = (a[j, 0] * half[0, k] + a[j, 1] * half[1, k] + a[j, 2] * half[2, k]) / det  # Eq. 13
+            rest[j, k] = (1.0 if j == k else 0.0) - gain[j, k]
+    x, y, z = two[0] - one[0], two[1] - one[1], two[2] - one[2]
+    for j in range(3):
+        one[j] += gain[j, 0] * x + gain[j, 1] * y + gain[j, 2] * z  # Eq. 14 *
+    for first, spread in ((rest, a), (gain, b)):  # Eq. 15 *, in the form that stays positive whatever the rounding
+        for j in range(3):
+            for k in range(3):
+                half[j, k] = first[j, 0] * spread[0, k] + first[j, 1] * spread[1, k] + first[j, 2] * spread[2, k]
+        for j in range(3):
+            for k in range(3):
+                spread[j, k] = half[j, 0] * first[k, 0] + half[j, 1] * first[k, 1] + half[j, 2] * first[k, 2]
+    entry = 3
+    for j in range(3):
+        for k in range(j, 3):
+            one[entry] = 0.5 * (a[j, k] + a[k, j] + b[j, k] + b[k, j])
+            entry += 1
+    return True
+
+
+@jit
+def join(
+    values_a: Any, where_a: Any, times_a: Any, values_b: Any, where_b: Any, times_b: Any, rows_a: Any, rows_b: Any,
+    motion: Any, extra: float, scales: Any, lanes: int, tiles: Any,
+) -> bool:  # fmt: skip
+    """Write the landmarks of a joint map, those of b moved, those of both fused where a particle holds both.
+
+    Args:
+        values_a: All numbers of one map, of which (n_a, M) begin at `where_a` with counts `times_a`; of b likewise.
+        rows_a: (n,) row in a of each joint landmark, -1 if only b has it; `rows_b` likewise.
+        motion: (M, 3) from b's map frame to a's, of each particle.
+        extra: Added to all variances of either side first [m^2].
+        scales: (n,) factor on the covariances of each then [-].
+        lanes: Particles in a block.
+        tiles: (>= n, blocks, 9, lanes), of which the first n are written; zeros where a particle holds neither.
+
+    Returns:
+        Whether all went well: not if two estimates are exact along one direction.
+    """
+    one, two, work = np.empty(9), np.empty(9), np.empty((5, 3, 3))
+    cos, sin = np.cos(motion[:, 2]), np.sin(motion[:, 2])
+    for i in range(len(rows_a)):
+        j, k, scale = rows_a[i], rows_b[i], scales[i]
+        for block in range(tiles.shape[1]):
+            tile, first = tiles[i, block], block * lanes
+            for lane in range(lanes):
+                p = first + lane
+                there = p < len(motion)
+                in_a, in_b = there and j >= 0 and times_a[j, p] > 0, there and k >= 0 and times_b[k, p] > 0
+                if in_b:
+                    _widened(values_b, where_b[k, p], lanes, extra, scale, two)
+                    _move(two, motion[p, 0], motion[p, 1], cos[p], sin[p])
+                if in_a:
+                    _widened(values_a, where_a[j, p], lanes, extra, scale, one)
+                    if in_b and not _fuse(one, two, work):
+                        return False
+                for c in range(9):
+                    tile[c, lane] = one[c] if in_a else two[c] if in_b else 0.0
+    return True

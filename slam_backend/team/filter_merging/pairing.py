@@ -1,0 +1,114 @@
+"""Which particles of two filters become joint ones: by which motion each pair of them fits, and how well.
+
+Pairs are weighed by their evidence, the integral of exp(-chi^2 / 2) over T by Laplace's formula; see `merging`, which
+also says what tau^2 and phi are.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from slam_backend.core.validation import FloatArray, IntArray
+from slam_backend.maps.alignment import Alignment
+from slam_backend.resampling import systematic
+from slam_backend.team.filter_merging._kernels.pairing import MIN_PAIRS, fit, unexplained
+from slam_backend.team.filter_merging.landmarks import Landmarks
+
+CANDIDATES = 4  # pairs of particles weighed for each that is kept
+ITERATIONS = 3  # of Gauss and Newton for each pair
+ROUNDS = 8  # of looking for what two maps' covariances do not explain
+MOST_EXTRA = 0.05**2  # [m^2] two robots may place what they take for one corner so far apart; more is a contradiction
+
+
+class Pairing(NamedTuple):
+    """Which particles of a and of b become joint ones (M,), their motions (M, 3), and their log-evidences (M,).
+
+    Before it moves, each landmark that is shared takes half of `extra` [m^2], then all are scaled by `scale`.
+    """
+
+    from_a: IntArray
+    from_b: IntArray
+    motion: FloatArray
+    evidence: FloatArray
+    extra: float
+    scale: float
+
+
+def pair_up(
+    weights_a: FloatArray, common_a: Landmarks, weights_b: FloatArray, common_b: Landmarks, alignment: Alignment,
+    count: int, rng: np.random.Generator, known: bool = False,
+) -> Pairing:  # fmt: skip
+    """Draw pairs of particles and their motions.
+
+    Args:
+        weights_a: (M_a,) of one filter's particles, summing to 1.
+        common_a: Its landmarks in common; those of the other in the same order.
+        weights_b, common_b: Of the other filter.
+        alignment: Where Gauss and Newton start, and the motion of pairs that share too few landmarks.
+        count: M, of pairs.
+        rng: For the pairing and the draws of T.
+        known: The motion is drawn from the alignment, whatever the landmarks in common say of it.
+    """
+    from_a = systematic(weights_a, rng, CANDIDATES * count)
+    from_b = rng.permutation(systematic(weights_b, rng, CANDIDATES * count))
+    common = common_a.values, common_a.counts > 0, common_b.values, common_b.counts > 0
+    some_a, some_b = from_a[::CANDIDATES].copy(), from_b[::CANDIDATES].copy()
+    extra = _extra(*unexplained(*common, some_a, some_b, alignment.transform, ROUNDS))
+    motions, informations, chi2, log_dets, shared = fit(
+        *common, from_a, from_b, alignment.transform, extra, ITERATIONS
+    )  # fmt: skip
+    scale = _contradiction(chi2, shared) if extra == MOST_EXTRA else 1.0
+    evidence, covariances = _weigh(motions, informations, chi2, log_dets, shared, scale, alignment, known)
+    weights = np.exp(evidence - evidence.max())
+    chosen = systematic(weights / weights.sum(), rng, count)
+    draws = rng.standard_normal((count, 3))
+    motion = motions[chosen] + np.einsum("mij,mj->mi", _factors(covariances[chosen]), draws)
+    return Pairing(from_a[chosen], from_b[chosen], motion, evidence[chosen], extra, scale)
+
+
+def _extra(extra: FloatArray, shared: IntArray) -> float:
+    """Return tau^2 [m^2], the median over pairs of particles (c,): at most `MOST_EXTRA`, 0 where maps agree."""
+    enough = shared >= MIN_PAIRS
+    return min(float(np.median(extra[enough])), MOST_EXTRA) if enough.any() else 0.0
+
+
+def _contradiction(chi2: FloatArray, shared: IntArray) -> float:
+    """Return phi >= 1, by how much the widened covariances still understate the differences between maps."""
+    enough = shared >= MIN_PAIRS
+    if not enough.any():
+        return 1.0
+    return max(1.0, float(np.median(chi2[enough] / (3.0 * shared[enough] - 3.0))))
+
+
+def _weigh(
+    motions: FloatArray,
+    informations: FloatArray,
+    chi2: FloatArray,
+    log_dets: FloatArray,
+    shared: IntArray,
+    scale: float,
+    alignment: Alignment,
+    known: bool,
+) -> tuple[FloatArray, FloatArray]:
+    """Return log-evidences (c,) and the covariance of each pair's motion (c, 3, 3).
+
+    Pairs of particles that share too little take the consensus motion, and the smallest evidence of the others. Where
+    the motion is `known`, all do.
+    """
+    poor = (shared < MIN_PAIRS) | known
+    informations = np.where(poor[:, None, None], np.eye(3), informations)
+    covariances = scale * np.linalg.inv(informations)
+    motions[poor] = alignment.transform
+    covariances[poor] = alignment.covariance
+    log_evidence = -0.5 * (chi2 / scale + log_dets + 3.0 * shared * math.log(scale))
+    log_evidence += 0.5 * np.linalg.slogdet(np.where(poor[:, None, None], np.eye(3), covariances))[1]
+    if poor.any():
+        log_evidence[poor] = log_evidence[~poor].min() if (~poor).any() else 0.0
+    return log_evidence, np.asarray(covariances)
+
+
+def _factors(covariances: FloatArray) -> FloatArray:
+    """Return C (c, 3, 3) with C C^T the covariances."""
+    values, vectors = np.linalg.eigh(0.5 * (covariances + covariances.transpose(0, 2, 1)))
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :])

@@ -1,0 +1,189 @@
+"""Groups of robots that share a map frame, and the table of who belongs to which."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+
+from slam_backend.core.validation import IntArray
+from slam_backend.fastslam.filter import FastSlam
+from slam_backend.team.branches import Branch, Intake, fork, landmark_counts, missing, parts, replay
+from slam_backend.team.merge_monitor import Watch
+from slam_backend.team.merge_rollback import Undoing
+from slam_backend.team.shared_records import Records
+
+
+class Group:
+    """Robots in ascending order; their map frame is the start frame of the lowest.
+
+    Args:
+        trunk: The joint filter's branch.
+        forks: The branches of robots that are out of contact with it.
+
+    Attributes:
+        branches: The trunk, then the forks. Each robot goes by exactly one of them.
+        undoing: Of a merge that is being taken back; None: none is.
+    """
+
+    def __init__(self, trunk: Branch, forks: Sequence[Branch] = ()) -> None:
+        self.branches = [trunk, *forks]
+        self.undoing: Undoing | None = None
+
+    @property
+    def trunk(self) -> Branch:
+        """The branch of the joint filter."""
+        return self.branches[0]
+
+    @property
+    def robots(self) -> tuple[int, ...]:
+        """All robots of the group."""
+        return self.branches[0].robots
+
+    # ------------------------------------------------------------------ contact lost and found
+
+    def regroup(self, networks: IntArray, records: Records) -> None:
+        """Fork filters whose robots have lost contact, and tell filters what returning robots have read.
+
+        Args:
+            networks: (K,) robots with the same number are in contact.
+            records: Of the team.
+        """
+        if len(self.robots) == 1:
+            return
+        for branch in list(self.branches):
+            for part in parts(branch.live, networks)[1:]:
+                copied = fork(branch, part, records.new_number(), records.rng)
+                records.copied(branch.number, copied.number)
+                branch.live = tuple(robot for robot in branch.live if robot not in part)
+                self.branches.append(copied)
+        if len(self.branches) > 1:
+            self._settle_trunk(networks)
+            for network in np.unique(networks[list(self.robots)]):
+                here = [branch for branch in self.branches if networks[branch.live[0]] == network]
+                if len(here) > 1:
+                    self._reunite(here, records)
+
+    def _settle_trunk(self, networks: IntArray) -> None:
+        """Hand the joint filter to those who meet other groups, if those who have it meet none: so they can merge.
+
+        A fork can take its place unless the joint filter has lived through a merge or an undo since.
+        """
+        outside = set(np.delete(networks, self.robots).tolist())
+        meeting = [branch for branch in self.branches if networks[branch.live[0]] in outside]
+        meeting = [branch for branch in meeting if branch.epoch == self.trunk.epoch]
+        if meeting and self.trunk not in meeting:
+            old, new = self.trunk, meeting[0]
+            old.split_from, old.split_counts = new.number, dict(new.split_counts)
+            self.branches = [new, *(branch for branch in self.branches if branch is not new)]
+
+    def _reunite(self, here: list[Branch], records: Records) -> None:
+        """Let the best informed of some branches in contact take in what the others know, and end those it caught."""
+        main = max(here, key=self._rank)
+        others = [branch for branch in here if branch is not main and set(branch.live) <= set(main.robots)]
+        wanted: dict[int, int] = {}
+        for other in others:
+            for robot, last in missing(main, other).items():
+                wanted[robot] = max(last, wanted.get(robot, -1))
+        done = replay(main, records.log, wanted)
+        records.note_replay(main.number, done)
+        records.exchange.record_replay(done)
+        for other in others:
+            known = other.told_by(main, done)
+            if all(main.known[robot] == other.known[robot] for robot in other.live):
+                counts, size = landmark_counts(main.filter), main.filter.descriptor_size
+                records.exchange.record_return(main.live[0], known, counts, size)
+                main.live = tuple(sorted(main.live + other.live))
+                self.branches = [branch for branch in self.branches if branch is not other]
+
+    def _rank(self, branch: Branch) -> tuple[bool, int, int, int]:
+        """Return by what branches in contact are ranked: the trunk, then who has lived through more merges."""
+        return branch is self.trunk, branch.epoch, len(branch.live), -branch.live[0]
+
+    # ------------------------------------------------------------------ snapshots
+
+    def steps_unknown(self) -> list[int]:
+        """Return from which past steps on its filters may have to take in readings yet; none if they know all."""
+        held = [
+            1 + last for branch in self.branches for robot, last in branch.known.items() if robot not in branch.live
+        ]
+        return held + [side.oldest for branch in self.branches for watch in branch.watches for side in watch.sides]
+
+    def numbers(self) -> set[int]:
+        """Return the numbers of all maps that the group uses or may take up again."""
+        watches = [watch for branch in self.branches for watch in branch.watches]
+        return {branch.number for branch in self.branches}.union(*map(_numbers, watches))
+
+    def get_state(self) -> dict[str, Any]:
+        """Return all that decides how the group goes on."""
+        return {
+            "branches": tuple(branch.get_state() for branch in self.branches),
+            "undoing": None if self.undoing is None else self.undoing.get_state(),
+        }
+
+    @classmethod
+    def from_state(cls, state: Mapping[str, Any], at_hand: Mapping[tuple[int, ...], FastSlam] | None = None) -> "Group":
+        """Build a group from `get_state`; a filter at hand for the trunk, by its robots, is filled."""
+        at_hand = {} if at_hand is None else at_hand
+        trunk, *forks = state["branches"]
+        group = cls(
+            Branch.from_state(trunk, at_hand.get(trunk["robots"])), [Branch.from_state(branch) for branch in forks]
+        )
+        group.undoing = None if state["undoing"] is None else Undoing.from_state(state["undoing"])
+        return group
+
+
+def _numbers(watch: Watch) -> set[int]:
+    """Return the numbers of the maps that an undo of a merge would take up again."""
+    older = [_numbers(one) for side in watch.sides for one in side.watches]
+    return {side.trunk["number"] for side in watch.sides}.union(*older)
+
+
+class Lineup(NamedTuple):
+    """What the groups of a team come to, as long as no group, branch or watch of a merge begins or ends.
+
+    Attributes:
+        groups: The robots of each group, by ascending first robot.
+        branches: Of all groups.
+        intakes: Of each, how it takes in a step.
+        places: Per robot its group, the branch that it goes by, and its place in that.
+        members: Per robot those whose places its filter knows, itself included, ascending.
+        mates: Per robot those that go by the same filter, itself included, ascending.
+        maps: Per robot the number of the map that it goes by.
+        numbers: Of all maps that are in use or may be taken up again.
+        oldest: The first step that some filter may have to take in yet; None: there is none.
+        is_split: Whether some robots are out of contact with their group's joint filter.
+        is_watched: Whether some merge can still be undone, or is being taken back.
+    """
+
+    groups: tuple[tuple[int, ...], ...]
+    branches: tuple[Branch, ...]
+    intakes: tuple[Intake, ...]
+    places: tuple[tuple[Group, Branch, int], ...]
+    members: tuple[tuple[int, ...], ...]
+    mates: tuple[tuple[int, ...], ...]
+    maps: tuple[int, ...]
+    numbers: frozenset[int]
+    oldest: int | None
+    is_split: bool
+    is_watched: bool
+
+    @classmethod
+    def of(cls, groups: Sequence[Group]) -> Self:
+        """Return that of these groups."""
+        owned = [(group, branch) for group in groups for branch in group.branches]
+        by_robot = {r: (group, branch, branch.robots.index(r)) for group, branch in owned for r in branch.live}
+        places = tuple(by_robot[robot] for robot in sorted(by_robot))
+        oldest = [step for group in groups for step in group.steps_unknown()]
+        return cls(
+            groups=tuple(group.robots for group in groups),
+            branches=tuple(branch for _, branch in owned),
+            intakes=tuple(Intake.of(branch, branch.live) for _, branch in owned),
+            places=places,
+            members=tuple(branch.robots for _, branch, _ in places),
+            mates=tuple(branch.live for _, branch, _ in places),
+            maps=tuple(branch.number for _, branch, _ in places),
+            numbers=frozenset[int]().union(*(group.numbers() for group in groups)),
+            oldest=min(oldest, default=None),
+            is_split=len(owned) > len(groups),
+            is_watched=any(branch.watches or group.undoing is not None for group, branch in owned),
+        )

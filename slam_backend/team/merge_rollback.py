@@ -1,0 +1,83 @@
+"""`Undoing`: a false merge is taken back over some steps, so that no step has to take in all that was read since.
+
+The groups that there were are taken up again as they were and catch up, a few steps of readings at a time, while their
+robots still go by the joint filter. When they have caught up they take over, as if the merge had never been.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from slam_backend.fastslam.step_input import InputLog
+from slam_backend.team.branches import MOST_REPLAYED, Branch, ReplayedStep, replay
+from slam_backend.team.merge_monitor import Side, Watch
+
+LEAST_REPLAYED = 2  # per tick and side: one is read in every tick
+
+
+@dataclass(slots=True, eq=False)
+class Undoing:
+    """Where the taking back of a merge, and of those on top of it, has got to.
+
+    Attributes:
+        number: Of the map that the false merge made.
+        sides: The joint filters of the groups that there will be, each on its way to the present.
+        replayed: What each has taken in so far.
+    """
+
+    number: int
+    sides: list[Branch]
+    replayed: list[list[ReplayedStep]]
+
+    @classmethod
+    def of(cls, trunk: Branch, number: int) -> "Undoing":
+        """Begin to take back the merge that made map `number`, which a joint filter watches."""
+        sides = [Branch.from_state(side.trunk) for side in _sides(trunk.watches[-1], number)]
+        return cls(number, sides, [[] for _ in sides])
+
+    def merges(self, trunk: Branch) -> list[Watch]:
+        """Return the merges of a joint filter that go, the last one first; none if it does not watch the false one."""
+        if all(watch.number != self.number for watch in trunk.watches):
+            return []
+        return list(_down_to(trunk.watches[-1], self.number))
+
+    def catch_up(self, trunk: Branch, log: InputLog) -> bool:
+        """Take in some steps of what the joint filter knows, and tell whether that was all."""
+        share = max(LEAST_REPLAYED, MOST_REPLAYED // len(self.sides))
+        caught_up = True
+        for side, done in zip(self.sides, self.replayed, strict=True):
+            wanted = {robot: trunk.known[robot] for robot in side.robots if trunk.known[robot] > side.known[robot]}
+            done += replay(side, log, wanted, share)
+            caught_up &= all(side.known[robot] >= last for robot, last in wanted.items())
+        return caught_up
+
+    def get_state(self) -> dict[str, Any]:
+        """Return all that decides how it goes on."""
+        return {
+            "number": self.number,
+            "sides": tuple(side.get_state() for side in self.sides),
+            "replayed": tuple(tuple(done) for done in self.replayed),
+        }
+
+    @classmethod
+    def from_state(cls, state: Mapping[str, Any]) -> "Undoing":
+        """Go on with what `get_state` returned."""
+        sides = [Branch.from_state(side) for side in state["sides"]]
+        return cls(state["number"], sides, [list(done) for done in state["replayed"]])
+
+
+def _down_to(watch: Watch, number: int) -> Iterator[Watch]:
+    """Yield a merge and those under it, down to the one that made map `number`."""
+    yield watch
+    for side in watch.sides:
+        if any(older.number == number for older in side.watches):
+            yield from _down_to(side.watches[-1], number)
+
+
+def _sides(watch: Watch, number: int) -> Iterator[Side]:
+    """Yield the groups that are left when a merge and those under it, down to map `number`, are taken back."""
+    for side in watch.sides:
+        if any(older.number == number for older in side.watches):
+            yield from _sides(side.watches[-1], number)
+        else:
+            yield side

@@ -1,0 +1,72 @@
+"""`Records`: what the groups of a team write down in common: readings, bytes, and what becomes of their maps."""
+
+import copy
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from slam_backend.fastslam.reports import LandmarksCreated, MapCopied, MapEntry, StepReport
+from slam_backend.fastslam.step_input import InputLog
+from slam_backend.team.branches import ReplayedStep
+from slam_backend.team.communication import ExchangeLedger
+
+
+class Records:
+    """The common records of a team.
+
+    Args:
+        num_robots: K; the first K maps are those of the robots alone.
+        seed: Of the streams from which forks draw.
+
+    Attributes:
+        log: What was read and may have to be taken in again.
+        exchange: Counts bytes.
+        rng: From which forks get their own streams.
+        entries: What happened to maps since the last report.
+    """
+
+    def __init__(self, num_robots: int, seed: np.random.SeedSequence) -> None:
+        self.log = InputLog()
+        self.exchange = ExchangeLedger(num_robots)
+        self.rng = np.random.default_rng(seed)
+        self.entries: list[MapEntry] = []
+        self._next_number = num_robots
+
+    def new_number(self) -> int:
+        """Return a number that no map has had."""
+        self._next_number += 1
+        return self._next_number - 1
+
+    def copied(self, source: int, copy: int) -> None:
+        """Write down that a filter forked."""
+        self.entries.append(MapCopied(source, copy))
+
+    def note_created(self, number: int, step: int, report: StepReport) -> None:
+        """Write down which landmarks a step of the filter of a map created."""
+        for robot in report.rows:
+            if robot >= 0 and report.findings.names_created(robot):
+                self.entries.append(LandmarksCreated(number, robot, step, report.findings.created(robot)))
+
+    def note_replay(self, number: int, replayed: Sequence[ReplayedStep]) -> None:
+        """Write down which landmarks a replay created in a map."""
+        for done in replayed:
+            self.note_created(number, done.step, done.report)
+
+    def get_state(self) -> dict[str, Any]:
+        """Return all that decides how the records go on."""
+        return {
+            "log": self.log.get_state(),
+            "exchange": self.exchange.get_state(),
+            "rng": copy.deepcopy(self.rng.bit_generator.state),
+            "entries": tuple(self.entries),
+            "next_number": self._next_number,
+        }
+
+    def set_state(self, state: Mapping[str, Any]) -> None:
+        """Go on with what `get_state` returned."""
+        self.log.set_state(state["log"])
+        self.exchange.set_state(state["exchange"])
+        self.rng.bit_generator.state = copy.deepcopy(state["rng"])
+        self.entries = list(state["entries"])
+        self._next_number = state["next_number"]

@@ -1,0 +1,456 @@
+"""`TeamSlam`: robots that start at unknown places, one filter each, until their maps can be aligned and merged.
+
+A group is a set of robots that share a map frame and a joint filter (Sec. 4); at the start each robot is its own
+group. The frame of a group is the start frame of its first robot, the one of lowest index. From time to time one pair
+of groups tries to align its maps (Sec. 3.1); when that succeeds their filters are merged particle by particle
+(Sec. 3.2). A merge can be refused, with a reason: a false merge is worse than a late one. For a while after a merge the
+team watches whether its maps contradict each other, and if they do it undoes the merge. Robots that lose contact with
+their group go on with a fork of the joint filter, which is told on their return what they have read meanwhile.
+"""
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from slam_backend.core.validation import FloatArray, IntArray, bad_argument, check_kind
+from slam_backend.fastslam.consistency import Consistency
+from slam_backend.fastslam.particle_maps import write_outline
+from slam_backend.fastslam.relative_poses import Standpoints
+from slam_backend.fastslam.reports import (
+    Findings,
+    MapDropped,
+    MergeEvent,
+    PoseEstimate,
+    RejuvenationReport,
+    Renaming,
+    TeamReport,
+)
+from slam_backend.fastslam.step_input import StepInput, check_step
+from slam_backend.geometry import inverse
+from slam_backend.maps.alignment import Alignment
+from slam_backend.maps.alignment_types import PairAttempts, count_attempts, refusals_of
+from slam_backend.maps.landmark_map import LandmarkMap, TeamOutlines
+from slam_backend.models.measurements import Measurements, TeamMeasurements
+from slam_backend.team.branches import Branch, restored_filter, take_in
+from slam_backend.team.communication import ExchangeLedger, check_contacts, reach
+from slam_backend.team.filter_merging.merging import inverse_alignment
+from slam_backend.team.group_merging import MergePlan, contradicted, merge_groups, undone
+from slam_backend.team.groups import Group, Lineup
+from slam_backend.team.merge_attempt import attempt
+from slam_backend.team.merge_rollback import Undoing
+from slam_backend.team.state import TeamState
+
+
+class TeamKnowledge(TeamState):
+    """All that can be asked of a team."""
+
+    @property
+    def num_robots(self) -> int:
+        """K."""
+        return self._num_robots
+
+    @property
+    def groups(self) -> tuple[tuple[int, ...], ...]:
+        """The groups, each in ascending order of robots, by ascending first robot."""
+        return self.lineup.groups
+
+    @property
+    def events(self) -> tuple[MergeEvent, ...]:
+        """All attempts, merges and undos so far, in order."""
+        return tuple(self._events)
+
+    @property
+    def pair_attempts(self) -> tuple[PairAttempts, ...]:
+        """What came of the attempts of each pair of groups so far, and why the last one was refused."""
+        return count_attempts(self._events)
+
+    @property
+    def bytes_sent(self) -> IntArray:
+        """(K,) bytes that each robot has sent; `slam_backend.team.communication` says what is counted. A copy."""
+        return np.array(self.exchange.sent, np.int64)
+
+    @property
+    def exchange(self) -> ExchangeLedger:
+        """Counts these bytes; to be looked at."""
+        return self._records.exchange
+
+    @property
+    def maps(self) -> tuple[int, ...]:
+        """Per robot the number of the map that it goes by; see `TeamReport`."""
+        return self.lineup.maps
+
+    @property
+    def diagnostics(self) -> tuple[dict[str, float], ...]:
+        """Per robot: ESS, NIS, landmarks held, and its accepted, new and rejected measurements of the last step.
+
+        Of the whole life of its filter: `nis_mean`, `nis_share`, `ess_share` and `rejected_share` of `Consistency`,
+        and `warnings`, how many there are; `consistency` has their texts.
+        And of all steps so far the attempts of its groups to align maps, and how many were refused for each reason.
+        """
+        rows: list[dict[str, float]] = []
+        for robot in range(self.num_robots):
+            branch, index = self._find(robot)
+            report = branch.report
+            found = np.empty(0, np.int64) if report is None else report.associations[index]
+            made = np.empty(0, np.int64) if report is None else report.created[index]
+            new = int(np.count_nonzero((found >= 0) & (found == made)))
+            told = branch.filter.consistency
+            rows.append(
+                {
+                    "ess": self.ess(robot),
+                    "nis": float("nan") if report is None else report.nis,
+                    "landmarks": float(branch.filter.map_size),
+                    "accepted": float(np.count_nonzero(found >= 0) - new),
+                    "new": float(new),
+                    "rejected": float(np.count_nonzero(found < 0)),
+                    "nis_mean": told.nis_mean,
+                    "nis_share": told.nis_share,
+                    "ess_share": told.ess_share,
+                    "rejected_share": told.rejected_share,
+                    "warnings": float(len(told.warnings)),
+                    **refusals_of(self._events, robot),
+                }
+            )
+        return tuple(rows)
+
+    def consistency(self, robot: int) -> Consistency:
+        """Return whether the filter that a robot goes by errs as little as it claims; see `FastSlam.consistency`."""
+        return self._find(robot)[0].filter.consistency
+
+    def members(self, robot: int) -> tuple[int, ...]:
+        """Return the robots whose places the robot's filter knows, itself included, in ascending order.
+
+        They are its group, but for a robot that has been out of contact since before a merge or an undo: it knows of
+        neither. The map frame is the start frame of the first of them.
+        """
+        return self._find(robot)[0].robots
+
+    def mates(self, robot: int) -> tuple[int, ...]:
+        """Return the robots that go by the same filter as this one now, itself included, in ascending order."""
+        return self._find(robot)[0].live
+
+    def keepers(self, robot: int) -> tuple[int, ...]:
+        """Return the robots that go by the joint filter of a robot's group, in ascending order: it merges by them."""
+        return self._group_of(robot).trunk.live
+
+    def ess(self, robot: int) -> float:
+        """Return the effective sample size of the robot's filter at its last step, in [1, M]."""
+        branch = self._find(robot)[0]
+        return float(branch.filter.num_particles) if branch.report is None else branch.report.ess
+
+    def pose(self, robot: int, seen_by: int | None = None) -> PoseEstimate:
+        """Return the robot's pose in the map frame.
+
+        Args:
+            robot: Whose.
+            seen_by: In whose filter, one of whose `members` is the robot; None: its own. Of a robot out of contact
+                others know where it was when contact was lost.
+
+        Raises:
+            ValueError: If a robot does not exist or that filter does not know it.
+        """
+        branch, index = self._find(robot)
+        if seen_by is not None:
+            branch = self._find(seen_by)[0]
+            if robot not in branch.robots:
+                raise bad_argument("robot", f"one of {branch.robots}", robot, "Ask about members of its filter.")
+            index = branch.robots.index(robot)
+        return branch.filter.pose(index)
+
+    def particles(self, robot: int) -> tuple[FloatArray, FloatArray]:
+        """Return the robot's poses (M, 3), map frame of its group, and their log-weights (M,). Copies."""
+        branch, index = self._find(robot)
+        return branch.filter.particles(index)
+
+    def pose_from_start(self, robot: int) -> PoseEstimate:
+        """Return the robot's pose in its own start frame; see `FastSlam.pose_from_start`."""
+        branch, index = self._find(robot)
+        return branch.filter.pose_from_start(index)
+
+    def particles_from_start(self, robot: int) -> FloatArray:
+        """Return the robot's poses (M, 3) in its own start frame; see `FastSlam.particles_from_start`."""
+        branch, index = self._find(robot)
+        return branch.filter.particles_from_start(index)
+
+    def map(self, robot: int, estimate: Literal["best", "mixture"] = "best", min_count: int = 1) -> LandmarkMap:
+        """Return the map that the robot goes by in its map frame; see `FastSlam.map`."""
+        return self._find(robot)[0].filter.map(estimate, min_count)
+
+    def merged_maps(self, merge: MergeEvent) -> tuple[LandmarkMap, LandmarkMap]:
+        """Return the two maps that a merge joined as they were just before it, straight if they had been straightened.
+
+        Each is in its own frame, under its own ids, and has the rows that the inliers of `merge.alignment` name.
+
+        Raises:
+            ValueError: If it is no merge that is still watched.
+        """
+        check_kind("merge", merge, MergeEvent, "Give one of the events of a step's report.")
+        for group in self._groups:
+            for watch in group.trunk.watches:
+                if watch.alignment is merge.alignment:
+                    map_a, map_b = (restored_filter(side.trunk["filter"]).map() for side in watch.sides)
+                    return map_a, map_b
+        expected, got = "a merge still watched", f"the {merge.kind} of step {merge.step}"
+        raise bad_argument("merge", expected, got, "Ask in the step in which it is made.")
+
+    def start_from_group(self, robot: int) -> FloatArray:
+        """Return (3,) the motion from the map frame of the robot's filter to the robot's own start frame.
+
+        It is that of the most probable particle, so that it fits `map(robot)`.
+        """
+        branch, index = self._find(robot)
+        return inverse(branch.filter.start_pose(index))
+
+    def outlines(self, min_count: int = 1, into: TeamOutlines | None = None) -> TeamOutlines:
+        """Return the outlines of `map(robot, min_count=min_count)` of all robots, much faster.
+
+        Args:
+            min_count: Landmarks that were measured fewer times are left out.
+            into: What this has returned before; it is written to, as long as it has room. None: fresh arrays.
+        """
+        outlines = TeamOutlines.unwritten(self._num_robots, 0) if into is None else into
+        (rows, parts), last = outlines, 0
+        for branch in self.lineup.branches:
+            slam = branch.filter
+            first, last = last, write_outline(slam._maps, slam._best, min_count, rows, last)
+            for robot in branch.live:
+                parts[robot, 0], parts[robot, 1] = first, last
+        if last > len(rows.names):
+            return self.outlines(min_count, TeamOutlines.unwritten(self._num_robots, 2 * last))
+        return outlines
+
+    def standpoints(self, into: Standpoints | None = None) -> Standpoints:
+        """Return where all robots stand: `pose_from_start`, `start_from_group`, `pose` at once.
+
+        Args:
+            into: What this has returned before; it is written to. None: fresh arrays.
+        """
+        points = Standpoints(self._num_robots) if into is None else into
+        for branch in self.lineup.branches:
+            slam, report = branch.filter, branch.report
+            ess = 1.0 if report is None else report.ess / slam.num_particles
+            slam._stand(branch.robots, branch.live, ess, points)
+        return points
+
+    def _group_of(self, robot: int) -> Group:
+        """Return the robot's group."""
+        return self._place(robot)[0]
+
+    def _find(self, robot: int) -> tuple[Branch, int]:
+        """Return the branch that the robot goes by, and its place in it."""
+        return self._place(robot)[1:]
+
+    def _place(self, robot: int) -> tuple[Group, Branch, int]:
+        """Return the robot's group, the branch that it goes by, and its place in that."""
+        if type(robot) is int and 0 <= robot < self._num_robots:
+            return self.lineup.places[robot]
+        if isinstance(robot, (int, np.integer)) and not isinstance(robot, bool) and 0 <= robot < self._num_robots:
+            return self.lineup.places[robot]
+        raise bad_argument("robot", f"an index from 0 to {self.num_robots - 1}", robot, "Count robots from 0.")
+
+
+Rejuvenation = tuple[tuple[int, ...], RejuvenationReport]  # of a filter: who goes by it, and what came of it
+
+
+class TeamSlam(TeamKnowledge):
+    """Visual FastSLAM for a team whose robots do not know where they start.
+
+    Args:
+        num_robots: K.
+        alignment: When two maps are believed to fit together.
+        attempts: When a pair of groups tries.
+        merging: How filters are merged, and when a merge is undone.
+        seed: Of all random streams of the team: an int or a `numpy.random.SeedSequence`.
+        **fastslam_options: Of each filter; the fields of `FilterOptions`.
+
+    Raises:
+        ValueError: If an argument is unknown or out of its range; the text names it.
+    """
+
+    # ------------------------------------------------------------------ one step
+
+    def step(
+        self,
+        odometry: FloatArray | Sequence[ArrayLike | None],
+        measurements: Sequence[Measurements | None] | TeamMeasurements,
+        contacts: ArrayLike | None = None,
+        identities: Sequence[ArrayLike | None] | None = None,
+        poses: Sequence[ArrayLike | None] | None = None,
+    ) -> TeamReport:
+        """Let robots lose and find each other, step each filter, weigh the last merges, and let one pair of groups try.
+
+        Robots pass on what they hear: who reaches another through others is in contact with it. Where robots of a
+        group lose contact, the largest part (of equal ones that with the lowest robot) keeps the joint filter; each
+        other part goes on with a fork of it, and the joint filter holds their poses. On return the joint filter takes
+        in what they have read meanwhile, at most 20 steps of it per step; until it has caught up they go by their
+        fork. Parts that meet away from the joint filter join likewise. Only the robots that keep the joint filter
+        align and merge.
+
+        Args:
+            odometry: Per robot (3,) [m, m, rad], or None; see `FastSlam.step`. (K, 3) where all have moved.
+            measurements: Per robot its frame, or None; or the frames of all in one piece.
+            contacts: (K, K) bool, symmetric: who hears whom now; the diagonal means nothing. None = all.
+            identities: Per robot (n_i,) int, see `FastSlam.step`.
+            poses: Per robot (3,), see `FastSlam.step`.
+
+        Raises:
+            ValueError: If an argument is ill-formed; the team is then as before.
+        """
+        count, networks = self._num_robots, self._together
+        if contacts is not None:
+            networks = reach(check_contacts(contacts, count), count)
+        lineup, size = self.lineup, self._size or self._descriptor_size()
+        camera = lineup.branches[0].filter.options.camera
+        inputs = check_step(count, size, camera, odometry, measurements, identities, poses)
+        records, before = self._records, len(self._events)
+        if contacts is not None or lineup.is_split:
+            lineup = self._regrouped(networks)
+        if lineup.oldest is not None:
+            records.log.record(self._step, inputs)
+        findings, rejuvenations = self._advance(lineup, inputs)
+        if lineup.is_watched:
+            self._doubt()
+        renamings = self._attempt(networks) if self._schedule.is_due(self._step) else ()
+        if self._is_stale:
+            self._settle()
+            lineup = self.lineup
+        oldest = self._step + 1 if lineup.oldest is None else lineup.oldest
+        if lineup is not self._last_lineup:
+            self._note_dropped(lineup)
+            records.log.forget_before(oldest)
+        events, entries = tuple(self._events[before:]), tuple(records.entries)
+        report = TeamReport(
+            self._step, findings, lineup.groups, events, renamings, lineup.maps, entries, oldest, rejuvenations
+        )
+        records.entries.clear()
+        self._step += 1
+        return report
+
+    def _regrouped(self, networks: IntArray) -> Lineup:
+        """Let robots of each group lose and find each other, and return who goes by which filter then."""
+        was_split = self.lineup.is_split
+        for group in self._groups:
+            group.regroup(networks, self._records)
+        if was_split or any(len(group.branches) > 1 for group in self._groups):
+            self._settle()
+        return self.lineup
+
+    def _advance(self, lineup: Lineup, inputs: StepInput) -> tuple[Findings, tuple[Rejuvenation, ...]]:
+        """Step all filters with what their robots have just read; return what `TeamReport` tells of it."""
+        step, records, findings = self._step, self._records, Findings.none_yet(inputs)
+        rejuvenations: tuple[Rejuvenation, ...] = ()
+        for branch, intake in zip(lineup.branches, lineup.intakes, strict=True):
+            report = take_in(branch, step, intake, inputs, findings)
+            if report.num_created:
+                records.note_created(branch.number, step, report)
+            if len(intake.robots) > 1:  # a robot that nobody hears sends nothing
+                records.exchange.record_step(report, branch.filter.descriptor_size)
+            if report.rejuvenation is not None:
+                rejuvenations += ((intake.robots, report.rejuvenation),)
+        findings.close()
+        return findings, rejuvenations
+
+    def merge(self, robot_a: int, robot_b: int, alignment: Alignment, known: bool = False) -> Renaming:
+        """Merge the joint filters of two robots' groups with a given alignment, unasked whether it is right.
+
+        The merge is then watched like any other; `MergeOptions(watch_steps=0)` makes it final.
+
+        Args:
+            robot_a: A robot of one group that goes by its joint filter.
+            robot_b: Such a robot of the other.
+            alignment: Motion from the map frame of b's group to that of a's; `inliers` are rows of `map(robot_a)` and
+                `map(robot_b)`, none if the landmarks in common are not known.
+            known: The motion is drawn from the alignment's covariance as it stands. Else the landmarks in common
+                correct it, for each pair of particles by itself, and the covariance counts where they are few.
+
+        Returns:
+            How landmark ids changed; `robots_a` is the group whose frame stays, the one with the lowest robot.
+
+        Raises:
+            ValueError: If the robots share a group already, or one is out of contact with its joint filter, or the
+                alignment is a refusal or names rows that do not exist or the same one twice; the team is then as
+                before.
+        """
+        groups = self._group_of(robot_a), self._group_of(robot_b)
+        if groups[0] is groups[1]:
+            expected = f"a robot outside the group {groups[0].robots}"
+            raise bad_argument("robot_b", expected, robot_b, "They share a map already.")
+        for name, robot, group in zip(("robot_a", "robot_b"), (robot_a, robot_b), groups, strict=True):
+            if robot not in group.trunk.live:
+                cure = "Merge through a robot that goes by the joint filter."
+                raise bad_argument(name, f"one of {group.trunk.live}", robot, cure)
+        if not isinstance(alignment, Alignment) or not alignment.success:
+            got = f"a refusal ({alignment.reason})" if isinstance(alignment, Alignment) else alignment
+            raise bad_argument("alignment", "a successful Alignment", got, "Align the two maps first.")
+        if groups[1].robots < groups[0].robots:
+            groups, alignment = groups[::-1], inverse_alignment(alignment)
+        renaming = self._merge(MergePlan.of(*groups, alignment), known)
+        self._settle()
+        return renaming
+
+    def _merge(self, plan: MergePlan, known: bool = False) -> Renaming:
+        """Merge two groups as planned, and write it down."""
+        epoch = self._epoch + 1
+        joint, renaming = merge_groups(plan, self._merging, self._records, self._rng, epoch, known)
+        self._epoch = epoch
+        self._events.append(MergeEvent(self._step, "merge", renaming.robots_a, renaming.robots_b, plan.alignment))
+        self._replace(plan.groups, [joint])
+        return renaming
+
+    def _replace(self, old: Sequence[Group], new: Sequence[Group]) -> None:
+        """Put some groups in the place of others."""
+        self._groups = [group for group in self._groups if all(group is not other for other in old)] + list(new)
+        self._groups.sort(key=lambda group: group.robots)
+        self._is_stale = True
+
+    def _doubt(self) -> None:
+        """Weigh the evidence about the merges that can still be undone, and undo what contradicts itself."""
+        due = self._step % self._merging.watch_every == 0
+        for group in list(self._groups):
+            if due and group.undoing is None:
+                false = contradicted(group.trunk, self._merging, self._alignment)
+                group.undoing = None if false is None else Undoing.of(group.trunk, false.number)
+            if group.undoing is not None:
+                self._undo(group, group.undoing)
+                continue
+            for branch in group.branches:
+                while branch.watches and branch.watches[0].steps >= self._merging.watch_steps:
+                    branch.watches.pop(0)
+                    self._is_stale = True
+
+    def _undo(self, group: Group, undoing: Undoing) -> None:
+        """Go on with taking back a merge; it is done when all sides have caught up and are in contact."""
+        merges = undoing.merges(group.trunk)
+        if not merges:  # the joint filter is another one now, whose window is over
+            group.undoing, self._is_stale = None, True
+            return
+        caught_up = undoing.catch_up(group.trunk, self._records.log)
+        if not caught_up or not all(watch.together(group.trunk.live) for watch in merges):
+            return
+        self._epoch += 1
+        self._replace([group], undone(group, undoing, self._records, self._epoch))
+        for watch in merges:
+            pair = (watch.sides[0].robots, watch.sides[1].robots)
+            self._events.append(MergeEvent(self._step, "undo", *pair, watch.alignment))
+        self._schedule.bar(pair, self._step + self._merging.barred_steps)
+
+    def _attempt(self, networks: IntArray) -> tuple[Renaming, ...]:
+        """Let a pair of groups try, and merge those whose attempt is a success."""
+        options = self._schedule, self._alignment, self._merging
+        tried = attempt(self._groups, networks, self._step, *options, self._records, self._rng)
+        if tried is None:
+            return ()
+        self._events.append(tried.event)
+        return () if tried.plan is None else (self._merge(tried.plan),)
+
+    def _note_dropped(self, lineup: Lineup) -> None:
+        """Write down which maps are gone since the last lineup."""
+        self._records.entries += [MapDropped(number) for number in sorted(self._numbers - lineup.numbers)]
+        self._last_lineup, self._numbers = lineup, lineup.numbers
+
+    def _descriptor_size(self) -> int:
+        """Return the length of the descriptors in use, 0 before the first one; it stays the same from there on."""
+        self._size = max([branch.filter.descriptor_size for branch in self.lineup.branches])
+        return self._size

@@ -1,0 +1,91 @@
+"""All kernels of the backend are compiled, or loaded from the cache, before anything waits for them."""
+
+from typing import Literal
+
+import numpy as np
+
+from slam_backend.core import state_checks
+from slam_backend.core.compilation import watch_compilation
+from slam_backend.fastslam.existence import ExistenceModel
+from slam_backend.fastslam.filter import FastSlam
+from slam_backend.fastslam.state_checks import are_linked
+from slam_backend.frontend import StereoFrontEnd
+from slam_backend.maps.alignment import align_maps
+from slam_backend.metrics.maps import map_error
+from slam_backend.models.camera import StereoCamera
+from slam_backend.models.measurements import Measurements, TeamMeasurements
+from slam_backend.smoother import gauge as holding
+from slam_backend.smoother._kernels import look_at_keys
+from slam_backend.smoother.graph import PathGraph
+from slam_backend.smoother.graph_building import Guesses
+from slam_backend.smoother.options import SmoothingOptions
+from slam_backend.smoother.reassociation import find_only
+from slam_backend.smoother.sampling import bend
+from slam_backend.team.merge_scheduler import AttemptOptions
+from slam_backend.team.options import MergeOptions
+from slam_backend.team.team import TeamSlam
+
+PROPOSALS: tuple[Literal["fastslam2", "fastslam1"], ...] = ("fastslam2", "fastslam1")
+STEPS = 4
+LANDMARKS = 12  # more than an alignment asks for
+
+
+def warm_up() -> float:
+    """Run tiny filters, a tiny team and a tiny pair of images along all paths that end in a kernel.
+
+    Kernels are kept in numba's cache: beside the package if its folder can be written, else in the user's own cache
+    folder, or where the variable NUMBA_CACHE_DIR says. A new version of the package, of numba or another processor
+    begins anew.
+
+    Returns:
+        Seconds spent compiling; 0 if all kernels came from the cache.
+    """
+    with watch_compilation(lambda name: None) as watch:
+        angles = np.linspace(0.0, 2.0 * np.pi, LANDMARKS, endpoint=False)
+        points = np.column_stack([2.0 * np.cos(angles), np.sin(angles), np.linspace(4.0, 6.0, LANDMARKS)])
+        descriptors = np.eye(LANDMARKS, dtype=np.float32)
+        names, some = np.arange(LANDMARKS), np.arange(LANDMARKS) - 1  # one of the latter is to be rejected
+        plain = Measurements(points, descriptors)
+        given = Measurements(points, descriptors, np.tile(1e-4 * np.eye(3), (LANDMARKS, 1, 1)))
+        move, still = np.array([0.0, 0.0, 0.01]), np.zeros(3)
+        for proposal in PROPOSALS:
+            for frame in (plain, given):
+                slam = FastSlam(2, num_particles=4, proposal=proposal, resample_threshold=1.0)
+                slam.step([None, None], [frame, None])
+                for _ in range(STEPS):
+                    slam.step([move, None], [frame, frame])
+                slam.step([None, None], [frame, frame], [names, some], [still, None])
+                slam.step([move, move], [None, None])
+        watching = FastSlam(num_particles=4, existence=ExistenceModel(), resample_threshold=1.0)
+        for _ in range(STEPS):
+            watching.step([move], [plain])
+        few_keys = SmoothingOptions(max_keys=2, fresh_keys=1)  # logs come in parts, between which keys are joined
+        smoothing = FastSlam(num_particles=4, rejuvenate_every=STEPS + 1, smoothing=few_keys)
+        for _ in range(2 * (STEPS + 1)):
+            smoothing.step([move], [plain])
+        for slam in (watching, smoothing):
+            slam.set_state(slam.get_state())
+        state_checks.warm()
+        root = np.array([-1])
+        are_linked(root, root)  # of a state that was a pickle
+        root.setflags(write=False)
+        are_linked(root, root)
+        bend(np.zeros((1, 3)), root, np.zeros((1, 3, 1)))
+        PathGraph.at_starts(np.zeros((1, 3))).known_as(names)  # of groups that merge
+        Guesses.none().at(root)  # of what was refused
+        find_only(points, descriptors, points, descriptors, 1.0, 1.0, names.copy())
+        look_at_keys(root, root[:0], 1, 1, np.empty(1, dtype=np.bool_), np.empty(1, dtype=np.bool_))  # and contradicted
+        holding.move(np.zeros((1, 3, 1)), np.zeros((1, 3)), np.zeros((1, 3, 1)))  # of starts that are sought
+        team = TeamSlam(2, num_particles=4, attempts=AttemptOptions(every=1), merging=MergeOptions(watch_every=1))
+        for _ in range(STEPS):
+            team.step([None, None], [plain, plain])
+        both = np.tile(points, (2, 1)), np.tile(descriptors, (2, 1))
+        team.step(np.zeros((2, 3)), TeamMeasurements(*both, np.array([LANDMARKS, 2 * LANDMARKS])))
+        team.standpoints(), team.outlines()
+        own = team.map(0)
+        map_error(own.means, names, points)
+        align_maps(own, own, "clique")
+        blocks = np.kron(np.random.default_rng(0).integers(0, 256, (8, 12)), np.ones((12, 12))).astype(np.uint8)
+        eye = StereoFrontEnd(StereoCamera(focal_px=100.0, width=128, height=96))
+        eye.measure(blocks[:, :128], blocks[:, 8:136])
+    return watch.seconds
