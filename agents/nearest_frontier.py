@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend.core.validation import FloatArray
-from vslam_env.belief import Belief
+from vslam_env.belief.team_belief import Belief
 from vslam_env.navigation import centre_of, distance_map, follow_path, plan_path
 
 WORTH_TURNING = 0.5  # leave a goal for one whose path is less than this share of the way that is left

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from vslam_env.belief import Belief
+from vslam_env.belief.team_belief import Belief
 
 
 class RandomGoals:

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam_env.belief import Belief
+from vslam_env.belief.team_belief import Belief
 
 MEAN_STRAIGHT, MEAN_TURN = 20, 8  # ticks
 AHEAD, LEFT, RIGHT = 1, 2, 3  # discrete actions

@@ -14,7 +14,7 @@ from agents.goal_network import NAMES, SHAPES, Weights, logits
 from slam_backend.core.array_files import read_arrays
 from slam_backend.core.files import write_file
 from slam_backend.core.validation import bad_argument
-from vslam_env.belief import Belief
+from vslam_env.belief.team_belief import Belief
 
 FORMAT = 1  # raised when the network, or what observations mean, changes
 SUFFIX = ".npz"

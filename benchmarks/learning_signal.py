@@ -38,7 +38,7 @@ from training.experiments.statistics import mean_of, shown
 from training.experiments.tables import markdown_table
 from training.rl.config import SPLIT_TRAIN, TrainConfig
 from vslam_env import ExplorationEnv, vslam_v0
-from vslam_env.belief import Belief
+from vslam_env.belief.team_belief import Belief
 from vslam_env.reward import RUNNING_COST
 
 TERMS = ("map_error", "coverage", "own_coverage")

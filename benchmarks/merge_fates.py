@@ -17,7 +17,7 @@ from slam_backend.geometry import between
 from slam_backend.team.merge_monitor import moved_share
 from slam_backend.team.team import TeamSlam
 from training.episodes.runner import is_false_merge
-from vslam_env.errors_of_maps import FALSE, ClaimLedger
+from vslam_env.evaluation.map_scores import FALSE, ClaimLedger
 
 WINDOW = 200  # [steps] after which a false merge counts
 

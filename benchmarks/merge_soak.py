@@ -50,7 +50,7 @@ from training.episodes.metrics import score_episode
 from training.episodes.runner import Progress, is_false_merge, run_episode
 from training.experiments.run_folder import plain
 from vslam_env import ExplorationEnv, preset_config
-from vslam_env.errors_of_maps import ClaimLedger
+from vslam_env.evaluation.map_scores import ClaimLedger
 
 KINDS = ("aisles", "environment", "both")
 WORLDS = ("office", "loops", "maze", "hall", "fig5")

@@ -6,12 +6,12 @@ Importing it registers `vslam_env/Exploration-v0` with PettingZoo and `vslam_env
 import gymnasium
 import pettingzoo
 
-from vslam_env.belief import Belief
+from vslam_env.belief.team_belief import Belief
 from vslam_env.config import EnvConfig
 from vslam_env.environment import ExplorationEnv
 from vslam_env.presets import preset_config, stereo_belief
 from vslam_env.snapshots import load_state, save_state
-from vslam_env.warming import warm_up
+from vslam_env.warm_up import warm_up
 from vslam_env.world import World
 
 __all__ = [

@@ -7,7 +7,7 @@ import numpy as np
 from gymnasium import spaces
 
 from slam_backend.core.validation import FloatArray, bad_argument, check_array
-from vslam_env.observation import NUM_ACTIONS
+from vslam_env.belief.observation import NUM_ACTIONS
 
 MAX_SPEED, MAX_REVERSE, MAX_TURN = 1.0, 0.3, 1.5  # [m/s], [m/s], [rad/s]
 DISCRETE_COMMANDS = ((0.0, 0.0), (MAX_SPEED, 0.0), (0.0, MAX_TURN), (0.0, -MAX_TURN))  # stay ahead left right

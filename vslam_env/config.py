@@ -1,20 +1,90 @@
 """`EnvConfig`: everything that defines an environment, frozen and validated, with a TOML form."""
 
+import dataclasses
+import json
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Literal, Self, TypeVar
 
+import numpy as np
 import tomli_w
-from pydantic import ConfigDict
+from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from slam_backend.core.validation import bad_argument, check_choice, check_float, check_int
-from vslam_env import _config_values as nested
-from vslam_env.robot_belief import BeliefConfig
+from vslam_env.belief.belief import BeliefConfig
 from vslam_env.sensors import LandmarkSensorConfig, ScanConfig, StereoSensorConfig
 from vslam_env.world import SPLITS, LandmarkConfig, OdometryNoise
 from vslam_env.world.spec import LARGEST_EXTENT
+
+T = TypeVar("T")
+
+NONE = "none"  # what TOML, which has no word for it, says for None
+
+
+def validated(cls: type[T], values: Mapping[str, Any]) -> T:
+    """Build `cls` from nested dicts, or raise the project's one error for the first thing that is wrong."""
+    try:
+        text = json.dumps(plain(values), default=str)
+    except (ValueError, RecursionError) as error:  # an int of 5000 digits, or a part that holds itself
+        raise bad_argument("config", "values that JSON can hold", "no such values", f"It says: {error}.") from error
+    try:
+        # Strict on JSON refuses 2.0, "2" and True as ints, but takes dicts for parts, lists for tuples, int for float.
+        return TypeAdapter(cls).validate_json(text, strict=True)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        own = first.get("ctx", {}).get("error")
+        if isinstance(own, ValueError):  # raised by a check of ours, which explains itself
+            raise own from None
+        name = ".".join(str(part) for part in first["loc"])
+        if first["type"] == "unexpected_keyword_argument":
+            raise bad_argument(name, "a known field", first["input"], "Check the spelling.") from None
+        expected = first["msg"].removeprefix("Input should be ")
+        raise bad_argument(name, expected, first["input"], "Correct this value.") from None
+
+
+def plain(value: Any) -> Any:
+    """Turn nested configurations into dicts, lists and numbers."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+    if isinstance(value, Mapping):
+        return {key: plain(entry) for key, entry in value.items()}
+    if isinstance(value, tuple):
+        return [plain(entry) for entry in value]
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def merged(values: dict[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return nested dicts with some entries changed; weights of rewards are replaced as a whole."""
+    result = dict(values)
+    for key, change in changes.items():
+        change = plain(change)
+        nested = isinstance(change, dict) and isinstance(result.get(key), dict) and key != "reward"
+        result[key] = merged(result[key], change) if nested else change
+    return result
+
+
+def without_none(values: Mapping[str, Any], standard: Any) -> dict[str, Any]:
+    """Return nested dicts without None: left out where the standard is None or knows no such entry, else `NONE`."""
+    usual = standard if isinstance(standard, Mapping) else {}
+    result: dict[str, Any] = {}
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            result[key] = without_none(value, usual.get(key))
+        elif value is not None:
+            result[key] = value
+        elif usual.get(key) is not None:
+            result[key] = NONE
+    return result
+
+
+def with_none(values: Any) -> Any:
+    """Turn the text `NONE` into None in nested dicts."""
+    if isinstance(values, Mapping):
+        return {key: with_none(value) for key, value in values.items()}
+    return None if values == NONE else values
+
 
 FORMAT = 1  # of TOML files; raised when what a field means changes
 ACTION_TYPES = ("continuous", "discrete", "goal")
@@ -174,12 +244,12 @@ class EnvConfig:
         Raises:
             ValueError: If a field is unknown or a value is refused; the text names it.
         """
-        return nested.validated(type(self), nested.merged(nested.plain(self), changes))
+        return validated(type(self), merged(plain(self), changes))
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
         """Build a configuration from nested dicts; what is left out has the value of the `standard` preset."""
-        return nested.validated(cls, nested.merged(nested.plain(cls()), values))
+        return validated(cls, merged(plain(cls()), values))
 
     @classmethod
     def from_toml(cls, path: str | Path) -> Self:
@@ -212,12 +282,12 @@ class EnvConfig:
         if type(found) is not int or found != FORMAT:
             cure = "Use the release that wrote it, or set the values again."
             raise bad_argument("config", f"one of format {FORMAT}", f"a configuration of format {found!r}", cure)
-        return cls.from_dict(nested.with_none(values))
+        return cls.from_dict(with_none(values))
 
     def to_toml(self) -> str:
         """Return the configuration as TOML, with the number of its format.
 
         None is left out where it is the standard, else it is the text "none".
         """
-        values = nested.without_none(nested.plain(self), nested.plain(type(self)()))
+        values = without_none(plain(self), plain(type(self)()))
         return tomli_w.dumps({"format": FORMAT} | values)

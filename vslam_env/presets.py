@@ -7,8 +7,8 @@ from slam_backend.core.validation import check_choice
 from slam_backend.fastslam.existence import ExistenceModel
 from slam_backend.frontend import KINDS
 from slam_backend.models.odometry import OdometryModel
+from vslam_env.belief.belief import BeliefConfig
 from vslam_env.config import SENSORS, EnvConfig
-from vslam_env.robot_belief import BeliefConfig
 from vslam_env.sensors import StereoSensorConfig
 
 PRESETS = ("easy", "standard", "hard")

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from slam_backend.core.validation import bad_argument, check_array, check_float
-from vslam_env.standing import (
+from vslam_env.evaluation.team_metrics import (
     COLLISIONS,
     DISTANCES,
     ERROR_INTEGRALS,

@@ -15,11 +15,11 @@ from slam_backend.core.files import refusing, write_file
 from slam_backend.core.state_checks import check_kind, check_whole, refuse
 from slam_backend.core.state_codec import ForeignObjectError, decoded, encoded, read_file, sequence_of
 from slam_backend.core.validation import bad_argument
-from vslam_env._state_checks import EpisodeCheck, check_drivers, check_standing
 from vslam_env.config import EnvConfig
-from vslam_env.episode import Episode
 from vslam_env.reward import RewardTerm, is_named
-from vslam_env.setting import Setting
+from vslam_env.simulation.episode import Episode
+from vslam_env.simulation.scenario import Setting
+from vslam_env.state_checks import EpisodeCheck, check_drivers, check_standing
 from vslam_env.state_kinds import ENV_KINDS
 from vslam_env.world import WorldSource
 

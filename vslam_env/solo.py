@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from slam_backend.core.validation import bad_argument, check_int
 from slam_backend.fastslam.reports import MergeEvent
-from vslam_env.belief import Belief
+from vslam_env.belief.team_belief import Belief
 from vslam_env.config import EnvConfig
 from vslam_env.environment import ExplorationEnv
 from vslam_env.vslam_v0 import parallel_env

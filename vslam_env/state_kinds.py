@@ -4,16 +4,15 @@ from slam_backend.core.state_codec import Kind, Kinds
 from slam_backend.frontend import CornerOptions, FrontEndOptions, StereoFrame
 from slam_backend.frontend.stereo import StereoMatches
 from slam_backend.state_kinds import BACKEND_KINDS
+from vslam_env.belief.belief import BeliefConfig
+from vslam_env.belief.readings import TeamReadings
+from vslam_env.belief.shared_grids import Kept, Strokes
 from vslam_env.config import EnvConfig
-from vslam_env.readings import TeamReadings
-from vslam_env.robot_belief import BeliefConfig
+from vslam_env.evaluation.team_metrics import Standing
 from vslam_env.sensors import EyeFrames, Frames, LandmarkSensorConfig, ScanConfig, StereoSensorConfig
-from vslam_env.sensors.stereo_camera import ImagingConfig
-from vslam_env.sensors.stereo_textures import TextureConfig, WallTextures
-from vslam_env.setting import Setting
-from vslam_env.shared_grids import Kept
-from vslam_env.standing import Standing
-from vslam_env.strokes import Strokes
+from vslam_env.sensors.stereo.cameras import ImagingConfig
+from vslam_env.sensors.stereo.textures import TextureConfig, WallTextures
+from vslam_env.simulation.scenario import Setting
 from vslam_env.world import LandmarkConfig, Landmarks, OdometryNoise, World
 
 CONFIGURATIONS = (

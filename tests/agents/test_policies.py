@@ -7,7 +7,7 @@ from agents import POLICIES, make_policy
 from agents.nearest_frontier import choose_slot, far_place
 from slam_backend.geometry import compose
 from vslam_env import ExplorationEnv, World, vslam_v0
-from vslam_env.belief import Belief, Teammate
+from vslam_env.belief.team_belief import Belief, Teammate
 from vslam_env.navigation import SeenGrid, cell_of, plan_path
 
 ROOM = World("room", [[0, 0, 11, 0], [11, 0, 11, 9], [11, 9, 0, 9], [0, 9, 0, 0], [5, 0, 5, 5]])

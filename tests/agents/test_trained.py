@@ -13,7 +13,7 @@ from agents import make_policy
 from agents.goal_network import CHANNELS, CONTEXT, PATCHES, PICTURE_SIZE, SHAPES, VECTOR_SIZE, logits
 from agents.trained import FORMAT, TrainedGoals, check_observation, load_model, save_model
 from vslam_env import vslam_v0
-from vslam_env.observation import observation_space
+from vslam_env.belief.observation import observation_space
 
 SPACE = observation_space(32, 8.0, True, False)
 ABOUT = {"version": "0", "environment": ""}

@@ -11,7 +11,7 @@ from agents import make_policy
 from training.cli import app
 from training.episodes.teleoperation import action_of, drive
 from vslam_env import vslam_v0
-from vslam_env.window import Window
+from vslam_env.rendering.window import Window
 
 runner = CliRunner()
 

@@ -33,7 +33,7 @@ from training.rl.config import TrainConfig
 from training.rl.network import GoalPolicy
 from training.rl.trainer import Training, as_arrays, as_tensors, check_device, kept_of
 from training.vec_env import ExplorationVecEnv
-from vslam_env.observation import observation_space
+from vslam_env.belief.observation import observation_space
 from vslam_env.state_kinds import ENV_KINDS
 
 SMOKE = TrainConfig.from_mapping({"preset": "smoke", "seed": 5})

@@ -5,8 +5,8 @@ import numpy as np
 from slam_backend.core.validation import FloatArray
 from slam_backend.fastslam.relative_poses import Standpoints
 from slam_backend.maps.landmark_map import TeamOutlines
-from vslam_env.errors_of_maps import ClaimLedger
-from vslam_env.standing import NUM_FIGURES, Standing
+from vslam_env.evaluation.map_scores import ClaimLedger
+from vslam_env.evaluation.team_metrics import NUM_FIGURES, Standing
 
 
 def standing_at(starts: FloatArray) -> Standpoints:

@@ -4,7 +4,7 @@ import numpy as np
 from python_entry import python_entry
 from scipy.optimize import linear_sum_assignment
 
-from vslam_env.navigation._search_kernels import SAME_GOAL, weigh_pairs
+from vslam_env.navigation._planning_kernels import SAME_GOAL, weigh_pairs
 from vslam_env.navigation.candidate_slots import NUM_SLOTS, _of_least_total
 
 weigh_pairs = python_entry(weigh_pairs)

@@ -12,9 +12,9 @@ from slam_backend.fastslam.reports import MergeEvent
 from slam_backend.geometry import between
 from slam_backend.maps.alignment import Alignment
 from vslam_env import ExplorationEnv
-from vslam_env.belief import TeamBelief
-from vslam_env.communication import contacts, crosses_wall
-from vslam_env.observation import observe
+from vslam_env.belief.observation import observe
+from vslam_env.belief.team_belief import TeamBelief
+from vslam_env.simulation.communication import contacts, crosses_wall
 
 POSES = np.array([[1.0, 1.0, 0.3], [4.0, 5.0, 2.0], [1.0, 9.0, -1.0]])  # the wall at y = 7 cuts the third off
 

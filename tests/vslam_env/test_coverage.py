@@ -4,7 +4,7 @@ import numpy as np
 
 from slam_backend.core.validation import FloatArray
 from tests.vslam_env.small_env import small_env
-from vslam_env.coverage import SEERS, Coverage, CoverageMeter
+from vslam_env.evaluation.coverage import SEERS, Coverage, CoverageMeter
 from vslam_env.navigation import TeamGrids
 
 STARTS = np.array([[1.0, 2.0, 0.0], [7.0, 2.0, np.pi]])

@@ -10,8 +10,8 @@ from slam_backend.fastslam.reports import Findings, LandmarksCreated, MapCopied,
 from slam_backend.geometry import compose, inverse, transform_points, wrap_angle
 from slam_backend.maps.landmark_map import LandmarkMap, TeamOutlines
 from slam_backend.metrics import gospa, map_error, map_rmse
-from vslam_env.coverage import Coverage, CoverageMeter
-from vslam_env.errors_of_maps import ClaimLedger
+from vslam_env.evaluation.coverage import Coverage, CoverageMeter
+from vslam_env.evaluation.map_scores import ClaimLedger
 from vslam_env.navigation import FREE, SeenGrid, TeamGrids, cell_of
 
 TRUTHS = np.array([[0.0, 0.0, 0.0], [5.0, 0.0, 0.3], [0.0, 6.0, -0.2], [7.0, 7.0, 0.0], [9.0, 1.0, 0.0]])

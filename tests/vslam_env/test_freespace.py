@@ -8,7 +8,7 @@ import pytest
 from slam_backend.models.camera import StereoCamera
 from vslam_env.sensors import LandmarkSensor, LandmarkSensorConfig
 from vslam_env.world import FreeSpace, Landmarks, World, make_world, place_landmarks
-from vslam_env.world.clearance import distances_to_walls
+from vslam_env.world._kernels.clearance import distances_to_walls
 
 # A 6 x 3 m hall with a 1 m door in the wall x = 4, a closed closet in a corner, and a wall outside.
 HALL = [

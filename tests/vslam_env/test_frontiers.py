@@ -18,9 +18,9 @@ from vslam_env.navigation import (
     follow_path,
     plan_path,
 )
-from vslam_env.navigation._painting_kernels import known_bounds
-from vslam_env.navigation._search_kernels.boxes import OUTSIDE, PAD, known_box
-from vslam_env.navigation._search_kernels.frontiers import _unseen_edges
+from vslam_env.navigation._grid_kernels import known_bounds
+from vslam_env.navigation._planning_kernels.costmap import OUTSIDE, PAD, known_box
+from vslam_env.navigation._planning_kernels.frontiers import _unseen_edges
 
 _unseen_edges, known_box = map(python_entry, (_unseen_edges, known_box))
 

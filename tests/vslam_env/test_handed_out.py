@@ -12,7 +12,7 @@ from digests import digest
 from small_env import MEETING, small_env, turning, wander
 
 from vslam_env import ExplorationEnv
-from vslam_env.belief import TeamBelief
+from vslam_env.belief.team_belief import TeamBelief
 
 STEPS = {"continuous": 130, "discrete": 130, "goal": 25}  # two robots meet, and their maps are merged
 

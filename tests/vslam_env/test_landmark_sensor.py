@@ -16,7 +16,7 @@ from slam_backend.models.camera import StereoCamera
 from vslam_env.sensors import LandmarkSensor, LandmarkSensorConfig
 from vslam_env.sensors._landmark_kernels import NEAREST, make_up, measure, mix_in
 from vslam_env.world import FreeSpace, Landmarks, World, make_world, place_landmarks
-from vslam_env.world.sight_kernels import choose, detect
+from vslam_env.world._kernels import choose, detect
 from vslam_env.world.visibility import marks_of, view_limits, visible_landmarks
 
 choose = python_entry(choose)

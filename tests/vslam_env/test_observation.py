@@ -7,10 +7,10 @@ from small_env import MEETING, small_env, turning, wander
 
 from slam_backend.geometry import between, inverse, transform_points
 from vslam_env import ExplorationEnv
-from vslam_env.belief import Belief, TeamBelief
+from vslam_env.belief.observation import flatten, observe
+from vslam_env.belief.readings import Readings, TeamReadings
+from vslam_env.belief.team_belief import Belief, TeamBelief
 from vslam_env.navigation import CELL, FREE, GRID_SIZE, OCCUPIED, UNKNOWN, cell_of
-from vslam_env.observation import flatten, observe
-from vslam_env.readings import Readings, TeamReadings
 
 KEYS = ["pose", "pose_std", "map_stats", "local_grid", "scan", "candidates", "teammates", "teammates_mask"]
 

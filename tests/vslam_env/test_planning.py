@@ -23,10 +23,9 @@ from vslam_env.navigation import (
     follow_path,
     plan_path,
 )
-from vslam_env.navigation._painting_kernels import known_bounds
-from vslam_env.navigation._search_kernels.boxes import OUTSIDE, PAD, known_box
-from vslam_env.navigation._search_kernels.ways import UNREACHED, parents_of, wavefront
-from vslam_env.navigation._search_kernels.weights import CLOSE, NEAR, OPEN, weigh
+from vslam_env.navigation._grid_kernels import known_bounds
+from vslam_env.navigation._planning_kernels.costmap import CLOSE, NEAR, OPEN, OUTSIDE, PAD, known_box, weigh
+from vslam_env.navigation._planning_kernels.dijkstra import UNREACHED, parents_of, wavefront
 
 known_box, wavefront, weigh = map(python_entry, (known_box, wavefront, weigh))
 

@@ -8,7 +8,7 @@ from hypothesis.extra.numpy import arrays
 
 from vslam_env.rendering import MergeFlash, RobotView, Scene, draw_frame
 from vslam_env.rendering.canvas import CHI_SQUARE_95, Viewport, dots, ellipse_outlines, veils
-from vslam_env.rendering.flash import FLASH_TICKS, caption
+from vslam_env.rendering.merge_effect import FLASH_TICKS, caption
 from vslam_env.rendering.palette import ROBOTS, robot_colour
 
 WALLS = np.array([[0.0, 0.0, 13.0, 0.0], [13.0, 0.0, 13.0, 11.0], [4.0, 11.0, 4.0, 6.0]])

@@ -13,10 +13,9 @@ from slam_backend.maps.alignment import Alignment
 from slam_backend.maps.landmark_map import LandmarkMap, TeamOutlines
 from vslam_env import ExplorationEnv, vslam_v0
 from vslam_env.config import TICK
-from vslam_env.errors_of_maps import ClaimLedger
-from vslam_env.oracle import true_alignment
+from vslam_env.evaluation.map_scores import FALSE, ClaimLedger
 from vslam_env.reward import POTENTIALS, RUNNING_COST, TERMS, Standing, evaluate, make_terms
-from vslam_env.scoring import FALSE
+from vslam_env.simulation.episode import true_alignment
 
 FIGURES: dict[str, list[float]] = {  # in the order of their rows
     "map_errors": [0.7, 0.6],

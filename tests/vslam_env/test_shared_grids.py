@@ -8,10 +8,9 @@ from small_env import MEETING, small_env, turning
 from slam_backend.fastslam.relative_poses import Standpoints
 from slam_backend.fastslam.reports import Findings, MergeUndone, Renaming, TeamReport
 from slam_backend.geometry import between, compose, inverse
+from vslam_env.belief.belief import Body
+from vslam_env.belief.shared_grids import LONGEST_ABSENCE, SharedGrids, Strokes, Telling, caught_up
 from vslam_env.navigation import OCCUPIED, UNKNOWN
-from vslam_env.robot_belief import Body
-from vslam_env.shared_grids import LONGEST_ABSENCE, SharedGrids
-from vslam_env.strokes import Strokes, Telling, caught_up
 
 BODY = Body(radius=0.2, ray_angles=ANGLES, scan_range=MAX_RANGE)
 STARTS = np.array([[7.3, 2.5, 1.5], [8.6, 1.8, 2.1], [6.2, 2.9, -2.0]])  # of three robots, in one room of the building

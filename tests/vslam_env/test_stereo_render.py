@@ -7,8 +7,8 @@ import pytest
 
 from slam_backend.frontend import StereoFrontEnd
 from slam_backend.models.camera import StereoCamera
-from vslam_env.sensors.stereo_camera import ImagingConfig, StereoEye
-from vslam_env.sensors.stereo_textures import STYLES, TextureConfig, draw_textures
+from vslam_env.sensors.stereo.cameras import ImagingConfig, StereoEye
+from vslam_env.sensors.stereo.textures import STYLES, TextureConfig, draw_textures
 
 CAMERA = StereoCamera(focal_px=80.0, baseline=0.12, width=90, height=60, mount=(0.1, -0.05, 0.2))
 # A room of 5 x 4 m with a wall in it; one wall of the room runs the other way round.

@@ -7,7 +7,7 @@ from slam_backend.frontend import FrontEndOptions
 from slam_backend.geometry import transform_points
 from slam_backend.metrics import gospa, map_error
 from slam_backend.models.camera import StereoCamera
-from vslam_env.sensors.stereo_sensor import EyeFrame, StereoSensor, StereoSensorConfig
+from vslam_env.sensors.stereo.sensor import EyeFrame, StereoSensor, StereoSensorConfig
 from vslam_env.world import FreeSpace, World
 
 ROOM = World("room", [[0, 0, 7, 0], [7, 0, 7, 5], [7, 5, 0, 5], [0, 5, 0, 0], [2.5, 2.0, 2.5, 3.0]])

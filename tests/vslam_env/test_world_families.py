@@ -11,9 +11,9 @@ import pytest
 from small_env import WALLS, room, small_env
 
 from vslam_env import EnvConfig, World, vslam_v0
-from vslam_env.setting import draw_setting
+from vslam_env.simulation.scenario import draw_setting
 from vslam_env.world import SPLITS, WORLD_FAMILIES, FreeSpace, draw_world_seed, make_world, save_walls_json
-from vslam_env.world.splits import files_of_split
+from vslam_env.world.loaders.splits import files_of_split
 
 FAMILIES = sorted(WORLD_FAMILIES)
 

@@ -27,7 +27,7 @@ def drive_by_hand(
     from training.episodes.video import VideoWriter
     from training.experiments.interrupt import interrupt_flag
     from vslam_env import vslam_v0
-    from vslam_env.window import Window, why_no_window
+    from vslam_env.rendering.window import Window, why_no_window
 
     env = vslam_v0.parallel_env(world=world, num_robots=robots, preset=preset, max_cycles=max_cycles)
     policies = {} if policy == "none" else {a: make_policy(policy, "continuous") for a in env.possible_agents}

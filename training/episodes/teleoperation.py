@@ -19,7 +19,7 @@ NEXT, END = {"tab"}, {"escape", "q"}
 
 
 class Screen(Protocol):
-    """What shows frames and knows the keys: `vslam_env.window.Window`, or a test's own."""
+    """What shows frames and knows the keys: `vslam_env.rendering.window.Window`, or a test's own."""
 
     held: set[str]
     typed: list[str]

@@ -15,7 +15,7 @@ from slam_backend.core.files import check_writable, move_file, resolved
 from slam_backend.core.validation import bad_argument, check_float, check_int
 from slam_backend.fastslam.reports import MergeEvent
 from vslam_env.rendering import MergeFlash, Scene
-from vslam_env.rendering.flash import FLASH_TICKS
+from vslam_env.rendering.merge_effect import FLASH_TICKS
 
 FPS = 25
 SLOWEST_FPS = 5

@@ -12,7 +12,7 @@ from slam_backend.core.validation import check_int
 from vslam_env import vslam_v0
 from vslam_env.config import EnvConfig
 from vslam_env.rendering import draw_frame
-from vslam_env.setting import draw_setting
+from vslam_env.simulation.scenario import draw_setting
 from vslam_env.world import FreeSpace
 
 TILE = (640, 480)  # [px]

@@ -25,7 +25,7 @@ from training.experiments.config import PlainConfig
 from training.replay.config import REJUVENATE_EVERY, check_common
 from training.replay.rejuvenation_counts import RejuvenationCount
 from training.replay.single_robot import PLANAR_GATE
-from vslam_env.errors_of_maps import ClaimLedger
+from vslam_env.evaluation.map_scores import ClaimLedger
 
 IDENTITIES = ("given", "hidden")
 # A joint filter's particles are weighed by what all its robots see, and die out so much faster: with the starts known,

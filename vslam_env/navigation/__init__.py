@@ -1,11 +1,10 @@
 """What a robot does with the floor it has seen: grid, frontiers, paths. It knows no simulator, no sensor, no reward."""
 
-from vslam_env.navigation._arguments import ray_directions
 from vslam_env.navigation.candidate_slots import CandidateSlots, TeamSlots
-from vslam_env.navigation.frontiers import Frontiers, find_frontiers
-from vslam_env.navigation.planning import DistanceMap, distance_map, follow_path, plan_path
-from vslam_env.navigation.seen_grid import CELL, FREE, GRID_SIZE, OCCUPIED, UNKNOWN, SeenGrid, cell_of, centre_of
+from vslam_env.navigation.occupancy_grid import CELL, FREE, GRID_SIZE, OCCUPIED, UNKNOWN, SeenGrid, cell_of, centre_of
+from vslam_env.navigation.planning import DistanceMap, Frontiers, distance_map, find_frontiers, follow_path, plan_path
 from vslam_env.navigation.team_grids import TeamGrids
+from vslam_env.navigation.validation import ray_directions
 
 __all__ = [
     "CELL",

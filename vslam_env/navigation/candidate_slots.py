@@ -9,11 +9,11 @@ from scipy.optimize import linear_sum_assignment
 
 from slam_backend.core.jit import in_place
 from slam_backend.core.validation import BoolArray, FloatArray
-from vslam_env.navigation._arguments import check_cells, pose_floats, positions_array
-from vslam_env.navigation._painting_kernels import GRID_SIZE, known_bounds
-from vslam_env.navigation._search_kernels import HEADING, LENGTH, NUM_COLUMNS, SAME_GOAL, SIZE, XY, refill, renew
+from vslam_env.navigation._grid_kernels import GRID_SIZE, known_bounds
+from vslam_env.navigation._planning_kernels import HEADING, LENGTH, NUM_COLUMNS, SAME_GOAL, SIZE, XY, refill, renew
 from vslam_env.navigation.planning import start_of
 from vslam_env.navigation.team_grids import TeamGrids
+from vslam_env.navigation.validation import check_cells, pose_floats, positions_array
 
 NUM_SLOTS, NUM_FEATURES = 16, 5
 FRONTIER_SIZE = 3  # the feature that is above 0 where there is a candidate

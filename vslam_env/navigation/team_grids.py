@@ -3,9 +3,9 @@
 import numpy as np
 
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
-from vslam_env.navigation import _painting_kernels as _painting
-from vslam_env.navigation._arguments import check_ranges, pose_floats
-from vslam_env.navigation.seen_grid import GRID_SIZE, UNKNOWN, SeenGrid
+from vslam_env.navigation import _grid_kernels as _painting
+from vslam_env.navigation.occupancy_grid import GRID_SIZE, UNKNOWN, SeenGrid
+from vslam_env.navigation.validation import check_ranges, pose_floats
 
 
 class TeamGrids:

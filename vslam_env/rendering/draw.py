@@ -5,10 +5,10 @@ import numpy as np
 from slam_backend.core.validation import FloatArray, bad_argument, check_int
 from vslam_env.rendering import palette
 from vslam_env.rendering.canvas import Image, Viewport, disc, dots, ellipse_outlines, fill, lines, path, veils
-from vslam_env.rendering.flash import draw_captions, draw_flashes
+from vslam_env.rendering.merge_effect import draw_captions, draw_flashes
+from vslam_env.rendering.overlays import draw_footer, draw_header
 from vslam_env.rendering.palette import mix, robot_colour
 from vslam_env.rendering.scene import RobotView, Scene
-from vslam_env.rendering.strips import draw_footer, draw_header
 
 SMALLEST_SIZE = (160, 120)
 WALL_WIDTH_M = 0.08

@@ -17,7 +17,7 @@ from slam_backend.core.validation import (
 from slam_backend.models.camera import StereoCamera
 from slam_backend.models.measurements import Measurements, TeamMeasurements
 from vslam_env.sensors._landmark_kernels import BEYOND, FARTHEST, make_up, measure, mix_in
-from vslam_env.world.sight_kernels import detect
+from vslam_env.world._kernels import detect
 from vslam_env.world.spec import Landmarks
 from vslam_env.world.visibility import marks_of, view_limits, visible_landmarks
 

@@ -4,15 +4,15 @@ A reset goes: `make_world` -> `FreeSpace` -> `place_landmarks` (unless the world
 `check_starts` -> `Simulator`.
 """
 
-from vslam_env.world.floorplan import load_floorplan, load_walls_json, save_walls_json
 from vslam_env.world.freespace import FreeSpace
 from vslam_env.world.landmarks import LandmarkConfig, place_landmarks
+from vslam_env.world.loaders.floorplan import load_floorplan, load_walls_json, save_walls_json
+from vslam_env.world.loaders.ros_map import load_ros_map
+from vslam_env.world.loaders.splits import SPLITS, draw_world_seed
 from vslam_env.world.odometry import OdometryNoise, draw_bias, read_odometry
 from vslam_env.world.registry import WORLD_FAMILIES, WorldSource, check_source, is_one_building, make_world
-from vslam_env.world.rosmap import load_ros_map
 from vslam_env.world.simulator import Simulator
 from vslam_env.world.spec import Landmarks, World
-from vslam_env.world.splits import SPLITS, draw_world_seed
 
 __all__ = [
     "SPLITS",

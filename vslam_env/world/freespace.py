@@ -8,8 +8,8 @@ import numpy as np
 from slam_backend.core.validation import BoolArray, FloatArray, bad_argument, check_array, check_float, check_int
 from slam_backend.geometry import wrap_angle
 from slam_backend.models.camera import StereoCamera
-from vslam_env.world.clearance import clearance_raster, distances_to_walls
-from vslam_env.world.sight_kernels import cast_scans, rays_at, seen_from_somewhere
+from vslam_env.world._kernels import cast_scans, rays_at, seen_from_somewhere
+from vslam_env.world._kernels.clearance import clearance_raster, distances_to_walls
 from vslam_env.world.spec import FARTHEST_PLACE, Landmarks, World
 from vslam_env.world.visibility import view_limits, visible_landmarks
 

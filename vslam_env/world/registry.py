@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 
 from slam_backend.core.validation import bad_argument, is_built_in
-from vslam_env.world.fig5 import fig5
-from vslam_env.world.floorplan import existing, load_floorplan, load_walls_json
-from vslam_env.world.hall import hall
-from vslam_env.world.loops import loops
-from vslam_env.world.maze import maze
-from vslam_env.world.office import office
-from vslam_env.world.rosmap import load_ros_map
+from vslam_env.world.generators.fig5 import fig5
+from vslam_env.world.generators.hall import hall
+from vslam_env.world.generators.loops import loops
+from vslam_env.world.generators.maze import maze
+from vslam_env.world.generators.office import office
+from vslam_env.world.loaders.floorplan import existing, load_floorplan, load_walls_json
+from vslam_env.world.loaders.ros_map import load_ros_map
+from vslam_env.world.loaders.splits import files_of_split
 from vslam_env.world.spec import World
-from vslam_env.world.splits import files_of_split
 
 WorldMaker = Callable[[np.random.Generator], World]
 WorldSource = str | Path | World | WorldMaker

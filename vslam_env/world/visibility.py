@@ -4,7 +4,7 @@ import numpy as np
 
 from slam_backend.core.validation import BoolArray, FloatArray
 from slam_backend.models.camera import StereoCamera
-from vslam_env.world.sight_kernels import see
+from vslam_env.world._kernels import see
 from vslam_env.world.spec import Landmarks
 
 

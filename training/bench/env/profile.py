@@ -12,12 +12,13 @@ import numpy as np
 
 from slam_backend.fastslam.filter import FastSlam
 from slam_backend.team.team import TeamSlam
-from vslam_env import environment, observation
-from vslam_env.belief import TeamBelief
-from vslam_env.episode import Episode
+from vslam_env import environment
+from vslam_env.belief import observation
+from vslam_env.belief.shared_grids import SharedGrids
+from vslam_env.belief.team_belief import TeamBelief
 from vslam_env.navigation import TeamSlots
 from vslam_env.sensors import LandmarkSensor, Scan
-from vslam_env.shared_grids import SharedGrids
+from vslam_env.simulation.episode import Episode
 from vslam_env.world import Simulator
 
 REST = "all else"

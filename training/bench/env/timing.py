@@ -16,7 +16,7 @@ from training.experiments.step_timing import no_garbage_collection
 from vslam_env import vslam_v0
 from vslam_env.config import TICK, EnvConfig
 from vslam_env.environment import ExplorationEnv
-from vslam_env.setting import draw_setting
+from vslam_env.simulation.scenario import draw_setting
 from vslam_env.world import Simulator, read_odometry
 
 PEER = "mpe2"  # the package whose simple_spread is timed beside

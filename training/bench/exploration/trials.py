@@ -14,7 +14,7 @@ from training.bench.exploration.bench import ExplorationBenchConfig, Exploration
 from training.episodes.metrics import score_episode
 from training.episodes.runner import EpisodeRecord, MergeRecord, run_episode
 from vslam_env import vslam_v0
-from vslam_env.belief import Belief
+from vslam_env.belief.team_belief import Belief
 
 NEARLY_ALL = 0.9  # of the floor
 WATCHED_S = 20.0  # a wrong merge that lasted so long, or to the end, is a false one

@@ -15,7 +15,7 @@ from training.bench.stereo.scenes import Scene, panel_hall
 from training.experiments.config import PlainConfig, check_each_once
 from training.experiments.step_timing import Timing, time_calls
 from training.experiments.timed_bench import describe_machine
-from vslam_env.sensors.stereo_textures import STYLES, TextureConfig
+from vslam_env.sensors.stereo.textures import STYLES, TextureConfig
 
 BUSY = TextureConfig(polygons=20.0, posters=0.6)  # enough corners for 100 landmarks in an image
 CROWDED = 2  # [px] between corners where more than 100 landmarks are wanted: 4 px leave 270 corners in an image

@@ -9,7 +9,7 @@ from slam_backend.frontend import GUARDS, KINDS, FrontEndOptions, StereoFrontEnd
 from slam_backend.geometry import rotation
 from slam_backend.models.camera import StereoCamera
 from training.bench.stereo.scenes import WALL, Named, Scene, office_views, wall_pose
-from vslam_env.sensors.stereo_textures import TextureConfig
+from vslam_env.sensors.stereo.textures import TextureConfig
 from vslam_env.world import make_world
 
 ANGLES_DEG = (0.0, 15.0, 30.0, 45.0, 60.0)

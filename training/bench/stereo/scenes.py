@@ -9,10 +9,10 @@ from slam_backend.frontend import StereoFrame, StereoFrontEnd
 from slam_backend.frontend.images import Image
 from slam_backend.geometry import transform_points
 from slam_backend.models.camera import StereoCamera
-from vslam_env.sensors.stereo_camera import ImagingConfig, StereoEye
-from vslam_env.sensors.stereo_sensor import SPURIOUS_PX
-from vslam_env.sensors.stereo_textures import TextureConfig, WallTextures, draw_textures
-from vslam_env.sensors.stereo_truth import TextureCorners
+from vslam_env.sensors.stereo.cameras import ImagingConfig, StereoEye
+from vslam_env.sensors.stereo.ground_truth import TextureCorners
+from vslam_env.sensors.stereo.sensor import SPURIOUS_PX
+from vslam_env.sensors.stereo.textures import TextureConfig, WallTextures, draw_textures
 from vslam_env.world import FreeSpace, World
 
 WALL = World("wall", np.array([[0, 0, 14, 0], [14, 0, 14, 9], [14, 9, 0, 9], [0, 9, 0, 0]], dtype=float))

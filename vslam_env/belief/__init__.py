@@ -1,0 +1,1 @@
+"""What robots believe: readings, the team's filters and grids, beliefs and observations. It knows no simulator."""

@@ -1,0 +1,186 @@
+"""The compiled inner loops of observations: what robots believe and scan, as the arrays that agents are handed."""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from slam_backend.core.jit import device, in_place, room_of
+from slam_backend.fastslam.relative_poses import COVARIANCE, ESS, OWN, SIGMAS, START
+from vslam_env.navigation import CELL, FREE, GRID_SIZE, OCCUPIED, UNKNOWN
+
+MOST_TEAMMATES = 7
+POSE_LIMIT = np.array([30.0, 30.0, np.pi])
+FAR = 90.0  # [m] more than the diagonal of the seen grid
+MAP_STATS_LIMIT = np.array([10_000.0, 10.0, 10.0, 10_000.0, 1.0, 1.0 + MOST_TEAMMATES])
+
+
+@device
+@in_place
+def _clip(value: float, low: float, high: float) -> np.float32:
+    """Clip to bounds that are rounded as those of the space are."""
+    return min(max(np.float32(value), np.float32(low)), np.float32(high))
+
+
+@device
+@in_place
+def write_pose(belief: Any, pose: Any, sigmas: Any) -> None:
+    """Write `pose` and `pose_std`, each (3,) float32, of a robot that believes this, see `Standpoints`."""
+    for i in range(3):
+        pose[i] = _clip(belief[OWN + i], -POSE_LIMIT[i], POSE_LIMIT[i])
+        sigmas[i] = _clip(math.sqrt(belief[COVARIANCE + 4 * i]), 0.0, POSE_LIMIT[i])
+
+
+@device
+@in_place
+def write_map_stats(places: Any, names: Any, belief: Any, group_size: int, stats: Any) -> None:
+    """Write `map_stats` of a robot.
+
+    Args:
+        places, names: (m, 4), (m, 2) int64. Of its landmarks, see `OutlineRows`.
+        belief: As in `write_pose`.
+        group_size: Robots that share its map.
+        stats: (6,) float32. Written to.
+    """
+    total = largest = 0.0
+    times = 0
+    for landmark in range(len(places)):
+        sigma = math.sqrt(places[landmark, 3] / 3.0)
+        total += sigma
+        largest = max(largest, sigma)
+        times += names[landmark, 0]
+    held = max(len(places), 1)
+    stats[0] = _clip(len(places), 0.0, MAP_STATS_LIMIT[0])
+    stats[1] = _clip(total / held, 0.0, MAP_STATS_LIMIT[1])
+    stats[2] = _clip(largest, 0.0, MAP_STATS_LIMIT[2])
+    stats[3] = _clip(times / held, 0.0, MAP_STATS_LIMIT[3])
+    stats[4] = _clip(belief[ESS], 0.0, MAP_STATS_LIMIT[4])
+    stats[5] = _clip(group_size, 0.0, MAP_STATS_LIMIT[5])
+
+
+@device
+@in_place
+def write_teammates(robot: int, poses: Any, belief: Any, teammates: Any, present: Any) -> int:
+    """Write where a robot believes the others of its group to be; return how many these are.
+
+    Args:
+        robot: Its index.
+        poses: (N, 3). Of all robots, start frame; NaN: it does not know.
+        belief: As in `write_pose`.
+        teammates: (7, 5) float32. Written to, as what follows.
+        present: (7,) int8. `teammates_mask`.
+    """
+    teammates[:], present[:] = 0.0, 0
+    x, y, theta = belief[OWN], belief[OWN + 1], belief[OWN + 2]
+    c, s = math.cos(theta), math.sin(theta)
+    known = 0
+    for mate in range(len(poses)):
+        if mate != robot and not np.isnan(poses[mate, 0]):
+            known += 1
+            to, place = teammates[mate - (mate > robot)], poses[mate]
+            dx, dy, turn = place[0] - x, place[1] - y, place[2] - theta
+            to[0], to[1] = _clip(c * dx + s * dy, -FAR, FAR), _clip(c * dy - s * dx, -FAR, FAR)
+            to[2], to[3] = np.float32(math.cos(turn)), np.float32(math.sin(turn))
+            to[4] = _clip(belief[SIGMAS + mate], -FAR, FAR)
+            present[mate - (mate > robot)] = 1
+    return known
+
+
+@device
+@in_place
+def clip_candidates(features: Any) -> None:
+    """Clip the features (16, 5) float32 of a robot's candidates."""
+    for i in range(features.shape[0]):
+        for j in range(features.shape[1]):
+            features[i, j] = _clip(features[i, j], -FAR, FAR)
+
+
+SIZE = 48
+CHANNELS = ("free", "occupied", "landmarks")
+MARK = 255
+REACH = 0.75 * SIZE  # [cells] more than from the robot to a corner of its picture
+
+
+@device
+@in_place
+def paint(cells: Any, belief: Any, places: Any, local: Any) -> None:
+    """Sample the seen grid at the centres of the local cells, and mark the cells that hold landmarks.
+
+    Rows go from 4.8 m ahead to 4.8 m behind, columns from 4.8 m to the left to 4.8 m to the right. Each row is written
+    in short loops without branches, which become vector instructions but for the look-up itself.
+
+    Args:
+        cells: (300, 300) uint8. Of the seen grid.
+        belief: (16 or more,). Of the robot, see `Standpoints`: where it is, and what moves landmarks to its frame.
+        places: (n, 4). Of the landmarks, see `OutlineRows`.
+        local: (3, 48, 48) uint8. Channels free, occupied, landmarks, of cells of 0.2 m, 0 or 255. Written to.
+    """
+    x, y = belief[OWN], belief[OWN + 1]
+    c, s = math.cos(belief[OWN + 2]), math.sin(belief[OWN + 2])
+    middle = 0.5 * SIZE
+    flat = cells.reshape(cells.size)
+    low, high = REACH - 0.5 * GRID_SIZE, 0.5 * GRID_SIZE - REACH
+    surely_inside = low < x / CELL < high and low < y / CELL < high
+    place, seen = room_of(SIZE, np.int32), room_of(SIZE, np.uint8)
+    for row in range(SIZE):
+        ahead = middle - 0.5 - row  # [cells], as what follows
+        first_i, first_j = y / CELL + s * ahead + 0.5 * GRID_SIZE, x / CELL + c * ahead + 0.5 * GRID_SIZE
+        if surely_inside:
+            for col in range(SIZE):
+                left = middle - 0.5 - col
+                place[col] = np.int32(first_i + c * left) * GRID_SIZE + np.int32(first_j - s * left)
+            for col in range(SIZE):
+                seen[col] = flat[np.uint32(place[col])]
+        else:
+            for col in range(SIZE):
+                left = middle - 0.5 - col
+                i, j = first_i + c * left, first_j - s * left
+                inside = 0.0 <= i < GRID_SIZE and 0.0 <= j < GRID_SIZE
+                seen[col] = cells[int(i), int(j)] if inside else UNKNOWN
+        free, occupied, landmarks = local[0, row], local[1, row], local[2, row]
+        for col in range(SIZE):
+            free[col] = MARK if seen[col] == FREE else 0
+            occupied[col] = MARK if seen[col] == OCCUPIED else 0
+            landmarks[col] = 0
+    start_x, start_y = belief[START], belief[START + 1]
+    start_c, start_s = math.cos(belief[START + 2]), math.sin(belief[START + 2])
+    for k in range(len(places)):
+        dx = start_x + start_c * places[k, 0] - start_s * places[k, 1] - x
+        dy = start_y + start_s * places[k, 0] + start_c * places[k, 1] - y
+        row = math.floor(middle - (c * dx + s * dy) / CELL)
+        col = math.floor(middle - (c * dy - s * dx) / CELL)
+        if 0 <= row < SIZE and 0 <= col < SIZE:
+            local[2, row, col] = MARK
+
+
+@in_place
+def observe_team(
+    robots: Any, poses: Any, beliefs: Any, places: Any, names: Any, parts: Any, cells: Any, scans: Any,
+    clipped: Any, deviations: Any, stats: Any, ranges: Any, candidates: Any, teammates: Any, present: Any,
+    pictures: Any,
+) -> None:  # fmt: skip
+    """Write what robots observe.
+
+    Args:
+        robots: As in `View`.
+        poses, beliefs: (n, K, 3), (n, 16 + K). Of its points.
+        places, names, parts: (N, 4), (N, 2) int64, (n, 2) int64. Of its outlines.
+        cells: Of the view.
+        scans: (n, R) float64 [m].
+        clipped, deviations, stats: (n, 3), (n, 3), (n, 6) float32: `pose`, `pose_std`, `map_stats`. Written to, as all
+            that follow.
+        ranges: (n, R) float32: `scan`.
+        candidates: (n, 16, 5) float32, as they are without bounds.
+        teammates: (n, 7, 5) float32.
+        present: (n, 7) int8: `teammates_mask`.
+        pictures: (n, 3, 48, 48) uint8: `local_grid`.
+    """
+    for k in range(len(robots)):
+        for r in range(scans.shape[1]):
+            ranges[k, r] = scans[k, r]
+        held = slice(parts[k, 0], parts[k, 1])
+        known = write_teammates(robots[k], poses[k], beliefs[k], teammates[k], present[k])
+        write_pose(beliefs[k], clipped[k], deviations[k])
+        write_map_stats(places[held], names[held], beliefs[k], 1 + known, stats[k])
+        clip_candidates(candidates[k])
+        paint(cells[k], beliefs[k], places[held], pictures[k])

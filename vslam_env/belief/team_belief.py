@@ -1,0 +1,284 @@
+"""`TeamBelief` owns the team's filters and the seen grids, and hands out what each robot believes."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import fields, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_backend.core.validation import FloatArray, bad_argument
+from slam_backend.fastslam.consistency import Consistency
+from slam_backend.fastslam.options import FilterOptions
+from slam_backend.fastslam.relative_poses import Standpoints
+from slam_backend.fastslam.reports import MergeEvent, Renaming, TeamReport
+from slam_backend.fastslam.step_input import StepInput
+from slam_backend.geometry import rotate_covariances
+from slam_backend.maps.alignment import Alignment
+from slam_backend.maps.landmark_map import LandmarkMap, TeamOutlines
+from slam_backend.team.merge_scheduler import AttemptOptions
+from slam_backend.team.options import MergeOptions
+from slam_backend.team.team import TeamSlam
+from vslam_env.belief.belief import Belief, BeliefConfig, Body, Candidates, Teammate, View
+from vslam_env.belief.readings import Readings, TeamReadings
+from vslam_env.belief.shared_grids import SharedGrids, Strokes
+from vslam_env.navigation import TeamSlots
+
+__all__ = ["Belief", "BeliefConfig", "Body", "Candidates", "TeamBelief", "Teammate"]
+
+CANDIDATE_TICKS = 10  # once a second
+
+
+class TeamBelief:
+    """The filters and grids of a team, moved on by readings alone.
+
+    Args:
+        config: What is assumed.
+        num_robots: K.
+        seed: Of all random streams; the same seed gives the same beliefs from the same readings.
+        body: The robots' hardware.
+        decision_ticks: Where policies choose among the candidates: these are renewed at every decision. None: every
+            ten ticks, the robots taking turns.
+        attempts: Whether the team tries to align its maps by itself; if not, merges from outside are final.
+
+    Attributes:
+        points: Where the robots stand; written to in the next step.
+        known_groups: Per robot those that share a map with it, as far as it knows, itself included.
+        exchange: Counts the bytes that they send; to be looked at.
+        grids: The robots' seen grids; to be looked at.
+    """
+
+    def __init__(
+        self,
+        config: BeliefConfig,
+        num_robots: int,
+        seed: int | np.random.SeedSequence,
+        body: Body,
+        decision_ticks: int | None = None,
+        attempts: bool = True,
+    ) -> None:
+        if isinstance(seed, np.random.SeedSequence):
+            # A sequence remembers how often it spawned: a fresh one makes the result depend on its seed alone.
+            seed = np.random.SeedSequence(seed.entropy, spawn_key=seed.spawn_key)
+        options = {f.name: getattr(config.filter, f.name) for f in fields(FilterOptions)}
+        rhythm, merging = assumed_of_merges(config, attempts)
+        self._team = TeamSlam(num_robots, config.alignment, seed, rhythm, merging, **options)
+        self.exchange = self._team.exchange
+        self._grids = SharedGrids(num_robots, body)
+        self.grids = self._grids.team
+        self._candidates = TeamSlots(num_robots)
+        self._slots = self._candidates.slots
+        self._robots = np.arange(num_robots)
+        self._scanned = num_robots, len(body.ray_angles)  # shape of a tick's scans
+        self._turns = _turns(num_robots, decision_ticks)
+        self._tick = -1
+        self._confirm_after = config.confirm_after
+        self._beliefs: dict[int, Belief] = {}  # of this tick, made when asked for
+        self._maps: dict[int, LandmarkMap] = {}  # of this tick, by the number of the map
+        self.points = Standpoints(num_robots)
+        self._outlines = TeamOutlines.unwritten(num_robots, 0)  # likewise, when asked for
+        self._has_outlines = False
+        self._look_up_poses()
+
+    @property
+    def num_robots(self) -> int:
+        """K."""
+        return self._team.num_robots
+
+    @property
+    def groups(self) -> tuple[tuple[int, ...], ...]:
+        """The groups, each in ascending order of robots."""
+        return self._lineup.groups
+
+    @property
+    def events(self) -> tuple[MergeEvent, ...]:
+        """All attempts, merges and undos so far, in order."""
+        return self._team.events
+
+    @property
+    def poses(self) -> FloatArray:
+        """(K, 3) float64 [m, m, rad]. Where each robot believes to be, in its own start frame. A copy."""
+        return self.points.own.copy()
+
+    def step(self, readings: TeamReadings | Sequence[Readings]) -> TeamReport:
+        """Take in one tick's readings of all K robots; the first ones are those of the reset.
+
+        Args:
+            readings: As `env.readings` and recorders give them, or in one piece.
+
+        Raises:
+            ValueError: If a reading is ill-formed, or some robots have a kind of reading that others have not.
+        """
+        if not isinstance(readings, TeamReadings):
+            readings = TeamReadings.gathered(readings)
+        if readings.scans.shape != self._scanned:
+            got, cure = f"shape {readings.scans.shape}", "Give a range for each ray of each robot."
+            raise bad_argument("readings.scans", f"an array of shape {self._scanned}", got, cure)
+        if len(readings.bumps) != len(self._robots):
+            got, cure = f"shape {readings.bumps.shape}", "Say of each robot whether it bumped into something."
+            raise bad_argument("readings.bumps", f"an array of shape ({len(self._robots)},)", got, cure)
+        report = self._team.step(
+            [None] * len(self._robots) if readings.odometry is None else readings.odometry,
+            readings.measurements,
+            readings.heard,
+            readings.identities,
+            None if readings.poses is None else list(readings.poses),
+        )
+        self._tick += 1
+        self._look_up_poses()
+        points = self.points
+        self._grids.step(self._tick, report, self._lineup.mates, points, readings.scans, readings.bumps)
+        for robot in self._turns[self._tick % len(self._turns)] if self._tick else range(len(self._robots)):
+            self._candidates.update(robot, self.grids, points.poses)
+        return report
+
+    def merge(self, robot_a: int, robot_b: int, alignment: Alignment, known: bool = False) -> Renaming:
+        """Merge the groups of two robots with a given alignment of their filter maps; see `TeamSlam.merge`."""
+        renaming = self._team.merge(robot_a, robot_b, alignment, known)
+        self._look_up_poses()
+        self._grids.keep(self._tick + 1, renaming)
+        self._grids.meet(self._tick + 1, self._lineup.mates, self.points.starts)
+        return renaming
+
+    def speaker(self, group: tuple[int, ...]) -> int:
+        """Return the first robot of a group that goes by its joint filter, and so can merge it with another."""
+        return self._team.keepers(group[0])[0]
+
+    def consistency(self, robot: int) -> Consistency:
+        """Return whether the filter that a robot goes by errs as little as it claims; see `FastSlam.consistency`."""
+        return self._team.consistency(robot)
+
+    def filter_map(self, robot: int) -> LandmarkMap:
+        """Return the whole map of a robot's group, unconfirmed landmarks included, in the group's map frame."""
+        return self._team.map(robot)
+
+    def group_map(self, robot: int) -> LandmarkMap:
+        """Return the confirmed landmarks of a robot's group, in the group's map frame."""
+        number = self._lineup.maps[robot]
+        if number not in self._maps:
+            self._maps[number] = self._team.map(robot, min_count=self._confirm_after)
+        return self._maps[number]
+
+    @property
+    def outlines(self) -> TeamOutlines:
+        """The outlines of the `group_map` of all robots, much faster; to be looked at before the next step."""
+        if not self._has_outlines:
+            self._outlines = self._team.outlines(self._confirm_after, self._outlines)
+            self._has_outlines = True
+        return self._outlines
+
+    def cells(self, robot: int) -> NDArray[np.uint8]:
+        """Return the cells (300, 300) uint8 of a robot's seen grid; a read-only view that follows its changes."""
+        return self._grids[robot].cells
+
+    def candidate(self, robot: int, slot: int) -> tuple[FloatArray, float] | None:
+        """Return the goal (2,) [m] of a robot's slot and where to look from there [rad]; None if it is empty."""
+        return self._slots[robot].candidate(slot)
+
+    def belief(self, robot: int) -> Belief:
+        """Return what a robot believes after the last tick."""
+        if robot not in self._beliefs:
+            self._beliefs[robot] = self._make_belief(robot)
+        return self._beliefs[robot]
+
+    def view(self) -> View:
+        """Return what observations show of all robots' beliefs; it shares memory with the grids."""
+        features = self._candidates.features(self.points.poses)
+        return View(self._robots, self.points, self.outlines, self.grids.cells, features)
+
+    @property
+    def kept_readings(self) -> Mapping[int, StepInput]:
+        """Readings of the last ticks that some filter may take in later, by step; to be looked at."""
+        return self._team.kept_readings
+
+    @property
+    def kept_strokes(self) -> dict[int, Strokes]:
+        """What the grids may have to paint again, by `id`; to be looked at."""
+        return self._grids.kept_strokes
+
+    def get_state(self) -> dict[str, Any]:
+        """Return all that decides how the beliefs go on; it shares nothing with them."""
+        return {
+            "tick": self._tick,
+            "team": self._team.get_state(),
+            "grids": self._grids.get_state(),
+            "slots": [slots.get_state() for slots in self._slots],
+        }
+
+    def set_state(self, state: Mapping[str, Any]) -> None:
+        """Go on exactly as the beliefs that gave `state`, which was checked."""
+        self._team._go_on_from(state["team"])
+        self._tick = state["tick"]
+        self._grids.set_state(state["grids"])
+        for slots, candidates in zip(self._slots, state["slots"], strict=True):
+            slots.set_state(candidates)
+        self._look_up_poses()
+
+    def _look_up_poses(self) -> None:
+        """Take note of the groups and poses after a step or a merge, and forget what was derived from those before."""
+        self._lineup = self._team.lineup
+        self.known_groups = self._lineup.members
+        self._team.standpoints(self.points)
+        self._beliefs.clear()
+        self._maps.clear()
+        self._has_outlines = False
+
+    def _others(self, robot: int) -> list[int]:
+        """Return the other robots that a robot knows of, ascending."""
+        return [mate for mate in self._lineup.members[robot] if mate != robot]
+
+    def _mates_around(self, robot: int) -> FloatArray:
+        """Return where a robot believes these to be (n, 2) [m], in its own start frame."""
+        return self.points.poses[robot, self._others(robot), :2]
+
+    def _teammates(self, robot: int) -> tuple[Teammate, ...]:
+        """Return the other robots that a robot knows of; one out of contact is where it was when contact was lost."""
+        points, team = self.points, self._team
+        turn = float(points.starts[robot, 2])
+        return tuple(
+            Teammate(mate, points.poses[robot, mate], rotate_covariances(turn, team.pose(mate, robot).covariance))
+            for mate in self._others(robot)
+        )
+
+    def _make_belief(self, robot: int) -> Belief:
+        """Put together what `belief` returns."""
+        points, slots, group = self.points, self._slots[robot], self._lineup.members[robot]
+        return Belief(
+            robot=robot,
+            tick=self._tick,
+            frame=group[0],
+            group=group,
+            pose=points.own[robot],
+            covariance=points.covariances[robot],
+            particles=self._team.particles_from_start(robot),
+            log_weights=self._team.particles(robot)[1],
+            ess=float(points.ess[robot]),
+            grid=self._grids[robot].frozen(),
+            candidates=Candidates(
+                goals=slots.goals,
+                headings=slots.headings,
+                lengths=slots.lengths,
+                valid=slots.valid,
+                features=slots.features(points.own[robot], self._mates_around(robot)),
+            ),
+            teammates=self._teammates(robot),
+            start_from_group=points.starts[robot],
+            group_map=self.group_map(robot),
+        )
+
+
+def assumed_of_merges(config: BeliefConfig, attempts: bool) -> tuple[AttemptOptions, MergeOptions]:
+    """Return when groups try to align their maps, and how they merge; where they do not try, merges are final."""
+    if attempts:
+        return config.attempts, config.merging
+    return replace(config.attempts, enabled=False), replace(config.merging, watch_steps=0)
+
+
+def _turns(num_robots: int, decision_ticks: int | None) -> Sequence[Sequence[int]]:
+    """Return per tick, after the first one, whose candidates are renewed; then it begins anew."""
+    if decision_ticks is not None:
+        return [range(num_robots), *[()] * (decision_ticks - 1)]
+    return [
+        [robot for robot in range(num_robots) if robot * CANDIDATE_TICKS // num_robots == tick]
+        for tick in range(CANDIDATE_TICKS)
+    ]

@@ -1,0 +1,1 @@
+"""Beliefs measured against the truth: coverage, map errors, metrics of the team."""

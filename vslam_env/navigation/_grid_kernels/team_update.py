@@ -1,0 +1,113 @@
+"""What robots read in a tick is written into grids: their scans, the floor that they cover, and their bumps."""
+
+import math
+from typing import Any
+
+from slam_backend.core.jit import device, in_place
+from slam_backend.core.validation import BoolArray, FloatArray
+from vslam_env.navigation._grid_kernels.occupancy import (
+    CELL,
+    FREE,
+    GRID_SIZE,
+    HALF_WIDTH,
+    HIT,
+    OCCUPIED,
+    cell_range,
+    judge,
+)
+from vslam_env.navigation._grid_kernels.scan_update import NUM_ROWS, good_ranges, paint_survey, survey
+
+
+@in_place
+def paint_disc(evidence: Any, cells: Any, changes: Any, bounds: Any, x: float, y: float, radius: float) -> None:
+    """Free what a robot covers: unknown cells centred in its disc, and occupied ones that lie wholly inside."""
+    first_row, last_row = cell_range(y - radius, y + radius)
+    first_col, last_col = cell_range(x - radius, x + radius)
+    for row in range(first_row, last_row):
+        for col in range(first_col, last_col):
+            if evidence[row, col] < 0:
+                continue
+            v = (row + 0.5) * CELL - HALF_WIDTH - y
+            u = (col + 0.5) * CELL - HALF_WIDTH - x
+            distance = math.hypot(u, v)
+            inside = distance <= max(radius - 0.5 * CELL, 0.0)
+            if inside or (evidence[row, col] == 0 and distance <= radius):
+                evidence[row, col] = min(evidence[row, col], -1)
+                judge(cells, changes, bounds, row, col, FREE)
+
+
+@in_place
+def paint_bump(
+    evidence: Any, cells: Any, changes: Any, bounds: Any, x: float, y: float, theta: float, radius: float
+) -> None:
+    """Mark the cell just ahead of a robot's rim as occupied, no firmer than two hits."""
+    ahead = radius + 0.5 * CELL
+    row = math.floor((y + ahead * math.sin(theta) + HALF_WIDTH) / CELL)
+    col = math.floor((x + ahead * math.cos(theta) + HALF_WIDTH) / CELL)
+    if 0 <= row < GRID_SIZE and 0 <= col < GRID_SIZE:
+        evidence[row, col] = max(evidence[row, col], 2 * HIT)
+        judge(cells, changes, bounds, row, col, OCCUPIED)
+
+
+@device
+@in_place
+def _find_bad(shared: Any, poses: FloatArray, scans: FloatArray) -> tuple[int, int]:
+    """Return what `paint_readings` returns."""
+    for robot in range(len(scans)):
+        if not good_ranges(scans[robot]):
+            return robot, robot
+        for owner in range(len(shared)):
+            x, y, theta = poses[owner, robot]
+            if shared[owner, robot] and not math.isfinite(x + y + theta):
+                return owner, robot
+    return -1, -1
+
+
+@in_place
+def paint_readings(
+    evidence: Any,
+    cells: Any,
+    changes: Any,
+    bounds: Any,
+    shared: Any,
+    poses: FloatArray,
+    scans: FloatArray,
+    bumps: BoolArray,
+    directions: FloatArray,
+    max_range: float,
+    radius: float,
+    room: FloatArray,
+) -> tuple[int, int]:
+    """Write what robots read in a tick: their scans, the floor that they cover, and their bumps.
+
+    Args:
+        evidence: (K, 300, 300) int8, as what follows: the grids, one after the other.
+        cells: (K, 300, 300) uint8.
+        changes: (K, 1 + n) int32.
+        bounds: (K, 4) int32.
+        shared: See `TeamGrids.paint_readings`, also for the rest.
+        poses: (K, K, 3) float64 [m, m, rad].
+        scans: (K, R) float64 [m].
+        bumps: (K,) bool.
+        directions: (2, R) float64.
+        max_range: [m].
+        radius: [m].
+        room: Of `room_to_paint`.
+
+    Returns:
+        Whose grid and whose reading do not go together, as its pose or its ranges are bad; nothing was written then.
+        -1 if all are good.
+    """
+    bad = _find_bad(shared, poses, scans)
+    if bad[0] >= 0:
+        return bad
+    for robot in range(len(scans)):
+        survey(scans[robot], directions, max_range, room[:NUM_ROWS])
+        for owner in range(len(shared)):
+            if shared[owner, robot]:
+                x, y, theta = poses[owner, robot]
+                paint_survey(evidence[owner], cells[owner], changes[owner], bounds[owner], x, y, theta, room)
+                paint_disc(evidence[owner], cells[owner], changes[owner], bounds[owner], x, y, radius)
+                if bumps[robot]:
+                    paint_bump(evidence[owner], cells[owner], changes[owner], bounds[owner], x, y, theta, radius)
+    return bad

@@ -1,0 +1,223 @@
+"""Cheapest paths from one cell to all others, and the shortcuts that straighten them."""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from slam_backend.core.jit import device, in_place, jit
+from vslam_env.navigation._grid_kernels import OCCUPIED
+from vslam_env.navigation._planning_kernels.costmap import PAD, known_box, weigh
+
+
+@device
+@in_place
+def _line_cost(weights: Any, row: float, col: float, to_row: float, to_col: float) -> float:
+    """Return the cost of a straight line between two cells, infinite if it leaves the open ones."""
+    distance = math.hypot(to_row - row, to_col - col)
+    samples = int(4.0 * distance) + 1
+    total = 0.0
+    for i in range(samples + 1):
+        share = i / samples
+        weight = weights[int(row + share * (to_row - row) + 0.5), int(col + share * (to_col - col) + 0.5)]
+        if weight == 0:
+            return np.inf
+        total += weight
+    return 2.0 * STRAIGHT * distance * total / (samples + 1)
+
+
+@jit
+def straight_path(weights: Any, cost: Any, parent: Any, row: int, col: int) -> Any:
+    """Follow the parents from a goal back to the start, and pull the way straight where that costs no more.
+
+    Args:
+        weights: (h, w) uint8.
+        cost: (h, w) int32, of `wavefront`.
+        parent: (h, w) int32, of `parents_of`.
+        row: The goal, a reached cell.
+        col: See `row`.
+
+    Returns:
+        (n, 2) int64 rows (row, column) of the corners, from the start to the goal.
+    """
+    width = weights.shape[1]
+    costs, before = cost.ravel(), parent.ravel()
+    goal = row * width + col
+    count = 1
+    cell = goal
+    while before[cell] >= 0:
+        cell = before[cell]
+        count += 1
+    way = np.empty(count, np.int64)
+    cell = goal
+    for i in range(count - 1, -1, -1):
+        way[i] = cell
+        cell = before[cell]
+
+    corners = np.empty((count, 2), np.int64)
+    corners[0, 0], corners[0, 1] = way[0] // width, way[0] % width
+    num = 1
+    anchor = 0
+    while anchor < count - 1:
+        reached = anchor + 1
+        while reached + 1 < count:
+            ahead = way[reached + 1]
+            line = _line_cost(weights, way[anchor] // width, way[anchor] % width, ahead // width, ahead % width)
+            if line > 1.02 * (costs[ahead] - costs[way[anchor]]):  # 2 % for the short diagonal and the sampling
+                break
+            reached += 1
+        corners[num, 0], corners[num, 1] = way[reached] // width, way[reached] % width
+        num += 1
+        anchor = reached
+    return corners[:num]
+
+
+STRAIGHT, DIAGONAL = 5, 7  # length of a step in fifths of a cell; 7/5 is 1 % short of the diagonal
+NUM_STRAIGHT = 4  # of the eight directions, the first ones
+NUM_BUCKETS = 64  # a power of two above the dearest step, DIAGONAL * (CLOSE + CLOSE)
+UNREACHED = np.iinfo(np.int32).max
+
+
+@jit
+def nearest_open(box: Any, weights: Any, row: int, col: int, reach: int) -> tuple[int, int]:
+    """Find the open cell that is the fewest steps away, without stepping through a wall.
+
+    Args:
+        box: (h, w) uint8. Cells.
+        weights: (h, w) uint8. 0 where a robot may not be.
+        row: Where to begin; this cell itself may be a wall's.
+        col: See `row`.
+        reach: How far to look, in cells.
+
+    Returns:
+        Its row and column, or (-1, -1).
+    """
+    height, width = box.shape
+    if not (0 <= row < height and 0 <= col < width):
+        return -1, -1
+    side = 2 * reach + 1
+    visited = np.zeros((side, side), np.bool_)
+    queue = np.empty((side * side, 2), np.int64)
+    queue[0, 0], queue[0, 1] = row, col
+    visited[reach, reach] = True
+    head, tail = 0, 1
+    while head < tail:
+        r, c = queue[head]
+        head += 1
+        if weights[r, c] > 0:
+            return r, c
+        for i, j in ((0, 1), (1, 0), (0, -1), (-1, 0)):
+            nr, nc = r + i, c + j
+            if not (0 <= nr < height and 0 <= nc < width) or abs(nr - row) > reach or abs(nc - col) > reach:
+                continue
+            if visited[nr - row + reach, nc - col + reach] or box[nr, nc] == OCCUPIED:
+                continue
+            visited[nr - row + reach, nc - col + reach] = True
+            queue[tail, 0], queue[tail, 1] = nr, nc
+            tail += 1
+    return -1, -1
+
+
+@device
+@in_place
+def steps_over(width: int) -> tuple[int, ...]:
+    """Return how far a step in each of the eight directions leads in a flat grid of rows as wide as this."""
+    return 1, width, -1, -width, 1 + width, width - 1, -1 - width, 1 - width
+
+
+@jit
+def parents_of(ways: Any) -> Any:
+    """Return of each cell the flat index of the one before it on its way, (h, w) int32; -1 where `ways` has that."""
+    steps = steps_over(ways.shape[1])
+    parents = np.empty(ways.size, np.int32)
+    for cell, direction in enumerate(ways.ravel()):
+        parents[cell] = cell - steps[direction] if direction >= 0 else -1
+    return parents.reshape(ways.shape)
+
+
+@device
+@jit
+def wavefront(weights: Any, row: int, col: int) -> tuple[Any, Any]:
+    """Find the cheapest ways from one cell to all others (Dijkstra's algorithm with Dial's buckets).
+
+    A step to one of the eight neighbours costs its length times the sum of the weights of its two cells. Diagonal
+    steps need no look at the cells beside them, since walls have been widened by more than a cell. Costs are small
+    integers, so that the queue is a ring of buckets, each a linked list. A cell whose cost falls is listed again; its
+    older entries are passed over.
+
+    Args:
+        weights: (h, w) uint8, 0 = closed. The outermost cells must be closed.
+        row: The first cell, open; -1 if there is none, and nothing is reached.
+        col: See `row`.
+
+    Returns:
+        Of each cell (h, w): the cost, int32, `UNREACHED` if there is no way; and the direction of the last step to
+        it, int8 as in `steps_over`, -1 at the first cell and where there is no way.
+    """
+    width = weights.shape[1]
+    weight = weights.ravel()
+    cost = np.empty(weight.size, np.int32)
+    num_open = 0
+    for i in range(weight.size):
+        # Closed cells are below all costs, so that one comparison passes over closed and settled cells alike.
+        cost[i] = UNREACHED if weight[i] > 0 else -1
+        num_open += weight[i] > 0
+    ways = np.full(weight.size, -1, np.int8)
+    # Cells, and which entry follows each; a cost falls at most once per neighbour.
+    entries = np.empty((8 * num_open + 1, 2), np.int32)
+    heads = np.full(NUM_BUCKETS, -1, np.int32)
+    steps = np.array(steps_over(width))
+
+    used, taken, current = 0, 0, 0
+    if row >= 0:
+        cost[row * width + col] = 0
+        entries[0, 0], entries[0, 1], heads[0] = row * width + col, -1, 0
+        used = 1
+    # Unsigned places need no look at whether they count from the end, which takes a quarter more time.
+    while taken < used:
+        bucket = np.uint32(current & (NUM_BUCKETS - 1))
+        while heads[bucket] >= 0:
+            entry = np.uint32(heads[bucket])
+            cell, heads[bucket] = np.uint32(entries[entry, 0]), entries[entry, 1]
+            taken += 1
+            if cost[cell] != current:
+                continue
+            here = np.int32(weight[cell])
+            for k in range(8):
+                neighbour = np.uint32(np.int64(cell) + steps[k])
+                length = STRAIGHT if k < NUM_STRAIGHT else DIAGONAL
+                through = np.int32(current + length * (here + np.int32(weight[neighbour])))
+                if through < cost[neighbour]:
+                    cost[neighbour], ways[neighbour] = through, k
+                    target, place = np.uint32(through & (NUM_BUCKETS - 1)), np.uint32(used)
+                    entries[place, 0], entries[place, 1], heads[target] = neighbour, heads[target], used
+                    used += 1
+        current += 1
+    for i in range(weight.size):
+        cost[i] &= UNREACHED  # turns -1 into it, and leaves all costs as they are
+    return cost.reshape(weights.shape), ways.reshape(weights.shape)
+
+
+@jit
+def ways_over(
+    cells: Any, bounds: Any, row: int, col: int, reach: float, escape: int
+) -> tuple[Any, Any, Any, Any, int, int]:
+    """Find the cheapest ways over the known floor of a grid.
+
+    Args:
+        cells: (300, 300) uint8. The grid.
+        bounds: (4,) int32, of `known_bounds`.
+        row: Of the cell where they begin, or near which: the nearest open one is taken.
+        col: Likewise.
+        reach: See `weigh`.
+        escape: How far to look for an open cell, in cells.
+
+    Returns:
+        The known box, (h, w) uint8; its weights, of `weigh`; costs and last steps, of `wavefront`; and the grid's row
+        and column of its first cell.
+    """
+    box, first_row, first_col = known_box(cells, bounds), bounds[0] - PAD, bounds[1] - PAD
+    weights = weigh(box, reach)
+    start_row, start_col = nearest_open(box, weights, row - first_row, col - first_col, escape)
+    cost, ways = wavefront(weights, start_row, start_col)
+    return box, weights, cost, ways, first_row, first_col

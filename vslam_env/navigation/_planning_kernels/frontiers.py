@@ -1,0 +1,200 @@
+"""Where the known floor of a box borders on what has not been seen."""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from slam_backend.core.jit import device, in_place, jit
+from vslam_env.navigation._grid_kernels import CELL, FREE, GRID_SIZE, HALF_WIDTH, UNKNOWN
+from vslam_env.navigation._planning_kernels.costmap import any_above_zero
+from vslam_env.navigation._planning_kernels.dijkstra import NUM_STRAIGHT, UNREACHED, steps_over, ways_over
+
+MIN_CELLS = 3  # a robot needs 0.4 m; what is smaller is a speck or the corner of a wall
+MAX_CELLS = 20  # longer frontiers are cut, as one goal cannot stand for them
+GOAL_STEPS = 5  # a goal is at most this far from its frontier [cells]
+MOST_NEAR = 1 + 2 * GOAL_STEPS * (GOAL_STEPS + 1)  # cells that so many steps lead to, the first one included
+LOOKED_AT = 4  # added to the marks of cells while a goal is looked for
+SIGHT_CELLS = 3  # the unknown this near to a goal tells where to look from it
+
+XY, HEADING, SIZE, LENGTH, NUM_COLUMNS = slice(0, 2), 2, 3, 4, 5  # columns of the rows that describe frontiers
+
+
+@device
+@in_place
+def _flood(mark: Any, level: int, into: int, row: int, col: int, limit: int, queue: Any) -> int:
+    """Move up to `limit` connected cells from one level of marks to another, nearest first; return how many.
+
+    Their rows and columns are left in the first rows of `queue`.
+    """
+    queue[0, 0], queue[0, 1] = row, col
+    mark[row, col] = into
+    head, tail = 0, 1
+    while head < tail:
+        r, c = queue[head]
+        head += 1
+        for nr in range(r - 1, r + 2):
+            for nc in range(c - 1, c + 2):
+                if mark[nr, nc] == level and tail < limit:
+                    mark[nr, nc] = into
+                    queue[tail, 0], queue[tail, 1] = nr, nc
+                    tail += 1
+    return tail
+
+
+@device
+@jit
+def _goal_near(members: Any, box: Any, cost: Any, mark: Any) -> tuple[int, int]:
+    """Return a reached cell as few steps as possible from a frontier and near its middle; (-1, -1) if none is near.
+
+    Steps go sideways and not through walls. Most often one is enough; where a wall that is drawn too thick closes a
+    door, the robot has to come near and look again. Marks are afterwards as they were.
+    """
+    queue = np.empty((MOST_NEAR * len(members), 2), np.int64)
+    first, last, goal_row, goal_col = 0, len(members), -1, -1
+    for k in range(last):
+        queue[k, 0], queue[k, 1] = members[k]
+        mark[members[k, 0], members[k, 1]] |= LOOKED_AT
+    for _ in range(GOAL_STEPS):
+        following, total, sum_row, sum_col = last, 0, 0.0, 0.0
+        for k in range(first, last):
+            for i, j in ((0, 1), (1, 0), (0, -1), (-1, 0)):
+                r, c = queue[k, 0] + i, queue[k, 1] + j
+                if not (0 <= r < box.shape[0] and 0 <= c < box.shape[1]) or mark[r, c] & LOOKED_AT:
+                    continue
+                if box[r, c] in (FREE, UNKNOWN):
+                    mark[r, c] |= LOOKED_AT
+                    queue[following, 0], queue[following, 1] = r, c
+                    following += 1
+                    if cost[r, c] != UNREACHED:
+                        total, sum_row, sum_col = total + 1, sum_row + r, sum_col + c
+        first, last = last, following
+        if total > 0:
+            best = np.inf
+            for k in range(first, last):
+                r, c = queue[k]
+                distance = (r - sum_row / total) ** 2 + (c - sum_col / total) ** 2
+                if cost[r, c] != UNREACHED and distance < best:
+                    best, goal_row, goal_col = distance, r, c
+            break
+    for k in range(last):
+        mark[queue[k, 0], queue[k, 1]] ^= LOOKED_AT
+    return goal_row, goal_col
+
+
+@device
+@in_place
+def _path_length(ways: Any, row: int, col: int) -> float:
+    """Measure the way to a reached cell [m]."""
+    width = ways.shape[1]
+    directions, steps = ways.reshape(ways.size), steps_over(width)
+    cell, length = row * width + col, 0.0
+    while directions[cell] >= 0:
+        direction = directions[cell]
+        length += CELL if direction < NUM_STRAIGHT else math.sqrt(2.0) * CELL
+        cell -= steps[direction]
+    return length
+
+
+@device
+@in_place
+def _heading_to_unknown(box: Any, row: int, col: int) -> float:
+    """Return the direction from a cell to the unknown cells around it [rad]."""
+    up = right = 0
+    for r in range(max(row - SIGHT_CELLS, 0), min(row + SIGHT_CELLS + 1, box.shape[0])):
+        for c in range(max(col - SIGHT_CELLS, 0), min(col + SIGHT_CELLS + 1, box.shape[1])):
+            if box[r, c] == UNKNOWN:
+                up, right = up + r - row, right + c - col
+    return math.atan2(up, right)
+
+
+@device
+@jit
+def _unseen_edges(box: Any, ignored: Any, row: int, col: int) -> Any:
+    """Return (h, w) int8, 1 for unknown cells beside free ones that are not to be ignored; see `_frontier_rows`."""
+    height, width = box.shape
+    edges = np.zeros((height, width), np.int8)
+    for r in range(max(1, -row), min(height - 1, GRID_SIZE - row)):
+        first, last = max(1, -col), min(width - 1, GRID_SIZE - col)
+        asked = ignored[row + r, col + first : col + last]
+        here, edge = box[r, first:last], edges[r, first:last]
+        below, above = box[r - 1, first:last], box[r + 1, first:last]
+        right, left = box[r, first - 1 : last - 1], box[r, first + 1 : last + 1]
+        for i in range(len(here)):  # without branches, it becomes vector code
+            beside = (below[i] == FREE) | (above[i] == FREE) | (right[i] == FREE) | (left[i] == FREE)
+            edge[i] = beside & (here[i] == UNKNOWN) & ~asked[i]
+    return edges
+
+
+@device
+@jit
+def _frontier_rows(box: Any, cost: Any, ways: Any, ignored: Any, row: int, col: int) -> Any:
+    """Collect the frontiers of a box.
+
+    Args:
+        box: (h, w) uint8, of `known_box`.
+        cost: (h, w) int32, of `wavefront`.
+        ways: (h, w) int8, likewise.
+        ignored: (300, 300) bool. Unknown cells of the grid that do not count.
+        row: Of the box's first cell in the grid.
+        col: Likewise.
+
+    Returns:
+        (n, 5) float64 rows (x, y, heading, size, length), by increasing length.
+    """
+    height, width = box.shape
+    mark = _unseen_edges(box, ignored, row, col)  # 1: such an edge; 2: its component known; 3: in a piece
+
+    found = np.empty((height * width // MIN_CELLS + 1, NUM_COLUMNS))
+    count = 0
+    whole = np.empty((height * width, 2), np.int64)
+    piece = np.empty((MAX_CELLS, 2), np.int64)
+    for r in range(1, height - 1):
+        if not any_above_zero(mark[r]):
+            continue
+        for c in range(1, width - 1):
+            if mark[r, c] != 1:
+                continue
+            size = _flood(mark, 1, 2, r, c, height * width, whole)
+            num_pieces = (size + MAX_CELLS - 1) // MAX_CELLS
+            share = (size + num_pieces - 1) // num_pieces
+            for k in range(size - 1, -1, -1):  # from the far end, so that a line is cut piece by piece
+                if mark[whole[k, 0], whole[k, 1]] != 2:
+                    continue
+                num = _flood(mark, 2, 3, whole[k, 0], whole[k, 1], share, piece)
+                if num < MIN_CELLS:
+                    continue
+                goal_row, goal_col = _goal_near(piece[:num], box, cost, mark)
+                if goal_row < 0:
+                    continue
+                length, at = _path_length(ways, goal_row, goal_col), count
+                while at > 0 and found[at - 1, LENGTH] > length:
+                    found[at] = found[at - 1]
+                    at -= 1
+                found[at, 0] = (col + goal_col + 0.5) * CELL - HALF_WIDTH
+                found[at, 1] = (row + goal_row + 0.5) * CELL - HALF_WIDTH
+                found[at, HEADING] = _heading_to_unknown(box, goal_row, goal_col)
+                found[at, SIZE] = num * CELL
+                found[at, LENGTH] = length
+                count += 1
+    return found[:count]
+
+
+@jit
+def frontiers_over(cells: Any, bounds: Any, row: int, col: int, reach: float, escape: int, ignored: Any) -> Any:
+    """Collect the frontiers to which a way is known.
+
+    Args:
+        cells: (300, 300) uint8. The grid, and how ways over it are looked for: see `ways_over`.
+        bounds: (4,) int32.
+        row: Where the ways begin.
+        col: Likewise.
+        reach: [cells].
+        escape: [cells].
+        ignored: (300, 300) bool. Unknown cells that do not count.
+
+    Returns:
+        (n, 5) float64 rows (x, y, heading, size, length), by increasing length.
+    """
+    box, _, cost, ways, first_row, first_col = ways_over(cells, bounds, row, col, reach, escape)
+    return _frontier_rows(box, cost, ways, ignored, first_row, first_col)

@@ -1,0 +1,189 @@
+"""`SeenGrid`: what one robot has seen of the floor, in its own start frame."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from slam_backend.core.read_only import as_read_only
+from slam_backend.core.validation import FloatArray, IntArray, bad_argument, check_array, check_float
+from vslam_env.navigation import _grid_kernels as _painting
+from vslam_env.navigation._grid_kernels import CELL, FREE, GRID_SIZE, HALF_WIDTH, OCCUPIED, UNKNOWN
+from vslam_env.navigation.validation import check_ranges, pose_floats, ray_directions
+
+# What each evidence, as an unsigned byte, says of a cell.
+_VERDICTS = np.where(np.arange(256) == 0, UNKNOWN, np.where(np.arange(256) < 128, OCCUPIED, FREE)).astype(np.uint8)
+
+__all__ = ["CELL", "FREE", "GRID_SIZE", "OCCUPIED", "UNKNOWN", "SeenGrid", "cell_of", "centre_of"]
+
+
+def cell_of(points: ArrayLike) -> IntArray:
+    """Return the cells in which points lie.
+
+    Args:
+        points: (..., 2) float64 [m], start frame, rows (x, y).
+
+    Returns:
+        (..., 2) int64 rows (row, column), to index `SeenGrid.cells`. Below 0 or at least `GRID_SIZE` for points
+        outside the grid.
+
+    >>> cell_of([0.1, -29.9]).tolist()
+    [0, 150]
+    """
+    points = np.asarray(points, dtype=np.float64)
+    return np.asarray(np.floor((points[..., ::-1] + HALF_WIDTH) / CELL), dtype=np.int64)
+
+
+def centre_of(cells: ArrayLike) -> FloatArray:
+    """Return the centres of cells.
+
+    Args:
+        cells: (..., 2) int64 rows (row, column).
+
+    Returns:
+        (..., 2) float64 [m], start frame, rows (x, y).
+
+    >>> centre_of([0, 150]).round(6).tolist()
+    [0.1, -29.9]
+    """
+    return np.asarray((np.asarray(cells)[..., ::-1] + 0.5) * CELL - HALF_WIDTH, dtype=np.float64)
+
+
+class SeenGrid:
+    """An occupancy grid of 60 x 60 m around a robot's start pose, whatever the world, so that it reveals nothing.
+
+    Each cell counts evidence (hits against passes) between bounds, so that one bad reading neither walls up a door
+    nor opens a wall; `cells` holds the verdict. What lies outside the grid is ignored.
+
+    Attributes:
+        cells: (300, 300) uint8, read-only, indexed [row, column] with row = y upwards and column = x: `UNKNOWN`,
+            `FREE` or `OCCUPIED`. It shares memory with the grid and follows its changes.
+    """
+
+    __slots__ = ("_bounds", "_cells", "_changes", "_evidence", "_read_only", "cells")
+
+    def __init__(self) -> None:
+        shape = (GRID_SIZE, GRID_SIZE)
+        self._adopt(np.zeros(shape, np.int8), np.full(shape, UNKNOWN, np.uint8), _no_changes(), np.zeros(4, np.int32))
+
+    def _adopt(
+        self,
+        evidence: NDArray[np.int8],
+        cells: NDArray[np.uint8],
+        changes: NDArray[np.int32],
+        bounds: NDArray[np.int32],
+        *,
+        read_only: bool = False,
+    ) -> "SeenGrid":
+        """Make arrays, as the kernels expect them, this grid's own."""
+        self._evidence, self._cells, self._changes, self._bounds = evidence, cells, changes, bounds
+        self._read_only = read_only
+        self.cells = as_read_only(cells)
+        return self
+
+    @classmethod
+    def _of(cls, *arrays: NDArray[Any], read_only: bool = False) -> "SeenGrid":
+        """Return the grid that lies in some arrays, as `_arrays` has them."""
+        return cls.__new__(cls)._adopt(*arrays, read_only=read_only)
+
+    @property
+    def _arrays(self) -> tuple[NDArray[np.int8], NDArray[np.uint8], NDArray[np.int32], NDArray[np.int32]]:
+        """The grid as kernels paint it."""
+        return self._evidence, self._cells, self._changes, self._bounds
+
+    def paint_scan(self, pose: ArrayLike, ranges: ArrayLike, angles: ArrayLike, max_range: float = 8.0) -> None:
+        """Mark what a range scan saw: free before the first surface, occupied on it.
+
+        Args:
+            pose: (3,) float64 [m, m, rad], start frame. Where the robot was.
+            ranges: (n,) float64 [m]. A reading of `max_range` or more saw nothing.
+            angles: (n,) float64 [rad], robot frame. Ascending, n >= 2, spanning less than pi.
+            max_range: [m].
+
+        Raises:
+            ValueError: If the pose is not finite, or ranges or angles are not as described.
+            RuntimeError: If the grid is a read-only view.
+        """
+        self._refuse_if_read_only()
+        x, y, theta = pose_floats(pose)
+        ranges = np.ascontiguousarray(ranges, dtype=np.float64)
+        angles = np.ascontiguousarray(angles, dtype=np.float64)
+        if ranges.ndim != 1 or ranges.shape != angles.shape or len(ranges) < 2:
+            raise bad_argument(
+                "ranges",
+                "an array of shape (n,), n >= 2, like angles",
+                f"shape {ranges.shape} with angles {angles.shape}",
+                "Give one range per ray.",
+            )
+        check_ranges(ranges)
+        directions = ray_directions(angles)
+        _painting.paint_scan(*self._arrays, x, y, theta, ranges, directions, float(max_range))
+
+    def clear_disc(self, pose: ArrayLike, radius: float = 0.2) -> None:
+        """Mark as free what the body of a robot covers.
+
+        Args:
+            pose: (3,) float64 [m, m, rad], start frame.
+            radius: Of the robot [m]. Occupied cells at its rim stay: they hold the wall that the robot touches.
+        """
+        self._refuse_if_read_only()
+        x, y, _ = pose_floats(pose)
+        radius = check_float("radius", radius, "Give the robot's radius in metres.", above=0.0)
+        _painting.paint_disc(*self._arrays, x, y, radius)
+
+    def bump(self, pose: ArrayLike, radius: float = 0.2) -> None:
+        """Mark the cell just ahead of a robot's rim as occupied: it bumped into something there.
+
+        A bump does not tell its direction, so the mark is no firmer than two hits, and later readings can lift it.
+
+        Args:
+            pose: (3,) float64 [m, m, rad], start frame.
+            radius: Of the robot [m].
+        """
+        self._refuse_if_read_only()
+        x, y, theta = pose_floats(pose)
+        _painting.paint_bump(*self._arrays, x, y, theta, radius)
+
+    def absorb(self, other: "SeenGrid", self_from_other: ArrayLike) -> None:
+        """Add the evidence of another robot's grid.
+
+        Args:
+            other: It stays as it is.
+            self_from_other: (3,) float64 [m, m, rad]. The other's start pose in this robot's start frame.
+        """
+        self._refuse_if_read_only()
+        x, y, theta = pose_floats(self_from_other, "self_from_other")
+        _painting.paint_grid(*self._arrays, other._evidence.copy(), x, y, theta)
+
+    def copy(self) -> "SeenGrid":
+        """Return an independent grid, which can be written to, with the same content."""
+        return SeenGrid._of(self._evidence.copy(), self._cells.copy(), _no_changes(), self._bounds.copy())
+
+    def frozen(self) -> "SeenGrid":
+        """Return a view that refuses changes and shares memory with this grid: it follows changes made here."""
+        return SeenGrid._of(*self._arrays, read_only=True)
+
+    def get_state(self) -> dict[str, Any]:
+        """Return a copy of all that `set_state` needs to continue bit by bit."""
+        return {"evidence": self._evidence.copy()}
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Restore what `get_state` returned, in place: views made by `frozen` follow."""
+        self._refuse_if_read_only()
+        shape = (GRID_SIZE, GRID_SIZE)
+        evidence = state["evidence"]
+        if not (isinstance(evidence, np.ndarray) and evidence.dtype == np.int8 and evidence.shape == shape):
+            evidence = check_array("evidence", evidence, shape, "Use what get_state returned.", dtype=np.int8)
+        self._evidence[:] = evidence
+        np.take(_VERDICTS, evidence.view(np.uint8), out=self._cells, mode="wrap")
+        self._changes[0] = -1
+        self._bounds[:] = _painting.known_bounds(self.cells)  # read-only: as planners ask, so that it is compiled once
+
+    def _refuse_if_read_only(self) -> None:
+        if self._read_only:
+            raise RuntimeError("SeenGrid: this is a read-only view. Make a copy() to write to.")
+
+
+def _no_changes() -> NDArray[np.int32]:
+    """Return the changes of a grid of which none are known."""
+    return np.full(1 + _painting.MOST_CHANGES, -1, np.int32)

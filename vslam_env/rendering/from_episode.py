@@ -1,0 +1,57 @@
+"""An episode as it stands becomes a `Scene`: the truth, and each robot's estimates laid at its true start."""
+
+import numpy as np
+
+from slam_backend.core.validation import FloatArray
+from slam_backend.geometry import compose
+from vslam_env.config import TICK
+from vslam_env.evaluation.team_metrics import Standing
+from vslam_env.rendering import MergeFlash, RobotView, Scene
+from vslam_env.simulation.episode import Episode
+
+FLASH_TICKS = 30
+
+
+def scene_of(episode: Episode, standing: Standing) -> Scene:
+    """Return what a picture of an episode shows.
+
+    Args:
+        episode: As it stands; nothing of it is shared with the scene but arrays that never change.
+        standing: Of the team at this moment.
+    """
+    landmarks = episode.world.landmarks
+    assert landmarks is not None
+    return Scene(
+        walls=episode.world.walls,
+        landmarks=landmarks.positions,
+        robots=tuple(_view(episode, robot, landmarks.positions) for robot in range(len(episode.true_starts))),
+        tick=episode.tick,
+        time=episode.tick * TICK,
+        robot_radius=episode.body.radius,
+        merges=tuple(
+            MergeFlash(episode.tick - tick, robots_a, robots_b)
+            for tick, robots_a, robots_b in episode.merge_ticks
+            if episode.tick - tick <= FLASH_TICKS
+        ),
+        map_errors=tuple(float(error) for error in standing.map_errors),
+        coverage=standing.coverage,
+    )
+
+
+def _view(episode: Episode, robot: int, positions: FloatArray) -> RobotView:
+    start = episode.true_starts[robot]
+    belief = episode.belief.belief(robot)
+    world_map = belief.map.moved(start)
+    seen = episode.frames[robot].true_ids
+    estimated = compose(start, np.array([poses[robot] for poses in episode.estimated_path]))
+    return RobotView(
+        true_pose=episode.true_path[-1][robot],
+        true_path=np.array([poses[robot, :2] for poses in episode.true_path]),
+        estimated_pose=estimated[-1],
+        estimated_path=estimated[:, :2],
+        particles=compose(start, belief.particles),
+        landmark_means=world_map.means,
+        landmark_covariances=world_map.covariances,
+        sight_lines=positions[seen[seen >= 0], :2],
+        group=belief.frame,
+    )

@@ -1,0 +1,70 @@
+"""The range finder: how far each robot can look along 32 rays in its camera's field of view."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from slam_backend.core.validation import FloatArray, check_array, check_float, check_int
+from slam_backend.models.camera import StereoCamera
+from vslam_env.world._kernels import cast_scans, rays_at
+
+MOST_RAYS = 100_000  # of a robot; memory ends before
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ScanConfig:
+    """What the range finder looks at and how well.
+
+    Attributes:
+        num_rays: Rays, evenly spread over the field of view from right to left, the outermost on its edges (R).
+        half_fov: Half of the field of view [rad]; by default that of the camera.
+        max_range: Where nothing is met nearer, this is read [m].
+        sigma: Standard deviation of a reading, as a share of the distance.
+    """
+
+    num_rays: int = 32
+    half_fov: float = field(default=StereoCamera().half_fov)
+    max_range: float = 8.0
+    sigma: float = 0.01
+
+    def __post_init__(self) -> None:
+        check_int("scan.num_rays", self.num_rays, 2, "Use at least two rays; 32 are a good start.", MOST_RAYS)
+        check_float("scan.half_fov", self.half_fov, "Give radians.", at_least=1e-3, at_most=np.pi)
+        check_float("scan.max_range", self.max_range, "Give metres.", at_least=1e-3, at_most=1e6)
+        check_float("scan.sigma", self.sigma, "Give a share of the distance.", at_least=0.0, at_most=1e6)
+
+    @property
+    def ray_angles(self) -> FloatArray:
+        """Directions of the rays (R,) [rad], robot frame, increasing to the left."""
+        return np.linspace(-self.half_fov, self.half_fov, self.num_rays)
+
+
+class Scan:
+    """Range finders of all robots in one world; they see walls and the other robots.
+
+    Attributes:
+        config: What they look at and how well.
+        ray_angles: (R,) float64 [rad], robot frame.
+    """
+
+    def __init__(self, config: ScanConfig, walls: FloatArray, robot_radius: float = 0.2) -> None:
+        self.config = config
+        self.ray_angles = config.ray_angles
+        walls = check_array("walls", walls, (None, 4), "Give rows x1 y1 x2 y2 in metres.")
+        robot_radius = check_float("robot_radius", robot_radius, "Give metres.", at_least=0.0)
+        fan = *rays_at(self.ray_angles), walls.T.copy()
+        self._sight = *fan, robot_radius, config.max_range, config.sigma  # as the kernel expects it
+
+    def measure(self, poses: FloatArray, rng: np.random.Generator) -> FloatArray:
+        """Read all rays of all robots.
+
+        Args:
+            poses: (K, 3) float64 [m, m, rad], world frame. True poses.
+            rng: Source of the draws: K R of them, whatever is in view.
+
+        Returns:
+            (K, R) float64 [m] in [0, max_range]. A ray that meets nothing reads exactly `max_range`.
+        """
+        ranges = rng.standard_normal((len(poses), len(self.ray_angles)))
+        cast_scans(poses, *self._sight, ranges)
+        return ranges

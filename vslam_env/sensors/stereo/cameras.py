@@ -1,0 +1,165 @@
+"""`StereoEye`: the images that a robot's two cameras take of a textured world."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from slam_backend.core.validation import Float32Array, FloatArray, IntArray, check_float, check_int
+from slam_backend.frontend.images import Image
+from slam_backend.models.camera import StereoCamera
+from vslam_env.sensors.stereo._render_kernels import expose, render, trace
+from vslam_env.sensors.stereo.textures import WallTextures
+from vslam_env.world._kernels import walls_in_wedge
+
+VIEW = 60.0  # [m] farther walls are not drawn
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ImagingConfig:
+    """How images are taken.
+
+    Attributes:
+        noise: Standard deviation of a pixel's noise, independent in each eye [grey levels].
+        gain_sigma: Standard deviation of the exposure, drawn for each pair: a factor about 1, the same in both eyes.
+        eye_gain_sigma: Likewise of what the right eye differs by.
+        blur_px: Standard deviation of a Gaussian blur before noise [px]; 0: none.
+        parts: Sub-columns of a column.
+    """
+
+    noise: float = 2.0
+    gain_sigma: float = 0.02
+    eye_gain_sigma: float = 0.01
+    blur_px: float = 0.0
+    parts: int = 2
+
+    def __post_init__(self) -> None:
+        for name in ("noise", "gain_sigma", "eye_gain_sigma", "blur_px"):
+            check_float(f"imaging.{name}", getattr(self, name), "Use 0 for none.", at_least=0.0, at_most=100.0)
+        check_int("imaging.parts", self.parts, 1, "2 are enough.", 1000)
+
+
+class Traced(NamedTuple):
+    """What rays through image columns meet.
+
+    Attributes:
+        walls: (n,) int64. Wall, -1: nothing, -2: a robot.
+        sides: (n,) int64. 0: its left face, seen from its beginning; 1: its right one.
+        depths: (n,) float64 [m]. Ahead of the camera; infinity where there is nothing.
+        along: (n,) float64. How far along the wall, in [0, 1].
+    """
+
+    walls: IntArray
+    sides: IntArray
+    depths: FloatArray
+    along: FloatArray
+
+
+class StereoEye:
+    """Takes pairs of images of one world.
+
+    Both eyes look the same way; the right one stands `camera.baseline` to the right of the left one. Other robots block
+    the view.
+
+    Args:
+        camera: Optics, mount and size of the images.
+        imaging: Noise and exposure.
+        walls: (S, 4) float64 [m], world frame.
+        textures: Of these walls.
+        robot_radius: [m].
+    """
+
+    def __init__(
+        self,
+        camera: StereoCamera,
+        imaging: ImagingConfig,
+        walls: FloatArray,
+        textures: WallTextures,
+        robot_radius: float = 0.2,
+    ) -> None:
+        self.camera, self.imaging, self.textures = camera, imaging, textures
+        self._walls, self._radius = walls.T.copy(), robot_radius
+        self._optics = np.array([camera.focal_px, 0.5 * (camera.width - 1), 0.5 * (camera.height - 1)])
+        paint = textures.config
+        self._span = np.array([paint.ceiling, (paint.ceiling - paint.floor) / textures.rows])
+        self._tan_half = (0.5 * camera.width + 1.0) / camera.focal_px
+
+    def take(self, poses: FloatArray, robot: int, rng: np.random.Generator) -> tuple[Image, Image]:
+        """Take a pair.
+
+        Args:
+            poses: (K, 3) float64 [m, m, rad], world frame. True poses of all robots.
+            robot: Whose eyes.
+            rng: Source of exposure and noise.
+
+        Returns:
+            Left and right image (H, W) uint8.
+        """
+        imaging, camera = self.imaging, self.camera
+        gain, difference = 1.0 + rng.standard_normal(2) * [imaging.gain_sigma, imaging.eye_gain_sigma]
+        shape = (4, camera.height, camera.width)
+        images = []
+        for shift, exposure in ((0.0, gain), (camera.baseline, gain * difference)):
+            radiance = self.radiance(poses, robot, shift)
+            noise = np.frombuffer(rng.bytes(int(np.prod(shape))), dtype=np.uint8).reshape(shape)
+            image = np.empty((camera.height, camera.width), dtype=np.uint8)
+            expose(radiance, noise, exposure, 0.0, imaging.noise, image)
+            images.append(image)
+        return images[0], images[1]
+
+    def radiance(self, poses: FloatArray, robot: int, shift: float = 0.0) -> Float32Array:
+        """Return the grey levels (W, H) float32, without noise, of an eye `shift` [m] to the right of the left one."""
+        place = self._place(poses[robot], shift)
+        local, indices = self._walls_ahead(place)
+        textures = self.textures
+        radiance = np.empty((self.camera.width, self.camera.height), dtype=np.float32)
+        render(
+            local,
+            indices,
+            self._others(poses, robot, place),
+            self._radius,
+            self.camera.mount[2],
+            self._optics,
+            textures.sums,
+            textures.starts,
+            textures.columns,
+            self._span,
+            self.imaging.parts,
+            radiance,
+        )
+        blur = self.imaging.blur_px
+        return radiance if blur == 0.0 else np.asarray(cv2.GaussianBlur(radiance, (0, 0), blur), dtype=np.float32)
+
+    def _walls_ahead(self, place: FloatArray) -> tuple[FloatArray, IntArray]:
+        """Return the walls (n, 4) [m] that an eye at `place` may see, in its frame, and their indices (n,)."""
+        local, indices = np.empty(self._walls.T.shape), np.empty(self._walls.shape[1], np.int64)
+        x, y, theta = place.tolist()
+        c, s = np.cos(theta), np.sin(theta)
+        count = walls_in_wedge(x, y, c, s, self._walls, self._tan_half, VIEW, local, indices)
+        return local[:count], indices[:count]
+
+    def trace(self, poses: FloatArray, robot: int, columns: FloatArray) -> Traced:
+        """Return what the left eye's rays through columns (n,) [px] meet; pixel centres are at integers."""
+        place = self._place(poses[robot], 0.0)
+        local, indices = self._walls_ahead(place)
+        others = self._others(poses, robot, place)
+        rows, depths, along = trace(columns, local, others, self._radius, self._optics[0], self._optics[1])
+        on_wall = rows >= 0
+        walls, sides = rows.copy(), np.zeros(len(rows), dtype=np.int64)
+        walls[on_wall] = indices[rows[on_wall]]
+        x1, y1, x2, y2 = local[rows[on_wall]].T
+        sides[on_wall] = np.where((x2 - x1) * y1 - (y2 - y1) * x1 < 0.0, 0, 1)
+        return Traced(walls, sides, depths, along)
+
+    def _place(self, pose: FloatArray, shift: float) -> FloatArray:
+        """Return (3,) where an eye is, world frame."""
+        c, s = np.cos(pose[2]), np.sin(pose[2])
+        ahead, left = self.camera.mount[0], self.camera.mount[1] - shift
+        return np.array([pose[0] + c * ahead - s * left, pose[1] + s * ahead + c * left, pose[2]])
+
+    def _others(self, poses: FloatArray, robot: int, place: FloatArray) -> FloatArray:
+        """Return the other robots (K - 1, 2) [m] in the frame of an eye."""
+        away = np.delete(poses[:, :2], robot, axis=0) - place[:2]
+        c, s = np.cos(place[2]), np.sin(place[2])
+        return np.column_stack([c * away[:, 0] + s * away[:, 1], c * away[:, 1] - s * away[:, 0]])

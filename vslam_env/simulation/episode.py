@@ -1,0 +1,265 @@
+"""`Episode`: one world with robots in it, what they perceive and believe, and the simulator's books; tick by tick."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from operator import add
+from typing import Any
+
+import numpy as np
+
+from slam_backend.core.validation import BoolArray, FloatArray, IntArray
+from slam_backend.geometry import between, compose
+from slam_backend.maps.alignment import Alignment
+from slam_backend.team.communication import reach
+from vslam_env.belief.readings import Readings, TeamReadings
+from vslam_env.belief.team_belief import Body, TeamBelief
+from vslam_env.config import TICK, EnvConfig
+from vslam_env.evaluation.coverage import Coverage
+from vslam_env.evaluation.team_metrics import DISTANCES, ERROR_INTEGRALS, FOUND, MAP_ERRORS, NUM_FIGURES, Standing
+from vslam_env.reward import RUNNING_COST
+from vslam_env.sensors import EyeFrame, EyeFrames, Frame, Frames
+from vslam_env.simulation.communication import contacts
+from vslam_env.simulation.scenario import Setting
+from vslam_env.world import Simulator, read_odometry
+
+MIN_SHARED = 3
+SIGMA = 1e-4  # [m, rad] what stands for certainty where a covariance is needed
+
+
+def true_alignment(
+    claims_a: IntArray, claims_b: IntArray, true_start_a: FloatArray, true_start_b: FloatArray
+) -> Alignment | None:
+    """Return the true alignment of two groups' maps, or None if they share fewer than three true landmarks.
+
+    Args:
+        claims_a: (n,) int64. True landmark of each row of map a, negative for none.
+        claims_b: (m,) int64. Likewise of map b.
+        true_start_a: (3,) [m, m, rad]. True start pose of a's first robot, whose start frame is the map frame.
+        true_start_b: (3,) Likewise of b.
+    """
+    real_a, real_b = (np.where(claims >= 0, claims, -1 - np.arange(len(claims))) for claims in (claims_a, claims_b))
+    # Of duplicates the first is taken; what is negative is unique in its map and must not match across maps.
+    shared, rows_a, rows_b = np.intersect1d(real_a, real_b, return_indices=True)
+    inliers = np.column_stack([rows_a, rows_b])[shared >= 0]
+    if len(inliers) < MIN_SHARED:
+        return None
+    tx, ty, theta = between(true_start_a, true_start_b).tolist()
+    return Alignment(True, "", tx, ty, theta, SIGMA**2 * np.eye(3), inliers, 0.0)
+
+
+Recorder = Callable[[tuple[Readings, ...]], None]
+
+
+@dataclass(slots=True)
+class Tap:
+    """Where readings can be listened to: an environment keeps it over its episodes."""
+
+    recorder: Recorder | None = None
+
+
+class Episode:
+    """From a reset to the next.
+
+    Each concern draws from a stream of its own, so that a new draw in one never shifts another.
+
+    Args:
+        config: Of the environment.
+        setting: What was drawn at the reset.
+        tap: Its recorder is called with the readings of each tick, the first ones included.
+
+    Attributes:
+        setting: What was drawn at the reset; of these:
+        given_setting: The setting in the last state that was set, from which `setting` was built again if it came from
+            elsewhere; None: no state was set.
+        world: Walls and landmarks.
+        true_starts: (K, 3) float64 [m, m, rad], world frame.
+        belief_seed: From which the team's beliefs draw.
+        body: The robots' hardware.
+        belief: What the robots believe.
+        ledger: What their landmarks are in truth.
+        tick: Ticks since the reset.
+        readings: Of the last tick; none before `begin`.
+        true_path: Poses (K, 3) after each tick, world frame.
+        estimated_path: Poses (K, 3) as estimated after each tick, each in the robot's own start frame.
+        merge_ticks: Tick and groups of each merge.
+    """
+
+    def __init__(self, config: EnvConfig, setting: Setting, tap: Tap | None = None) -> None:
+        self._config = config
+        self._tap = Tap() if tap is None else tap
+        self._all_hear_all = config.always_in_contact
+        self._streams = {name: np.random.default_rng(0) for name in setting.stream_states}
+        self.given_setting: Setting | None = None
+        self._settle(setting)
+        self.body = Body(
+            radius=config.robot_radius, ray_angles=config.scan.ray_angles, scan_range=config.scan.max_range
+        )
+        self.belief = TeamBelief(
+            config.belief,
+            config.num_robots,
+            self.belief_seed,
+            self.body,
+            decision_ticks=config.ticks_per_step if config.action_type == "goal" else None,
+            attempts=not config.oracle_merge,
+        )
+
+        self.tick = 0
+        self._collisions: tuple[int, ...] = (0,) * config.num_robots
+        self._figures = np.zeros((NUM_FIGURES, config.num_robots))  # of `Standing`; ways are added up in their row
+        self._found, self._distances = self._figures[FOUND], self._figures[DISTANCES]
+        self._error_integrals = self._figures[ERROR_INTEGRALS]
+        self._integrates = RUNNING_COST in config.reward  # scoring every tick costs time: only where it is asked for
+        self.true_path: list[FloatArray] = []
+        self.estimated_path: list[FloatArray] = []
+        self.merge_ticks: list[tuple[int, tuple[int, ...], tuple[int, ...]]] = []
+        self.readings: TeamReadings  # set by `begin`
+        self._frames: Frames | EyeFrames  # likewise
+
+    def _settle(self, setting: Setting) -> None:
+        """Move into a setting, as at its reset."""
+        self.setting = setting
+        self.world, self.true_starts, self.belief_seed = setting.world, setting.true_starts, setting.belief_seed
+        self._simulator = Simulator(setting.world, setting.true_starts, self._config.robot_radius, TICK)
+        self.ledger = setting.new_ledger(self._config.map_error_cutoff)
+        self._coverage = Coverage(setting.coverage)
+        for name, state in setting.stream_states.items():
+            self._streams[name].bit_generator.state = state
+
+    def begin(self) -> None:
+        """Let the robots take their first frame."""
+        self._perceive(None)
+
+    @property
+    def true_poses(self) -> FloatArray:
+        """(K, 3) float64 [m, m, rad], world frame. A copy."""
+        return self._simulator.poses.copy()
+
+    @property
+    def frames(self) -> Sequence[Frame | EyeFrame]:
+        """Each robot's frame of the last tick, with the true landmarks behind its measurements."""
+        return self._frames.of_each()
+
+    def advance(self, commands: FloatArray) -> None:
+        """Drive all robots with velocity commands (K, 2) [m/s, rad/s] for a tick, and let them perceive and believe.
+
+        Raises:
+            ValueError: If `Simulator.step` refuses them; nothing has changed then.
+        """
+        simulator, noise, stream = self._simulator, self._config.odometry, self._streams["odometry"]
+        before = simulator.poses
+        if simulator.step(commands):
+            self._collisions = tuple(map(add, self._collisions, simulator.bumped.tolist()))
+        self.tick += 1
+        self._perceive(read_odometry(before, simulator.poses, self.setting.bias, noise, stream, self._distances))
+        if self._integrates:
+            self._score(simulator.poses)
+            self._error_integrals += self._figures[MAP_ERRORS] * TICK
+
+    def believed_poses(self) -> FloatArray:
+        """Return where the robots believe to be (K, 3) [m, m, rad], laid at their true starts, world frame."""
+        return compose(self.true_starts, self.estimated_path[-1])
+
+    def standing(self) -> Standing:
+        """Return how the team stands now: its maps and poses are scored."""
+        belief, poses = self.belief, self._simulator.poses
+        self._score(poses)
+        coverage = self._coverage.update(belief.grids, poses, self._found)
+        counts = self._collisions, tuple(belief.exchange.sent)
+        return Standing(self._figures.tolist(), counts, coverage, len(self.merge_ticks), self.tick * TICK)
+
+    # ------------------------------------------------------------------ snapshots
+
+    def get_state(self) -> dict[str, Any]:
+        """Return all that decides how the episode goes on; what never changes is shared, all else is copied."""
+        return {
+            "setting": self.setting,
+            "tick": self.tick,
+            "simulator": self._simulator.get_state(),
+            "streams": {name: stream.bit_generator.state for name, stream in self._streams.items()},
+            "belief": self.belief.get_state(),
+            "ledger": self.ledger.get_state(),
+            "coverage": self._coverage.get_state(),
+            "counts": (self._collisions, self._distances.copy(), self._error_integrals.copy()),
+            "last": (self.readings, self._frames),
+            "paths": (tuple(self.true_path), tuple(self.estimated_path), tuple(self.merge_ticks)),
+        }
+
+    def set_state(self, state: Mapping[str, Any], setting: Setting) -> None:
+        """Go on exactly as the episode that gave `state`, which was checked, in its setting."""
+        self.given_setting = state["setting"]
+        if setting is not self.setting:
+            self._settle(setting)
+        self._simulator.set_state(state["simulator"])
+        for name, stream in state["streams"].items():
+            self._streams[name].bit_generator.state = stream
+        self.belief.set_state(state["belief"])
+        self.ledger.set_state(state["ledger"])
+        self._coverage.set_state(state["coverage"])
+        self.tick = state["tick"]
+        self._collisions, self._distances[:], self._error_integrals[:] = state["counts"]
+        self.readings, self._frames = state["last"]
+        self.true_path, self.estimated_path, self.merge_ticks = (list(path) for path in state["paths"])
+
+    # ------------------------------------------------------------------ within
+
+    def _score(self, poses: FloatArray) -> None:
+        """Write the scores of all maps and poses, with robots at true poses (K, 3), into the first figures."""
+        belief = self.belief
+        self.ledger.score(belief.outlines, belief.points, self.true_starts, poses, self._figures)
+
+    def _perceive(self, odometry: FloatArray | None) -> None:
+        """Read all other sensors at the true poses, and let the robots take it in."""
+        config, poses = self._config, self._simulator.poses
+        self._frames = frames = self.setting.sensor.measure(poses, self._streams["sensor"])
+        scans = self.setting.scan.measure(poses, self._streams["scan"])
+        heard = None if self._all_hear_all else self._contacts(poses)
+        self.readings = TeamReadings(
+            odometry,
+            frames.measurements,
+            scans,
+            self._simulator.bumped,
+            between(self.true_starts, poses) if config.oracle_pose else None,
+            frames.true_ids if config.oracle_association else None,
+            heard,
+            frames.left if config.observe_images and isinstance(frames, EyeFrames) else None,
+        )
+        if self._tap.recorder is not None:
+            self._tap.recorder(self.readings.of_each())
+        report = self.belief.step(self.readings)
+        self.ledger.record(report, frames.names)
+        for made in report.renamings:
+            self.merge_ticks.append((self.tick, made.robots_a, made.robots_b))
+        if config.oracle_merge:
+            self._merge_by_oracle(reach(heard, config.num_robots))
+        self.true_path.append(poses.copy())  # whoever writes to that moves no robot
+        self.estimated_path.append(self.belief.points.own.copy())
+
+    def _contacts(self, poses: FloatArray) -> BoolArray:
+        """Return who hears whom (K, K)."""
+        config = self._config
+        limits = config.comm_range, config.comm_line_of_sight, config.comm_loss
+        return contacts(poses, self.world.walls, *limits, self._streams["radio"])
+
+    def _merge_by_oracle(self, networks: IntArray) -> None:
+        """Merge groups that share true landmarks until none do; robots of one network (K,) are in contact."""
+        merged = True
+        while merged:
+            merged = False
+            for a, b in combinations(self.belief.groups, 2):
+                speakers = self.belief.speaker(a), self.belief.speaker(b)
+                if networks[speakers[0]] != networks[speakers[1]]:
+                    continue
+                alignment = true_alignment(
+                    self._claims(a), self._claims(b), self.true_starts[a[0]], self.true_starts[b[0]]
+                )
+                if alignment is not None:
+                    self.ledger.rename(self.belief.merge(*speakers, alignment, known=True))
+                    self.merge_ticks.append((self.tick, a, b))
+                    merged = True
+                    break
+
+    def _claims(self, group: tuple[int, ...]) -> IntArray:
+        """Return which true landmark each row of a group's filter map claims."""
+        speaker = self.belief.speaker(group)
+        return self.ledger.claims(speaker, self.belief.filter_map(speaker).ids)

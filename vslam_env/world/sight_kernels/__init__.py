@@ -1,6 +1,0 @@
-"""Compiled geometry of sight: what rays hit, which landmarks cameras see, and whether they can be seen at all."""
-
-from vslam_env.world.sight_kernels.landmarks import choose, detect, see, seen_from_somewhere
-from vslam_env.world.sight_kernels.rays import cast_scans, rays_at, walls_in_wedge
-
-__all__ = ["cast_scans", "choose", "detect", "rays_at", "see", "seen_from_somewhere", "walls_in_wedge"]
