@@ -184,7 +184,8 @@ def live(log: BarrierLog, seed: int, **options: Any) -> dict[str, float]:
     for step, (move, frame, names) in enumerate(zip(log.odometry, log.frames, log.identities, strict=True)):
         slam.step([move if step else None], [frame], [names])
     told = slam.consistency
-    _, means, _, _ = slam._dense()
+    maps = slam.state.maps
+    means = maps.dense(maps.used_slots())[0][:, :3]
     return {
         "map": map_error(log, slam),
         "spread": float(np.sqrt(means[:, :2].var(axis=2).sum(axis=1).mean())),
@@ -195,7 +196,7 @@ def live(log: BarrierLog, seed: int, **options: Any) -> dict[str, float]:
 
 def map_error(log: BarrierLog, slam: FastSlam) -> float:
     """Return the RMS error [m] of a filter's map after the best fit; each landmark is of the name it was given."""
-    landmarks, maps = slam.map(), slam._maps
+    landmarks, maps = slam.map(), slam.state.maps
     slots = maps.used_slots()
     names = maps.identities[slots][np.searchsorted(maps.ids[slots], landmarks.ids)]
     true = log.landmarks[names]

@@ -19,7 +19,7 @@ from slam_backend.fastslam.reports import (
 )
 from slam_backend.fastslam.step_input import StepInput
 from slam_backend.maps.alignment_types import Alignment, AlignmentOptions
-from slam_backend.maps.landmark_map import FIELDS, LandmarkMap
+from slam_backend.maps.landmark_map import FIELDS, LandmarkMap, unchecked_map
 from slam_backend.models.camera import StereoCamera
 from slam_backend.models.measurements import Measurements, TeamMeasurements
 from slam_backend.models.odometry import OdometryModel
@@ -49,6 +49,6 @@ def _parts_of_map(landmarks: LandmarkMap) -> list[Any]:
 BACKEND_KINDS = Kinds(
     (*CONFIGURATIONS, *RECORDS),
     # A mixture's covariances are symmetric but for rounding: the constructor would change them.
-    {LandmarkMap: Kind("LandmarkMap", _parts_of_map, LandmarkMap._trusted)},
+    {LandmarkMap: Kind("LandmarkMap", _parts_of_map, unchecked_map)},
 ).with_others(SEEDS)
 """All classes of this package whose objects may stand in the states of `FastSlam` and `TeamSlam`."""

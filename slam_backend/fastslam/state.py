@@ -1,18 +1,22 @@
-"""State of `FastSlam`: poses, weights, maps, logs and the random stream, changed as a whole and snapshotted."""
+"""`FilterState`: all that a filter holds, and how a step, a resampling, a rejuvenation or a merge changes it."""
 
 import copy
 from collections.abc import Mapping, Sequence
-from typing import Any
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from slam_backend.core.state_checks import CURE, generator_of, refusing
-from slam_backend.core.validation import FloatArray, Int32Array, IntArray, bad_argument, check_int, check_seed
-from slam_backend.fastslam._kernels import add_share
+from slam_backend.core.packed_symmetric import UNPACK, UPPER
+from slam_backend.core.state_checks import generator_of
+from slam_backend.core.validation import FloatArray, Int32Array, IntArray, check_int, check_seed
+from slam_backend.fastslam import _kernels
+from slam_backend.fastslam._kernels import IDLE, PLACED, add_share
 from slam_backend.fastslam._kernels.layout import (
     ASSOCIATED,
     CAMERA,
     COVARIANCES,
+    CREATED,
     LOG_WEIGHTS,
     MEANS,
     NUM_MEASURED,
@@ -30,92 +34,19 @@ from slam_backend.fastslam.existence import ExistenceStep
 from slam_backend.fastslam.options import MOST_ROBOTS, FilterOptions, assumed, spans_of
 from slam_backend.fastslam.particle_maps import ParticleMaps, aligned_zeros
 from slam_backend.fastslam.rejuvenation import RejuvenationStep, write_maps
-from slam_backend.fastslam.reports import PoseEstimates
+from slam_backend.fastslam.reports import PoseEstimates, RejuvenationReport
 from slam_backend.fastslam.run_log import RobotLog
-from slam_backend.fastslam.state_checks import KEPT, POSE_FIELDS, check_filter, last_step
+from slam_backend.fastslam.state_checks import KEPT
 from slam_backend.fastslam.step_input import Seats, StepInput
+from slam_backend.geometry import compose, rotation, wrap_angle
+from slam_backend.resampling import RESAMPLING
 from slam_backend.smoother.rejuvenation import Particles
-
-
-class FilterArrays:
-    """What K robots and M particles of a filter hold without their maps, in P lanes; those beyond M mean nothing.
-
-    All names but the attributes are views. Poses are in the map frame.
-
-    Attributes:
-        num_particles: M.
-        _of_robots: (5, K, 3, P) float64. `_poses`, `_starts`, `_means`, and in the last two `_covariances`.
-        _of_particles: (4, P) float64. `_log_weights`, `_path_log_weights`, `_weights`, and what a step adds to them.
-        _blind: (K,) int64. 1 where N(x^, P^) was propagated since the last sighting, else 0.
-        _frame: (3, 3) float64 [m, m, rad]. Covariance of a motion of the whole map that the particles do not show, as
-            their frame was held when they were drawn anew; estimates have their share of it.
-        _found, _distances: (n, P) int32, float64. Room for what is made of measurements within a step, see
-            `update_fastslam2`.
-    """
-
-    def _make_arrays(self, num_robots: int, num_particles: int, padded: int) -> None:
-        """Begin with all robots at the origin and equal weights."""
-        self.num_particles = num_particles
-        self._of_robots: FloatArray = aligned_zeros((5, num_robots, 3, padded), np.float64)
-        self._of_particles: FloatArray = aligned_zeros((4, padded), np.float64)
-        self._log_weights[:] = -np.log(num_particles)
-        self._weights[:] = 1.0 / num_particles
-        self._blind: IntArray = np.zeros(num_robots, np.int64)
-        self._frame: FloatArray = np.zeros((3, 3))
-        self._found: Int32Array = np.empty((0, padded), np.int32)
-        self._distances: FloatArray = np.empty((0, padded))
-
-    def _make_room_for(self, count: int) -> None:
-        """Provide room for what is made of so many measurements, and more."""
-        shape = 2 * count, self._found.shape[1]
-        self._found, self._distances = np.empty(shape, np.int32), np.empty(shape)
-
-    @property
-    def num_robots(self) -> int:
-        """K."""
-        return int(self._of_robots.shape[1])
-
-    @property
-    def _poses(self) -> FloatArray:
-        """(K, 3, P) [m, m, rad]. Of each robot (x_t^[m])."""
-        return np.asarray(self._of_robots[POSES])
-
-    @property
-    def _starts(self) -> FloatArray:
-        """(K, 3, P) likewise. Where each robot started; spreads at a merge."""
-        return np.asarray(self._of_robots[STARTS])
-
-    @property
-    def _means(self) -> FloatArray:
-        """(K, 3, P) likewise: with `_covariances` N(x^, P^) of each particle before sampling."""
-        return np.asarray(self._of_robots[MEANS])
-
-    @property
-    def _covariances(self) -> FloatArray:
-        """(K, 6, P) upper triangles."""
-        return self._of_robots[COVARIANCES:].reshape(self.num_robots, 6, -1)
-
-    @property
-    def _log_weights(self) -> FloatArray:
-        """(M,) since the last resampling, normalised."""
-        return np.asarray(self._of_particles[LOG_WEIGHTS, : self.num_particles])
-
-    @property
-    def _path_log_weights(self) -> FloatArray:
-        """(M,) accumulated along the ancestral line (Eq. 12)."""
-        return np.asarray(self._of_particles[PATH_LOG_WEIGHTS, : self.num_particles])
-
-    @property
-    def _weights(self) -> FloatArray:
-        """(M,) as the last step left them, summing to 1."""
-        return np.asarray(self._of_particles[WEIGHTS, : self.num_particles])
-
 
 LONGEST = 32  # steps that wait
 ROOM = 16 * LONGEST  # for measurements at first
 
 
-class Journal:
+class PendingSteps:
     """Steps that wait; kernels write into its arrays.
 
     Args:
@@ -149,7 +80,7 @@ class Journal:
         self.steps.clear()
         self.num_measured = 0
 
-    def write_down(self, logs: Sequence[RobotLog], smoother: RejuvenationStep | None) -> None:
+    def flush(self, logs: Sequence[RobotLog], smoother: RejuvenationStep | None) -> None:
         """Enter what waits into the logs of K robots, and tell the smoother of the filter, if it has one.
 
         A step in which a robot did nothing and was given no measurement gets no row.
@@ -165,7 +96,7 @@ class Journal:
         self.clear()
 
 
-def tell_refused(smoother: RejuvenationStep, step: int, inputs: StepInput, seats: Seats, told: IntArray) -> None:
+def note_refused(smoother: RejuvenationStep, step: int, inputs: StepInput, seats: Seats, told: IntArray) -> None:
     """Tell the smoother what of a step's measurements, those with names left out, was neither matched nor new."""
     for robot, row in seats.heard:
         _, begin, end, _, named, _ = inputs.turns[row]
@@ -173,148 +104,345 @@ def tell_refused(smoother: RejuvenationStep, step: int, inputs: StepInput, seats
             smoother.note_refused(robot, step, told[ASSOCIATED, begin:end], inputs.descriptors[begin:end])
 
 
-class FilterState(FilterArrays):
-    """What a filter of K robots with M particles holds.
+class StepSummary(NamedTuple):
+    """Outcome of a step, but for the association of each measurement.
 
     Attributes:
-        options: What it assumes and how it decides.
-        may_smooth: Whether it may in the next step; filters of a team take turns.
-        _from_origin: Whether all robots started at the origin, as in a filter that was never merged.
-        _spans: Whose turns are taken in each call; where existence is kept, one by one.
-        _best: Index of the largest weight along paths.
-        _maps: The landmarks of all particles.
-        _estimates: The poses of all robots over all particles; written to in each step.
-        _journal: What the last steps came to that the logs do not hold yet.
-        _consistency: Whether it errs as little as it claims, as far as its frames tell.
-        _steps: Number of the next step.
-        _rng: The filter's own random stream.
+        long_unseen: Measurements matched to landmarks that were not seen for long.
+        created, new, matched, rejected, ess, nis: See `StepReport`.
+        is_depleted: Whether the effective sample size fell below the threshold of resampling.
     """
 
-    def _set_up(self, num_robots: int, options: FilterOptions, seed: Any, num_particles: int | None = None) -> None:
-        """Begin with all robots at the origin and no landmarks; with `num_particles` in place of the options' own."""
+    long_unseen: int
+    created: int
+    new: int
+    matched: int
+    rejected: int
+    ess: float
+    nis: float
+    is_depleted: bool
+
+
+class FilterState:
+    """State of a filter of K robots with M particles, in P lanes; lanes beyond M mean nothing.
+
+    Poses are in the map frame. `poses`, `starts`, `means`, `covariances` and the weights are views of the two arrays
+    that the kernels take.
+
+    Args:
+        num_robots: K. All robots start at the origin of the map frame.
+        options: What the filter assumes and how it decides.
+        seed: An int, a `numpy.random.SeedSequence` or a Generator.
+        num_particles: M; None: that of `options`.
+
+    Attributes:
+        options: As given.
+        num_particles: M.
+        pose_arrays: (5, K, 3, P) float64: `poses`, `starts`, `means`, and in the last two `covariances`.
+        weight_arrays: (4, P) float64: `log_weights`, `path_log_weights`, `weights`, and the increments of a step.
+        propagated_only: (K,) int64. 1 where N(x^, P^) was only propagated since the last match, else 0.
+        gauge_covariance: (3, 3) float64 [m, m, rad]. Covariance of a motion of the whole map that the particles do not
+            show, because their frame was fixed when they were sampled from smoothed paths; estimates include it.
+        maps: Landmarks of all particles.
+        estimates: Poses of all robots over all particles; written in each step.
+        best: Index of the most probable particle, by accumulated log-weight (Eq. 12).
+        starts_at_origin: Whether all robots started at the origin, as in a filter that was never merged.
+        next_step: Number of the next step.
+        consistency: Running test of whether the errors are as small as the filter claims.
+        existence: Update of the landmarks' log-odds of existence, or None.
+        rejuvenation: Schedule and graph of the smoother, or None.
+        rng: Random stream of the filter.
+
+    Raises:
+        ValueError: If `num_robots` or `seed` is out of its range.
+    """
+
+    def __init__(self, num_robots: int, options: FilterOptions, seed: Any, num_particles: int | None = None) -> None:
         k = check_int("num_robots", num_robots, 1, "Use at least one robot.", MOST_ROBOTS)
         m = options.num_particles if num_particles is None else num_particles
-        self.options = options
-        self.may_smooth = True
-        self._rng = np.random.default_rng(check_seed(seed))
-        self._assumed = assumed(options)
-        self._camera = self._assumed[CAMERA:RECOVERY]
         existence = options.existence
-        self._existence = None if existence is None else ExistenceStep(existence, options.camera)
-        self._spans = spans_of(k, existence is not None)
-        self._rejuvenation = None if options.rejuvenate_every is None else RejuvenationStep(options, k)
-        self._maps = ParticleMaps(m, None if existence is None else existence.log_odds_prior)
-        self._make_arrays(k, m, self._maps.padded)
-        self._from_origin = True
-        self._best = 0
-        self._steps = 0
-        self._robot_logs = [RobotLog() for _ in range(k)]
-        self._journal = Journal(k)
-        self._consistency = ConsistencyTest()
-        self._estimates = self._mixtures()
+        self.options = options
+        self.num_particles = m
+        self.rng = np.random.default_rng(check_seed(seed))
+        self.packed_options = assumed(options)
+        self.packed_camera = self.packed_options[CAMERA:RECOVERY]
+        self.existence = None if existence is None else ExistenceStep(existence, options.camera)
+        self.rejuvenation = None if options.rejuvenate_every is None else RejuvenationStep(options, k)
+        self.maps = ParticleMaps(m, None if existence is None else existence.log_odds_prior)
+        padded = self.maps.padded
+        self.pose_arrays: FloatArray = aligned_zeros((5, k, 3, padded), np.float64)
+        self.weight_arrays: FloatArray = aligned_zeros((4, padded), np.float64)
+        self.log_weights[:] = -np.log(m)
+        self.weights[:] = 1.0 / m
+        self.propagated_only: IntArray = np.zeros(k, np.int64)
+        self.gauge_covariance: FloatArray = np.zeros((3, 3))
+        self.starts_at_origin = True
+        self.best = 0
+        self.next_step = 0
+        self.consistency = ConsistencyTest()
+        self.estimates = self._mixtures()
+        self._batches = spans_of(k, existence is not None)  # robots of each kernel call: one by one with existence
+        self._logs = [RobotLog() for _ in range(k)]
+        self._pending = PendingSteps(k)  # not in the logs yet
+        self._associations: Int32Array = np.empty((0, padded), np.int32)  # work space of `update_fastslam2`
+        self._mahalanobis_sq: FloatArray = np.empty((0, padded))
+
+    def start_at(self, poses: FloatArray) -> None:
+        """Let the robots start at poses (K, 3) [m, m, rad], map frame, without uncertainty."""
+        self.poses[:] = poses[:, :, None]
+        self.poses[:, 2] = wrap_angle(self.poses[:, 2])
+        self.starts[:] = self.means[:] = self.poses
+        self._refresh_starts()
+        self.estimates = self._mixtures()
 
     @property
-    def best_particle(self) -> int:
-        """Index of the most probable particle, by accumulated log-weight (Eq. 12)."""
-        return self._best
+    def num_robots(self) -> int:
+        """Number of robots, K."""
+        return int(self.pose_arrays.shape[1])
+
+    @property
+    def poses(self) -> FloatArray:
+        """Poses x_t^[m] of the robots, (K, 3, P) [m, m, rad]."""
+        return np.asarray(self.pose_arrays[POSES])
+
+    @property
+    def starts(self) -> FloatArray:
+        """Start poses of the robots, (K, 3, P) [m, m, rad]; they spread at a merge."""
+        return np.asarray(self.pose_arrays[STARTS])
+
+    @property
+    def means(self) -> FloatArray:
+        """Means of N(x^, P^), each particle's pose before sampling, (K, 3, P) [m, m, rad]."""
+        return np.asarray(self.pose_arrays[MEANS])
+
+    @property
+    def covariances(self) -> FloatArray:
+        """Covariances of N(x^, P^), (K, 6, P), upper triangles."""
+        return self.pose_arrays[COVARIANCES:].reshape(self.num_robots, 6, -1)
+
+    @property
+    def log_weights(self) -> FloatArray:
+        """Log-weights since the last resampling, normalised, (M,)."""
+        return np.asarray(self.weight_arrays[LOG_WEIGHTS, : self.num_particles])
+
+    @property
+    def path_log_weights(self) -> FloatArray:
+        """Log-weights accumulated along the ancestral line (Eq. 12), (M,)."""
+        return np.asarray(self.weight_arrays[PATH_LOG_WEIGHTS, : self.num_particles])
+
+    @property
+    def weights(self) -> FloatArray:
+        """Weights after the last step, summing to 1, (M,)."""
+        return np.asarray(self.weight_arrays[WEIGHTS, : self.num_particles])
 
     def _mixtures(self) -> PoseEstimates:
         """Return the robots' poses over all particles, map frame. Fresh arrays."""
-        return pose_mixtures(self._means, self._covariances, self._weights)
+        return pose_mixtures(self.means, self.covariances, self.weights)
 
-    def _widen(self) -> None:
-        """Give the mixtures of the poses, as the particles show them, their share of what these do not show."""
-        if self._frame.any():
-            add_share(self._frame, *self._estimates)
+    def _refresh_starts(self) -> None:
+        """Update `starts_at_origin` after the start poses were written."""
+        self.starts_at_origin = not self.starts[:, :, : self.num_particles].any()
 
-    def _look_at_starts(self) -> None:
-        """Take note of whether all robots start at the origin of the map frame; asked for when that was written."""
-        self._from_origin = not self._starts[:, :, : self.num_particles].any()
+    def _refresh_best(self) -> None:
+        """Update `best` after the weights along paths were written."""
+        self.best = int(self.path_log_weights.argmax())
 
-    def _look_at_weights(self) -> None:
-        """Take note of which particle is the most probable; asked for when the weights along paths were written."""
-        self._best = int(self._path_log_weights.argmax())
+    # ------------------------------------------------------------------ one step
 
-    # ------------------------------------------------------------------ other particles, other robots
+    def update(self, inputs: StepInput, seats: Seats, told: IntArray) -> StepSummary:
+        """Move all robots, match what they saw, weigh and update (Algorithm 1, l. 6-8).
 
-    def _renew(self, new: Particles) -> None:
-        """Go on with M particles from smoothed paths; the old ones' most probable says which landmarks there are."""
+        Where a robot did and saw nothing no random number is drawn.
+
+        Args:
+            inputs: What these robots, and perhaps others, read.
+            seats: Rows of these robots there.
+            told: (2, n) int64, written: what becomes of their measurements, see `Findings`.
+        """
+        maps, pending = self.maps, self._pending
+        active = used = 0
+        for robot, row in seats.heard:
+            act, begin, end, _, _, _ = inputs.turns[row]
+            active, used = active + (act != IDLE), used + end - begin
+            if act == PLACED:
+                self._set_exact_pose(robot, inputs.moves[row])
+        if used:
+            maps.make_room(used, inputs.descriptors.shape[1])
+            if len(self._associations) < len(inputs.sightings):
+                shape = 2 * len(inputs.sightings), maps.padded
+                self._associations, self._mahalanobis_sq = np.empty(shape, np.int32), np.empty(shape)
+        if len(pending.steps) == LONGEST:
+            pending.flush(self._logs, self.rejuvenation)
+        pending.make_room(used)
+        now = 0 if self.rejuvenation is None else self.rejuvenation.steps + 1
+        normals = self.rng.standard_normal((active, maps.num_particles, 3))
+        means, covariances = self.estimates
+        deleted: list[IntArray] = []
+        for low, high, is_over in self._batches:
+            summary = _kernels.take_turns(
+                low, high, is_over, now, self.packed_options, seats.array, inputs.table, inputs.moves, normals,
+                self.pose_arrays, self.propagated_only, self.weight_arrays, self.gauge_covariance,
+                maps.values, maps.counts, maps.odds, maps.table, maps.maps, maps.users, maps.free_rows, maps.tops,
+                maps.descriptors, maps.heads, inputs.sightings, inputs.descriptors, inputs.names,
+                self._associations, self._mahalanobis_sq, told, means, covariances,
+                pending.noted[len(pending.steps)], pending.measured, pending.num_measured,
+            )  # fmt: skip
+            if self.existence is not None and not is_over and (row := seats.rows[low]) >= 0:
+                _, begin, end, _, _, count = inputs.turns[row]
+                if count >= 0:
+                    found, new_slots = self._associations[begin:end], told[CREATED, begin:end]
+                    deleted.append(self.existence.weigh(maps, self.poses[low], self.best, found, new_slots))
+        self.best, long_unseen, created, new, matched, rejected, ess, nis, is_depleted = summary
+        pending.steps.append(self.next_step)
+        pending.num_measured += used
+        if used:
+            self.consistency.note(self.next_step, nis, ess / self.num_particles, used, used - new - matched)
+        if rejected and self.rejuvenation is not None:
+            note_refused(self.rejuvenation, self.next_step, inputs, seats, told)
+        self.next_step += 1
+        for slots in deleted:  # only now: until here their ids were asked for
+            maps.release(slots)
+        return StepSummary(long_unseen, created, new, matched, rejected, ess, nis, is_depleted)
+
+    def _set_exact_pose(self, robot: int, pose: FloatArray) -> None:
+        """Set a robot's pose in all particles from an exact one (3,) [m, m, rad] in its own start frame."""
+        count = self.num_particles
+        self.poses[robot, :, :count] = compose(self.starts[robot, :, :count].T.copy(), pose).T
+        self.gauge_covariance.fill(0.0)
+
+    def resample(self) -> None:
+        """Resample the particles in proportion to their weights, with all that they hold."""
+        ancestors = RESAMPLING[self.options.resampling](self.weights, self.rng, self.num_particles)
+        self.best = self.maps.resample(ancestors, self.pose_arrays, self.weight_arrays)
+
+    def rejuvenate(self, smoother: RejuvenationStep) -> RejuvenationReport | None:
+        """Sample the particles from the smoothed paths, if it is time and those can be found."""
+        if smoother.rests(self.logs):
+            return None
+        starts = self.starts[:, :, : self.num_particles]
+        result = smoother.run(self.logs, starts, self.maps, self.best, self.packed_camera, self.rng)
+        if result is None:
+            return None
+        if result.particles is not None:
+            self._replace_particles(result.particles)
+        return RejuvenationReport(result.reason, result.ess, result.iterations, result.graph.num_keys)
+
+    def _replace_particles(self, new: Particles) -> None:
+        """Go on with M particles from smoothed paths; landmarks are those of the most probable particle so far."""
         m = self.num_particles
-        write_maps(self._maps, self.best_particle, new, self.options.landmark_walk)
-        self._poses[:, :, :m], self._starts[:, :, :m] = new.poses, new.starts
-        self._look_at_starts()
-        self._means[:] = self._poses
-        self._covariances.fill(0.0)
-        self._frame[:] = new.frame
-        self._blind.fill(0)
-        self._log_weights[:], self._path_log_weights[:] = new.log_weights, new.log_densities
-        self._look_at_weights()
-        self._weights[:] = np.exp(new.log_weights)
-        self._estimates.means[:], self._estimates.covariances[:] = new.means, new.covariances
+        write_maps(self.maps, self.best, new, self.options.landmark_walk)
+        self.poses[:, :, :m], self.starts[:, :, :m] = new.poses, new.starts
+        self._refresh_starts()
+        self.means[:] = self.poses
+        self.covariances.fill(0.0)
+        self.gauge_covariance[:] = new.frame
+        self.propagated_only.fill(0)
+        self.log_weights[:], self.path_log_weights[:] = new.log_weights, new.log_densities
+        self._refresh_best()
+        self.weights[:] = np.exp(new.log_weights)
+        self.estimates.means[:], self.estimates.covariances[:] = new.means, new.covariances
+
+    @property
+    def logs(self) -> list[RobotLog]:
+        """Per robot what it did and measured so far, and which landmarks that was associated with."""
+        if self._pending.steps:
+            self._pending.flush(self._logs, self.rejuvenation)
+        return self._logs
+
+    # ------------------------------------------------------------------ other robots
 
     def reorder(self, order: IntArray) -> None:
         """Renumber the robots: robot i becomes the one that was `order[i]`; (K,) a permutation."""
-        for name in (*POSE_FIELDS, "_blind"):
-            array = getattr(self, name)
+        for array in (self.poses, self.starts, self.means, self.covariances, self.propagated_only):
             array[:] = array[order]
-        self._robot_logs = [self._logs[robot] for robot in order]
-        self._estimates = PoseEstimates(*(of_all[order] for of_all in self._estimates))
-        if self._rejuvenation is not None:
-            self._rejuvenation.reorder(order)
+        self._logs = [self.logs[robot] for robot in order]
+        self.estimates = PoseEstimates(*(of_all[order] for of_all in self.estimates))
+        if self.rejuvenation is not None:
+            self.rejuvenation.reorder(order)
 
-    # ------------------------------------------------------------------ what a step leaves behind
+    @classmethod
+    def joined(
+        cls, a: "FilterState", from_a: IntArray, b: "FilterState", from_b: IntArray, motion: FloatArray,
+        evidence: FloatArray, rng: np.random.Generator,
+    ) -> "FilterState":  # fmt: skip
+        """Return the state of both groups' robots, a's first, in a's map frame, still without landmarks.
 
-    @property
-    def _logs(self) -> list[RobotLog]:
-        """Per robot what it did and measured so far, and which landmarks that was taken for."""
-        if self._journal.steps:
-            self._write_down()
-        return self._robot_logs
+        Args:
+            a, b: State of either group.
+            from_a, from_b: (M,) particles of either that each joint particle pairs.
+            motion: (M, 3) [m, m, rad], frame a from frame b, of each joint particle.
+            evidence: (M,) log-weight of each pair.
+            rng: Seeds the joint filter's own stream.
+        """
+        count, k = len(motion), a.num_robots
+        same = a.options.num_particles == count
+        options = a.options if same else replace(a.options, num_particles=count)
+        joint = cls(k + b.num_robots, options, np.random.default_rng(rng.integers(2**63, size=4)))
+        for target, of_a, of_b in zip(joint.pose_arrays[:3], a.pose_arrays, b.pose_arrays, strict=False):
+            target[:k, :, :count] = of_a[:, :, from_a]
+            target[k:, :, :count] = compose(motion, of_b[:, :, from_b].transpose(0, 2, 1)).transpose(0, 2, 1)
+        joint._refresh_starts()
+        turn = np.zeros((count, 3, 3))
+        turn[:, :2, :2], turn[:, 2, 2] = rotation(motion[:, 2]), 1.0
+        spread_b = b.covariances[:, :, from_b].transpose(0, 2, 1)[..., UNPACK]
+        moved = turn @ spread_b @ turn.transpose(0, 2, 1)
+        joint.covariances[:k, :, :count] = a.covariances[:, :, from_a]
+        joint.covariances[k:, :, :count] = moved[..., *UPPER].transpose(0, 2, 1)
+        joint.propagated_only[:] = np.concatenate([a.propagated_only, b.propagated_only])
+        joint.gauge_covariance[:] = a.gauge_covariance
+        joint.path_log_weights[:] = a.path_log_weights[from_a] + b.path_log_weights[from_b] + evidence
+        return joint
 
-    def _write_down(self) -> None:
-        """Enter into the logs, and tell the smoother, what the steps in the journal came to."""
-        self._journal.write_down(self._robot_logs, self._rejuvenation)
+    def finish_join(self, a: "FilterState", b: "FilterState", renamed: IntArray) -> None:
+        """Take over the step count, warnings, logs and smoothers of two groups, once the joint map is loaded.
+
+        Args:
+            a, b: State of either group.
+            renamed: (n, 2) int64 rows (id in b, id in the joint map) of all of b's landmarks.
+        """
+        self._refresh_best()
+        self.next_step = max(a.next_step, b.next_step)
+        self.consistency = ConsistencyTest.joined(a.consistency, b.consistency)
+        self.estimates = self._mixtures()
+        if self.gauge_covariance.any():
+            add_share(self.gauge_covariance, *self.estimates)
+        self._logs = [log.copy() for log in a.logs] + [log.renamed(renamed[:, 0], renamed[:, 1]) for log in b.logs]
+        if self.rejuvenation is not None and a.rejuvenation is not None and b.rejuvenation is not None:
+            starts = [state.starts[:, :, : state.num_particles] for state in (a, b, self)]
+            frames = a.gauge_covariance, b.gauge_covariance
+            self.rejuvenation.join(a.rejuvenation, b.rejuvenation, starts, frames, renamed, self.packed_camera)
 
     # ------------------------------------------------------------------ snapshots
 
     def get_state(self) -> dict[str, Any]:
         """Return all that decides how the filter goes on, its random stream included. Shares nothing with it."""
-        logs = tuple(log.get_state() for log in self._logs)  # first, for it tells the smoother as well
+        logs = tuple(log.get_state() for log in self.logs)  # first, for it informs the smoother as well
         state: dict[str, Any] = {name: getattr(self, name).copy() for name in KEPT}
-        state |= {"steps": self._steps, "estimates": self._estimates.copy(), "maps": self._maps.get_state()}
-        state |= {"logs": logs, "consistency": self._consistency.get_state()}
-        if self._rejuvenation is not None:
-            state["rejuvenation"] = self._rejuvenation.get_state()
-        return state | {"options": self.options, "rng": copy.deepcopy(self._rng.bit_generator.state)}
+        state |= {"steps": self.next_step, "estimates": self.estimates.copy(), "maps": self.maps.get_state()}
+        state |= {"logs": logs, "consistency": self.consistency.get_state()}
+        if self.rejuvenation is not None:
+            state["rejuvenation"] = self.rejuvenation.get_state()
+        return state | {"options": self.options, "rng": copy.deepcopy(self.rng.bit_generator.state)}
 
-    def set_state(self, state: Mapping[str, Any]) -> None:
-        """Go on exactly as the filter that gave `state`.
-
-        Raises:
-            ValueError: If `state` is not one of `get_state`.
-        """
-        with refusing("state"):
-            check_filter("state", state, (self.options,))
-        if (last := max(map(last_step, state["logs"]))) >= state["steps"]:
-            raise bad_argument("state['steps']", f"an int > {last}, the last step logged", state["steps"], CURE)
-        self._go_on_from(state)
-
-    def _go_on_from(self, state: Mapping[str, Any]) -> None:
-        """Go on from a state that was checked."""
-        shapes = [state[name].shape == getattr(self, name).shape for name in ("_poses", "_weights")]
-        same = state["options"] == self.options and all(shapes)
-        if not same:
-            self._set_up(len(state["_poses"]), state["options"], 0, len(state["_weights"]))
+    @classmethod
+    def restored(cls, state: Mapping[str, Any], previous: "FilterState") -> "FilterState":
+        """Return a state from a snapshot that was checked, in the arrays of `previous` if they fit."""
+        shapes = [state[name].shape == getattr(previous, name).shape for name in ("poses", "weights")]
+        if state["options"] == previous.options and all(shapes):
+            self = previous
+        else:
+            self = cls(len(state["poses"]), state["options"], 0, len(state["weights"]))
         for name in KEPT:
             getattr(self, name)[:] = state[name]
-        self._look_at_starts()
-        self._look_at_weights()
-        self._maps.set_state(state["maps"])
-        self._journal.clear()
-        for log, logged in zip(self._robot_logs, state["logs"], strict=True):
+        self._refresh_starts()
+        self._refresh_best()
+        self.maps.set_state(state["maps"])
+        self._pending.clear()
+        for log, logged in zip(self._logs, state["logs"], strict=True):
             log.set_state(logged)
-        if self._rejuvenation is not None:
-            self._rejuvenation.set_state(state["rejuvenation"])
-        self._consistency.set_state(state["consistency"])
-        self._steps, self._estimates = state["steps"], state["estimates"].copy()
-        self._rng = generator_of(state["rng"])  # of its own: the old one may be the caller's, or of another kind
+        if self.rejuvenation is not None:
+            self.rejuvenation.set_state(state["rejuvenation"])
+        self.consistency.set_state(state["consistency"])
+        self.next_step, self.estimates = state["steps"], state["estimates"].copy()
+        self.rng = generator_of(state["rng"])  # a new one: the old one may be the caller's, or of another kind
+        return self

@@ -48,8 +48,8 @@ from slam_backend.smoother.graph import NONE, PathGraph
 from slam_backend.smoother.log_arrays import EXACT, REJECTED, STOOD, LogArrays, has_been_checked, note_checked
 from slam_backend.smoother.reassociation import Refused
 
-POSE_FIELDS = ("_poses", "_starts", "_means", "_covariances")  # (K, 3 or 6, P), of each robot
-KEPT = (*POSE_FIELDS, "_frame", "_blind", "_log_weights", "_path_log_weights", "_weights")
+POSE_FIELDS = ("poses", "starts", "means", "covariances")  # (K, 3 or 6, P), of each robot
+KEPT = (*POSE_FIELDS, "gauge_covariance", "propagated_only", "log_weights", "path_log_weights", "weights")
 OTHERS_KEPT = ("steps", "estimates", "maps", "logs", "consistency", "options", "rng")
 LONGEST_DESCRIPTOR = 1 << 16
 MOST_LANDMARKS = 1 << 30  # names of landmarks: tables are as long as the largest of them
@@ -76,20 +76,20 @@ def check_filter(name: str, state: Any, known: Sequence[FilterOptions] = ()) -> 
     check_options(f"{name}['options']", options, FilterOptions, known)
     if not any(options is other or options == other for other in known):
         _check_fit(f"{name}['options']", options)
-    weights = state["_weights"]
-    check_floats(f"{name}['_weights']", weights, (None,), 0.0, 1.0)
+    weights = state["weights"]
+    check_floats(f"{name}['weights']", weights, (None,), 0.0, 1.0)
     m = len(weights)
-    poses = state["_poses"]
-    check_kept(f"{name}['_poses']", poses, FLOAT64, (None, 3, -(-m // LANES) * LANES))
+    poses = state["poses"]
+    check_kept(f"{name}['poses']", poses, FLOAT64, (None, 3, -(-m // LANES) * LANES))
     k, _, padded = poses.shape
     if not 1 <= k <= MOST_ROBOTS or m < 1 or not abs(float(weights.sum()) - 1.0) < 1e-6:
         refuse(name, "robots, particles, and weights that sum to 1", f"{k} robots, weights of {m} particles")
     for part in POSE_FIELDS[:3]:
         check_floats(f"{name}[{part!r}]", state[part], (k, 3, padded), -FARTHEST, FARTHEST, m)
-    check_floats(f"{name}['_covariances']", state["_covariances"], (k, 6, padded), -LARGEST, LARGEST, m)
-    check_floats(f"{name}['_frame']", state["_frame"], (3, 3))
-    check_indices(f"{name}['_blind']", state["_blind"], (k,), 0, 1)
-    for part in ("_log_weights", "_path_log_weights"):
+    check_floats(f"{name}['covariances']", state["covariances"], (k, 6, padded), -LARGEST, LARGEST, m)
+    check_floats(f"{name}['gauge_covariance']", state["gauge_covariance"], (3, 3))
+    check_indices(f"{name}['propagated_only']", state["propagated_only"], (k,), 0, 1)
+    for part in ("log_weights", "path_log_weights"):
         check_floats(f"{name}[{part!r}]", state[part], (m,), LEAST, LARGEST)
     check_whole(f"{name}['steps']", state["steps"])
     check_estimates(f"{name}['estimates']", state["estimates"], k)

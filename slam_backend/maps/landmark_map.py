@@ -138,22 +138,6 @@ class LandmarkMap:
         for name, array in fields.items():
             object.__setattr__(self, name, as_read_only(array))
 
-    @classmethod
-    def _trusted(
-        cls,
-        means: FloatArray,
-        covariances: FloatArray,
-        descriptors: NDArray[np.float32],
-        counts: IntArray,
-        ids: IntArray,
-    ) -> Self:
-        """Build a map in a hot loop: no copies, no checks. The caller must not write to the arrays afterwards."""
-        self = object.__new__(cls)
-        arrays: tuple[NDArray[Any], ...] = (means, covariances, descriptors, counts, ids)
-        for name, array in zip(FIELDS, arrays, strict=True):
-            object.__setattr__(self, name, as_read_only(array))
-        return self
-
     def __len__(self) -> int:
         return len(self.means)
 
@@ -169,7 +153,7 @@ class LandmarkMap:
         check_int("descriptor_size", descriptor_size, 0, "Give the length of a descriptor.")
         return cls(np.empty((0, 3)), np.empty((0, 3, 3)), np.empty((0, descriptor_size), np.float32))
 
-    def moved(self, a_from_b: ArrayLike) -> Self:
+    def moved(self, a_from_b: ArrayLike) -> "LandmarkMap":
         """Express this map, given in frame b, in frame a; the motion is taken as exact.
 
         Args:
@@ -183,7 +167,7 @@ class LandmarkMap:
             ValueError: If `a_from_b` is no pose.
         """
         pose = check_array("a_from_b", a_from_b, (3,), "Give a pose (x, y, theta).")
-        return self._trusted(
+        return unchecked_map(
             transform_points(pose, self.means),
             rotate_covariances(float(pose[2]), self.covariances),
             self.descriptors,
@@ -191,7 +175,7 @@ class LandmarkMap:
             self.ids,
         )
 
-    def subset(self, indices: ArrayLike) -> Self:
+    def subset(self, indices: ArrayLike) -> "LandmarkMap":
         """Return some of the landmarks, in the order asked for.
 
         Args:
@@ -202,14 +186,14 @@ class LandmarkMap:
         """
         chosen = np.asarray(indices)
         if chosen.dtype == np.bool_ and chosen.shape == (len(self),):
-            return self._trusted(*(getattr(self, name)[chosen] for name in FIELDS))
+            return unchecked_map(*(getattr(self, name)[chosen] for name in FIELDS))
         cure = f"Give integers from 0 to {len(self) - 1}, or a mask of shape ({len(self)},)."
         if chosen.ndim != 1 or not (chosen.size == 0 or np.issubdtype(chosen.dtype, np.integer)):
             raise bad_argument("indices", "(k,) integers or a mask", f"an array {chosen.dtype} {chosen.shape}", cure)
         rows = chosen.astype(np.int64)
         if rows.size and (rows.min() < 0 or rows.max() >= len(self) or len(np.unique(rows)) < len(rows)):
             raise bad_argument("indices", "rows of the map, each at most once", rows.tolist(), cure)
-        return self._trusted(*(getattr(self, name)[rows] for name in FIELDS))
+        return unchecked_map(*(getattr(self, name)[rows] for name in FIELDS))
 
     def save(self, path: str | Path) -> None:
         """Write the map to `path`, exactly as named, as a numpy archive that `load` reads back bit for bit.
@@ -270,3 +254,14 @@ def _checked_integers(name: str, value: Any, n: int, minimum: int) -> IntArray:
         raise bad_argument(name, f"integers >= {minimum}", as_float.tolist(), cure)
     array: IntArray = check_array(name, value, (n,), cure, dtype=np.int64)
     return array
+
+
+def unchecked_map(
+    means: FloatArray, covariances: FloatArray, descriptors: NDArray[np.float32], counts: IntArray, ids: IntArray
+) -> LandmarkMap:
+    """Build a map in a hot loop: no copies, no checks. The caller must not write to the arrays afterwards."""
+    result = object.__new__(LandmarkMap)
+    arrays: tuple[NDArray[Any], ...] = (means, covariances, descriptors, counts, ids)
+    for name, array in zip(FIELDS, arrays, strict=True):
+        object.__setattr__(result, name, as_read_only(array))
+    return result

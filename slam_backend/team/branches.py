@@ -113,8 +113,8 @@ class ReplayedStep(NamedTuple):
 
 def restored_filter(state: Mapping[str, Any], at_hand: FastSlam | None = None) -> FastSlam:
     """Return a filter that goes on from `FastSlam.get_state`; one at hand is filled, which is faster than building."""
-    slam = at_hand if at_hand is not None else FastSlam.from_options(len(state["_poses"]), state["options"])
-    slam._go_on_from(state)
+    slam = at_hand if at_hand is not None else FastSlam.from_options(len(state["poses"]), state["options"])
+    slam.go_on_from(state)
     return slam
 
 
@@ -167,8 +167,7 @@ def take_in(branch: Branch, step: int, intake: Intake, inputs: StepInput, findin
         return report
     slam = branch.filter
     slam.may_smooth = step % TURNS in turns
-    slam._steps = step
-    branch.report = report = slam._step_checked(inputs, seats, findings)
+    branch.report = report = slam.step_checked(inputs, seats, findings, step)
     if report.num_created:
         for watch in branch.watches:
             watch.note(branch.robots, report)
@@ -183,8 +182,8 @@ def _silent_report(branch: Branch, seats: Seats, findings: Findings) -> StepRepo
 
 def fork(branch: Branch, live: tuple[int, ...], number: int, rng: np.random.Generator) -> Branch:
     """Copy a branch for robots that lose contact with it; the copy draws from a stream of its own."""
-    slam = restored_filter(branch.filter.get_state())
-    slam._rng = np.random.default_rng(rng.integers(2**63, size=4))
+    stream = np.random.default_rng(rng.integers(2**63, size=4)).bit_generator.state
+    slam = restored_filter(branch.filter.get_state() | {"rng": stream})
     return Branch(
         robots=branch.robots,
         live=live,

@@ -99,10 +99,10 @@ class MergePlan(NamedTuple):
         )  # fmt: skip
         if joint.rejuvenate().reason:
             return None
-        starts = joint._starts[a.num_robots, :, : joint.num_particles]
+        starts = joint.state.starts[a.num_robots, :, : joint.num_particles]
         motion = mean_pose(starts)
         covariance = scattered(starts)
-        _kernels.add_share(joint._frame, motion[None], covariance[None])
+        _kernels.add_share(joint.state.gauge_covariance, motion[None], covariance[None])
         x, y, theta = motion.tolist()
         alignment = Alignment(True, "", x, y, theta, covariance, self.alignment.inliers, self.alignment.ratio)
         sides, straight = (self.maps[0], renamed_map(self.maps[1], dict(renamed.tolist()))), joint.map("mixture")
@@ -124,7 +124,7 @@ def doubt_about(plan: MergePlan) -> float:
     assert plan.pairing is not None
     a, b = plan.filters
     covariance = motion_covariance(plan.pairing.motion, plan.alignment)
-    covariance += _of_frames(a._frame, b._frame, plan.alignment)
+    covariance += _of_frames(a.state.gauge_covariance, b.state.gauge_covariance, plan.alignment)
     return _in_bounds(covariance)
 
 
@@ -165,7 +165,7 @@ def merge_groups(
         new_ids = dict(renamed.tolist())
         older = [*(watch.copy() for watch in a.watches), *(watch.copy(new_ids) for watch in b.watches)]
         sides = Side.of(a.get_state()), Side.of(b.get_state())
-        common = renamed[np.isin(renamed[:, 1], a.filter._maps.ids), ::-1]
+        common = renamed[np.isin(renamed[:, 1], a.filter.state.maps.ids), ::-1]
         fresh = begin_watch(number, alignment, sides, plan.maps, renamed, common)
         trunk.watches = [*sorted(older, key=lambda watch: watch.number), fresh]
     renaming = Renaming(a.robots, b.robots, renamed, (a.number, b.number, number))

@@ -121,7 +121,7 @@ def _straight(
     if fewer or alignment.reason == "too few inliers":
         alignment = Alignment.refused("too few inliers", alignment.ratio)
         for group, state in zip(pair, before, strict=bool(before)):  # the smoother has lost its way
-            group.trunk.filter._go_on_from(state)
+            group.trunk.filter.go_on_from(state)
     return alignment
 
 

@@ -27,7 +27,7 @@ from slam_backend.geometry import transform_points
 from slam_backend.maps import _kernels as kernels
 from slam_backend.maps.alignment import RIVAL_ANGLE, RIVAL_DISTANCE, Alignment, AlignmentOptions, align_maps
 from slam_backend.maps.correspondences import may_suffice
-from slam_backend.maps.landmark_map import LandmarkMap
+from slam_backend.maps.landmark_map import LandmarkMap, unchecked_map
 from slam_backend.team.options import MergeOptions
 
 
@@ -152,7 +152,7 @@ def renamed_map(landmarks: LandmarkMap, new_ids: Mapping[int, int]) -> LandmarkM
     """Return the landmarks that have new names, under these."""
     names = np.array([new_ids.get(name, -1) for name in landmarks.ids.tolist()], dtype=np.int64)
     kept = landmarks.subset(names >= 0)
-    return LandmarkMap._trusted(kept.means, kept.covariances, kept.descriptors, kept.counts, names[names >= 0])
+    return unchecked_map(kept.means, kept.covariances, kept.descriptors, kept.counts, names[names >= 0])
 
 
 def begin_watch(

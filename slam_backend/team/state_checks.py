@@ -177,8 +177,8 @@ class TeamCheck:
         check_whole(f"{name}['number']", branch["number"], 0, self._next_number - 1)
         check_whole(f"{name}['epoch']", branch["epoch"])
         check_filter(f"{name}['filter']", branch["filter"], self._known)
-        if len(branch["filter"]["_poses"]) != len(robots):
-            refuse(f"{name}['filter']", f"one of {len(robots)} robots", len(branch["filter"]["_poses"]))
+        if len(branch["filter"]["poses"]) != len(robots):
+            refuse(f"{name}['filter']", f"one of {len(robots)} robots", len(branch["filter"]["poses"]))
         for robot, log in zip(robots, branch["filter"]["logs"], strict=True):
             if last_step(log) > known[robot]:
                 refuse(f"{name}['known']", f"at least {last_step(log)}, the last step logged", known[robot])

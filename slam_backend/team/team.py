@@ -214,7 +214,7 @@ class TeamKnowledge(TeamState):
         (rows, parts), last = outlines, 0
         for branch in self.lineup.branches:
             slam = branch.filter
-            first, last = last, write_outline(slam._maps, slam._best, min_count, rows, last)
+            first, last = last, write_outline(slam.state.maps, slam.state.best, min_count, rows, last)
             for robot in branch.live:
                 parts[robot, 0], parts[robot, 1] = first, last
         if last > len(rows.names):
@@ -231,7 +231,7 @@ class TeamKnowledge(TeamState):
         for branch in self.lineup.branches:
             slam, report = branch.filter, branch.report
             ess = 1.0 if report is None else report.ess / slam.num_particles
-            slam._stand(branch.robots, branch.live, ess, points)
+            slam.write_team_poses(branch.robots, branch.live, ess, points)
         return points
 
     def _group_of(self, robot: int) -> Group:

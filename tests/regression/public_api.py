@@ -24,7 +24,7 @@ PACKAGES = (
     "agents",
 )  # fmt: skip
 MODULES = (
-    "slam_backend.trajectory", "slam_backend.existence", "slam_backend.readers.calibration",
+    "slam_backend.trajectory", "slam_backend.fastslam.existence", "slam_backend.readers.calibration",
     "slam_backend.readers.kitti", "slam_backend.readers.mrclam", "slam_backend.readers.victoria",
     "vslam_env.vslam_v0", "vslam_env.reward", "vslam_env.solo", "training.vec_env",
 )  # fmt: skip

@@ -10,12 +10,20 @@ from slam_backend.fastslam.filter import FastSlam
 from slam_backend.fastslam.particle_maps import ParticleMaps
 
 
+def dense(slam: FastSlam) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return ids (n,), means (n, 3, M) [m], covariances (n, 6, M) [m^2] and counts (n, M), 0 where one lacks it."""
+    maps = slam.state.maps
+    slots = maps.used_slots()
+    values, counts = maps.dense(slots)
+    return maps.ids[slots], values[:, :3], values[:, 3:], counts.astype(np.int64)
+
+
 def contents(slam: FastSlam) -> dict[str, Any]:
     """Return all of a snapshot, landmarks by ascending id, each at its particle's own place, zeros where it is lacking.
 
     Places beyond the last particle, which mean nothing, are left out.
     """
-    ids, means, covariances, counts = slam._dense()  # brings all landmarks to their places
+    ids, means, covariances, counts = dense(slam)  # brings all landmarks to their places
     state, count, held = slam.get_state(), slam.num_particles, counts > 0
     maps = state["maps"]
     np.testing.assert_array_equal(maps["ids"], ids)
@@ -26,14 +34,14 @@ def contents(slam: FastSlam) -> dict[str, Any]:
     maps["means"], maps["covariances"] = (np.where(held[:, None], values, 0.0) for values in (means, covariances))
     if maps.get("odds") is not None:
         maps["odds"] = np.where(held, maps["odds"][:, :count], 0.0)
-    for name in ("_poses", "_starts", "_means", "_covariances"):
+    for name in ("poses", "starts", "means", "covariances"):
         state[name] = state[name][:, :, :count]
     return state
 
 
 def map_of(slam: FastSlam, particle: int) -> FloatArray:
     """Return (n, 10) what one particle knows of the landmarks it holds: mean, covariance (upper triangle) and count."""
-    _, means, covariances, counts = slam._dense()
+    _, means, covariances, counts = dense(slam)
     held = counts[:, particle] > 0
     columns = (means[held, :, particle], covariances[held, :, particle], counts[held, particle, None])
     return np.concatenate(columns, axis=1)
@@ -49,7 +57,7 @@ def load_landmarks(maps: ParticleMaps, values: FloatArray, *names: Any) -> None:
 
 def arrays_of(slam: FastSlam) -> dict[str, Any]:
     """Return all arrays that a filter works with, by owner and name: not copies."""
-    owners = {"filter": slam, "maps": slam._maps}
+    owners = {"filter": slam.state, "maps": slam.state.maps}
     return {
         f"{owner}.{name}": value
         for owner, holder in owners.items()

@@ -21,7 +21,7 @@ def filter_after_some_steps(num_particles: int, seed: int) -> tuple[FastSlam, np
 def filter_with_gaps(num_particles: int, seed: int) -> FastSlam:
     """Return a filter whose particles have resampled at different times, and do not all hold the same landmarks."""
     slam, _, _ = filter_after_some_steps(num_particles, seed)
-    slots = slam._maps.used_slots()
-    slam._maps.refresh(slots[::2])
-    slam._maps.counts[slam._maps.row_of[slots[::2]], 1::3] = 0
+    slots = slam.state.maps.used_slots()
+    slam.state.maps.refresh(slots[::2])
+    slam.state.maps.counts[slam.state.maps.row_of[slots[::2]], 1::3] = 0
     return slam

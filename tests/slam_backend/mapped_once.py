@@ -72,7 +72,7 @@ def map_once(
 
 def names_of(slam: FastSlam) -> dict[int, int]:
     """Return the true name of each landmark that a filter holds, by its id."""
-    maps = slam._maps
+    maps = slam.state.maps
     slots = maps.used_slots()
     return dict(zip(maps.ids[slots].tolist(), maps.identities[slots].tolist(), strict=True))
 

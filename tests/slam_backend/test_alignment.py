@@ -20,7 +20,7 @@ from slam_backend.maps.alignment import (
 )
 from slam_backend.maps.correspondences import may_suffice, mutual_nearest
 from slam_backend.maps.fusion import alignment_jacobian
-from slam_backend.maps.landmark_map import LandmarkMap
+from slam_backend.maps.landmark_map import LandmarkMap, unchecked_map
 
 D = 32
 SQUARE = 30.0  # [m]
@@ -357,7 +357,7 @@ def test_twenty_thousand_landmarks_stay_within_memory() -> None:
     """Matching 20,000 with 20,000 landmarks needs less than 100 MB, where the full matrix would take 1.6 GB."""
     rng = np.random.default_rng(14)
     looks = unit(rng, 20_000)[:, :10].astype(np.float32)  # shorter ones, to be quick
-    m = LandmarkMap._trusted(
+    m = unchecked_map(
         rng.uniform(0.0, 300.0, (20_000, 3)),
         np.tile(0.01 * np.eye(3), (20_000, 1, 1)),
         looks,

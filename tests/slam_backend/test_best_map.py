@@ -14,7 +14,7 @@ UNPACK = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 def _filter_after_some_steps() -> FastSlam:
     """Return a filter that has resampled, and in which landmarks came and went."""
     slam, points, looks = filter_after_some_steps(70, seed=3)
-    slam._maps.release(slam._maps.used_slots()[[2, 5]])
+    slam.state.maps.release(slam.state.maps.used_slots()[[2, 5]])
     extra = Measurements(points[:2] + np.array([0.0, 0.0, 3.0]), -looks[:2])
     slam.step([None], [extra])
     return slam
@@ -23,7 +23,7 @@ def _filter_after_some_steps() -> FastSlam:
 def test_the_gather_agrees_with_fancy_indexing() -> None:
     """For each of 70 particles and any least count: the same landmarks, by ascending id, with the same bits."""
     slam = _filter_after_some_steps()
-    maps = slam._maps
+    maps = slam.state.maps
     slots = maps.used_slots()
     assert not (np.diff(slots) > 0).all()  # slots were used again: ids do not ascend with them
     for m in range(70):
@@ -55,7 +55,7 @@ def test_an_outline_tells_how_much_room_it_takes(room: int) -> None:
     size = len(expected.ids)
     assert 9 - 3 < size < 100 - 3
     rows = OutlineRows(np.full((room, 4), -7.0), np.full((room, 2), -7))
-    assert write_outline(slam._maps, slam.best_particle, 2, rows, 3) == 3 + size
+    assert write_outline(slam.state.maps, slam.best_particle, 2, rows, 3) == 3 + size
     for got in rows:
         assert (got[:3] == -7).all()
         assert (got[3 + size :] == -7).all()

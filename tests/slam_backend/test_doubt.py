@@ -32,7 +32,7 @@ def test_what_held_frames_leave_open_is_doubted_as_well() -> None:
     position, heading = math.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1]), math.sqrt(covariance[2, 2])
 
     for slam, frame in zip((a, b), frames, strict=True):
-        slam._frame[:] = frame
+        slam.state.gauge_covariance[:] = frame
     after = doubt_about(plan)
     np.testing.assert_allclose(after, max(position / RIVAL_DISTANCE, heading / RIVAL_ANGLE), rtol=0.03)
     assert after > 1.5 * before

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from filter_contents import dense
 from stereo_world import StereoWorld
 
 from slam_backend.fastslam.filter import FastSlam
@@ -21,7 +22,7 @@ NOISY = OdometryModel(sigma_along=0.2, sigma_heading=0.1)
 
 def bits_by_landmark(slam: FastSlam) -> dict[int, list[tuple[int, bytes]]]:
     """Return, by landmark and particle, its count and all bytes of its estimate; zeros where it is not held."""
-    ids, means, covariances, counts = slam._dense()
+    ids, means, covariances, counts = dense(slam)
     values = np.concatenate([means, covariances], axis=1).transpose(0, 2, 1) * (counts > 0)[:, :, None]
     return {
         int(name): [(int(count), row.tobytes()) for count, row in zip(counts[i], values[i], strict=True)]

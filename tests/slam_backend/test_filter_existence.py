@@ -154,10 +154,10 @@ def test_what_is_given_up_leaves_its_memory_to_others(proposal: Any) -> None:
         slam.step([None], [Measurements(POINTS[step % 3 : step % 3 + 1], looks[step : step + 1])])
         held.append(slam.num_landmarks)
         if step == 20:
-            memory = slam._maps.nbytes
+            memory = slam.state.maps.nbytes
     assert max(held) == ExistenceModel().misses_to_delete(0.0)
-    assert slam._maps.nbytes == memory
-    assert slam._maps.next_id == 200
+    assert slam.state.maps.nbytes == memory
+    assert slam.state.maps.next_id == 200
 
 
 # ---------------------------------------------------------------------------------------------------- what stays
@@ -214,7 +214,7 @@ def test_a_restored_filter_weighs_existence_on_bit_for_bit(proposal: Any) -> Non
     state = slam.get_state()
     reports = [slam.step(odometry, frames) for odometry, frames in steps[12:]]
     expected = slam.get_state()
-    assert slam._maps.next_id > slam.num_landmarks, "some were given up"
+    assert slam.state.maps.next_id > slam.num_landmarks, "some were given up"
     for restored in (slam, FastSlam(2, 3)):
         restored.set_state(state)
         assert_same([restored.step(odometry, frames) for odometry, frames in steps[12:]], reports)

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from filter_contents import dense
 from small_world import SmallWorld
 from stereo_world import EXACT_MOTION
 
@@ -78,7 +79,7 @@ def assert_same_report(found: StepReport, plain: WatchedPlainFastSlam) -> None:
 
 def assert_same_particles(slam: FastSlam, plain: PlainFastSlam) -> None:
     """Compare each landmark of each particle: which decided alike if and only if they hold the same."""
-    ids, means, covariances, counts = slam._dense()
+    ids, means, covariances, counts = dense(slam)
     expected_counts = np.zeros_like(counts)
     expected_means, expected_covariances = np.zeros_like(means), np.zeros_like(covariances)
     rows = {int(name): row for row, name in enumerate(ids)}
@@ -94,7 +95,7 @@ def assert_same_particles(slam: FastSlam, plain: PlainFastSlam) -> None:
     np.testing.assert_allclose(np.where(held, means, 0.0), expected_means, **CLOSE)
     np.testing.assert_allclose(np.where(held, covariances, 0.0), expected_covariances, **CLOSE)
     if slam.options.existence is not None:
-        log_odds = slam._maps.dense_odds(slam._maps.used_slots())
+        log_odds = slam.state.maps.dense_odds(slam.state.maps.used_slots())
         for m, particle in enumerate(plain.particles):
             for name, landmark in particle.landmarks.items():
                 assert log_odds[rows[name], m] == pytest.approx(landmark.log_odds, abs=1e-9)

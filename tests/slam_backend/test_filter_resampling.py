@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from filter_contents import arrays_of, contents, load_landmarks, map_of
+from filter_contents import arrays_of, contents, dense, load_landmarks, map_of
 from same_bits import assert_same
 from stereo_world import StereoWorld
 
@@ -65,9 +65,9 @@ def test_accumulated_weights_follow_the_ancestral_line(proposal: Any) -> None:
         twin.step(odometry, frames)
         slam.step(odometry, frames)
         parents = parents_of(slam, twin)
-        np.testing.assert_array_equal(slam._path_log_weights, twin._path_log_weights[parents])
+        np.testing.assert_array_equal(slam.state.path_log_weights, twin.state.path_log_weights[parents])
         np.testing.assert_allclose(slam.weights, 1.0 / 11.0)
-        strangers += int(np.sum(slam._path_log_weights != twin._path_log_weights))
+        strangers += int(np.sum(slam.state.path_log_weights != twin.state.path_log_weights))
     assert strangers > 10, "the indices have changed their meaning many times"
 
 
@@ -78,7 +78,7 @@ def test_a_resampled_particle_brings_along_all_that_its_parent_holds(scheme: str
     Robot 1 sees nothing: its Gaussians are not sampled, and go along too.
     """
     slam = FastSlam(2, 70, CAMERA, resampling=scheme, resample_threshold=1.0)
-    slam._starts[1, :2, :70] += np.random.default_rng(1).normal(size=(2, 70))  # as after a merge
+    slam.state.starts[1, :2, :70] += np.random.default_rng(1).normal(size=(2, 70))  # as after a merge
     copies = 0
     for odometry, frames in inputs(12, seed=2):
         twin = without_resampling(slam.get_state())
@@ -86,7 +86,7 @@ def test_a_resampled_particle_brings_along_all_that_its_parent_holds(scheme: str
             each.step([*odometry, MOVE], [*frames, None])
         parents = parents_of(slam, twin)
         resampled, before = contents(slam), contents(twin)
-        for name in ("_poses", "_starts", "_means", "_covariances"):
+        for name in ("poses", "starts", "means", "covariances"):
             np.testing.assert_array_equal(resampled[name], before[name][..., parents], err_msg=name)
         resampled, before = resampled["maps"], before["maps"]
         kept = np.isin(before["ids"], resampled["ids"])
@@ -111,7 +111,9 @@ def test_landmarks_out_of_view_follow_every_resampling(proposal: Any, scheme: st
         unseen += alone.map_size - len(frames[0])
         assert report.resampled
     assert unseen > 70
-    assert len(np.unique(alone._maps.map_of)) > 4, "landmarks last seen before one, two, three and more resamplings"
+    assert len(np.unique(alone.state.maps.map_of)) > 4, (
+        "landmarks last seen before one, two, three and more resamplings"
+    )
     assert_same(contents(alone), contents(read))
 
 
@@ -135,10 +137,10 @@ def test_survivors_keep_their_places(scheme: str) -> None:
 def test_weights_are_kept_until_the_particles_are_resampled() -> None:
     """Without resampling a step multiplies the weights of before; with it they start from 1/M."""
     slam = filter_after(3, resample_threshold=0.0)
-    before, paths = slam.particles()[1], slam._path_log_weights.copy()
+    before, paths = slam.particles()[1], slam.state.path_log_weights.copy()
     odometry, frames = inputs(4)[3]
     slam.step(odometry, frames)
-    gained = slam._path_log_weights - paths
+    gained = slam.state.path_log_weights - paths
     expected = before + gained
     np.testing.assert_allclose(slam.particles()[1], expected - np.logaddexp.reduce(expected), atol=1e-12)
 
@@ -154,7 +156,7 @@ def test_what_a_particle_writes_reaches_no_other(proposal: Any, scheme: str, num
     writer = int(np.flatnonzero(siblings)[0])
     before, state = contents(slam), slam.get_state()
     kept, other = copy.deepcopy(state), copy.deepcopy(state)
-    other["_poses"][0, :, writer] += [0.3, -0.2, 0.1]
+    other["poses"][0, :, writer] += [0.3, -0.2, 0.1]
     odometry, frames = inputs(9)[8]
     twins = [without_resampling(start) for start in (state, other)]
     for twin in twins:
@@ -172,7 +174,7 @@ def test_what_a_particle_writes_reaches_no_other(proposal: Any, scheme: str, num
 def test_a_landmark_is_updated_in_the_particle_that_holds_it_only(proposal: Any, num_particles: int) -> None:
     """Where one particle alone holds a landmark, its update leaves all that is kept for the others alone."""
     slam = filter_after(8, num_particles, resample_threshold=1.0, proposal=proposal)
-    maps = slam._maps
+    maps = slam.state.maps
     slots = maps.used_slots()
     values, counts = maps.dense(slots)
     row = int(np.flatnonzero((counts > 0).all(axis=1))[-1])  # the newest lies ahead of the robot
@@ -181,11 +183,11 @@ def test_a_landmark_is_updated_in_the_particle_that_holds_it_only(proposal: Any,
     names = np.where(np.arange(len(slots)) == row, 5, -1)
     load_landmarks(maps, values, counts, maps.descriptors[slots], maps.ids[slots], names, maps.next_id)
     slam = without_resampling(slam.get_state())
-    ids, means, covariances, counts = slam._dense()
+    ids, means, covariances, counts = dense(slam)
     poses = slam.particles()[0]
-    look = slam._maps.descriptors[slam._maps.used_slots()[row]][None]
+    look = slam.state.maps.descriptors[slam.state.maps.used_slots()[row]][None]
     report = slam.step([None], [Measurements([[-0.1, -0.2, 3.0]], look)], identities=[[5]])
-    now_ids, now_means, now_covariances, now_counts = slam._dense()
+    now_ids, now_means, now_covariances, now_counts = dense(slam)
     np.testing.assert_array_equal(now_ids, [*ids, report.created[0][0]])
     expected = np.zeros(counts.shape, dtype=bool)
     expected[row, 4] = True
@@ -246,7 +248,7 @@ def test_a_filter_goes_on_bit_for_bit_through_many_snapshots(proposal: Any) -> N
         restored.set_state(state)
         if step % 2:
             restored.map("mixture")
-    assert slam._maps.next_id - slam.num_landmarks > 10, "landmarks have been forgotten"
+    assert slam.state.maps.next_id - slam.num_landmarks > 10, "landmarks have been forgotten"
     assert_same(restored.map("mixture"), slam.map("mixture"))
     assert_same(contents(restored), contents(slam))
 
@@ -269,7 +271,9 @@ def test_a_snapshot_shares_nothing_that_can_be_written(proposal: Any) -> None:
     state = slam.get_state()
     kept = copy.deepcopy(state)
     other.set_state(state)
-    in_use = [array for each in (slam, other) for array in [*arrays_of(each).values(), *arrays_in(each._estimates)]]
+    in_use = [
+        array for each in (slam, other) for array in [*arrays_of(each).values(), *arrays_in(each.state.estimates)]
+    ]
     for array in arrays_in(state):
         assert not any(held.flags.writeable and np.shares_memory(array, held) for held in in_use)
     for odometry, frames in inputs(8)[5:]:
@@ -312,7 +316,7 @@ def test_the_seed_decides_everything() -> None:
 def test_landmarks_that_no_survivor_holds_are_forgotten() -> None:
     """Ids are never used twice, and only landmarks that a particle holds are counted."""
     slam = filter_after(20, proposal="fastslam1", resample_threshold=1.0)
-    held, _, _, counts = slam._dense()
+    held, _, _, counts = dense(slam)
     assert (held >= 0).all()
     assert (counts > 0).any(axis=1).all()
     assert len(np.unique(held)) == len(held) == slam.num_landmarks

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from filter_contents import dense
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mapped_once import names_of
@@ -59,7 +60,7 @@ class Hall:
 
 def check_unique(slam: FastSlam) -> None:
     """Fail if any particle of a filter, or its map, holds two landmarks of one name."""
-    ids, _, _, counts = slam._dense()
+    ids, _, _, counts = dense(slam)
     names = names_of(slam)
     for held in (counts > 0).T:
         told = [names[name] for name in ids[held].tolist() if names[name] >= 0]

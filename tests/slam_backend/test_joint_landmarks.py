@@ -47,7 +47,7 @@ def plain_join(
 @pytest.mark.parametrize("sizes", [(33, 70), (5, 5)])
 def test_the_join_agrees_with_matrices(sizes: tuple[int, int]) -> None:
     """Of landmarks that both sides, one, or no particle of a side holds: the same numbers, with the same counts."""
-    maps = [filter_with_gaps(size, 11 + size)._maps for size in sizes]
+    maps = [filter_with_gaps(size, 11 + size).state.maps for size in sizes]
     rng = np.random.default_rng(3)
     a, b = (Landmarks.of(side, rng.integers(0, side.num_particles, 40)) for side in maps)
     rows_a, rows_b = np.array([*range(len(a.slots)), -1, -1]), np.full(len(a.slots) + 2, -1)
@@ -70,7 +70,7 @@ def test_the_join_agrees_with_matrices(sizes: tuple[int, int]) -> None:
 
 def test_landmarks_are_read_wherever_they_lie() -> None:
     """Values of some landmarks in any order, of all particles: those of the copies that each particle gives."""
-    maps = filter_with_gaps(33, 21)._maps
+    maps = filter_with_gaps(33, 21).state.maps
     names = maps.ids[maps.used_slots()][[4, 0, 3]]
     some = Landmarks.of(maps, ids=names)
     np.testing.assert_array_equal(some.ids, names)

@@ -14,7 +14,7 @@ import pytest
 from slam_backend.core.compilation import watch_compilation
 
 KERNEL = """
-from slam_backend._jit import jit
+from slam_backend.core.jit import jit
 
 @jit
 def kernel_of_a_test(x):

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from slam_backend.geometry import compose, inverse
-from slam_backend.maps.landmark_map import FIELDS, LandmarkMap
+from slam_backend.maps.landmark_map import FIELDS, LandmarkMap, unchecked_map
 
 N, D = 5, 7
 
@@ -88,7 +88,7 @@ def test_subset_takes_rows_in_order_or_by_mask() -> None:
 def test_trusted_maps_equal_checked_ones() -> None:
     """The unchecked constructor of the hot loop builds the same map, and protects it from writes through itself."""
     f = fields()
-    trusted = LandmarkMap._trusted(**f)
+    trusted = unchecked_map(**f)
     assert_same(trusted, LandmarkMap(**f))
     with pytest.raises(ValueError, match="read-only"):
         trusted.means[0] = 0.0

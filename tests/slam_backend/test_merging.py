@@ -2,7 +2,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from filter_contents import arrays_of, contents, load_landmarks
+from filter_contents import arrays_of, contents, dense, load_landmarks
 from hypothesis import given
 from hypothesis import strategies as st
 from mapped_once import (
@@ -117,7 +117,7 @@ def test_ids_of_a_stay_and_those_of_b_are_renamed_one_to_one() -> None:
 def test_a_landmark_keeps_the_caller_s_name_that_either_robot_was_given() -> None:
     """Where a's landmark has no name of the caller's, the fused one takes that of b."""
     a, b = both()
-    a._maps.identities[a._maps.ids == 2] = -1
+    a.state.maps.identities[a.state.maps.ids == 2] = -1
     joint, _ = merge_filters(a, b, known_alignment(), PAIRS, np.random.default_rng(1))
     assert names_of(joint)[2] == NAMES_A[2]
 
@@ -150,7 +150,7 @@ def test_a_joint_filter_has_uniform_weights_and_as_many_particles_as_the_larger(
     assert joint.num_particles == 11
     assert joint.options.num_particles == 11
     np.testing.assert_allclose(joint.weights, 1 / 11)
-    ids, means, covariances, counts = joint._dense()
+    ids, means, covariances, counts = dense(joint)
     assert (means.shape, covariances.shape, counts.shape) == ((9, 3, 11), (9, 6, 11), (len(ids), 11))
     for robot in range(2):
         assert joint.particles(robot)[0].shape == joint.particles_from_start(robot).shape == (11, 3)
@@ -187,7 +187,7 @@ def test_common_landmarks_are_fused_at_each_particle_s_own_motion() -> None:
     motions = joint.particles(1)[0]  # b stands at its start, so its poses are the motions a_from_b
     assert np.ptp(motions, axis=0).min() > 0.05
     map_a, map_b = a.map(), b.map()  # nobody moved: the same in all particles
-    _, joint_means, joint_covariances, _ = joint._dense()
+    _, joint_means, joint_covariances, _ = dense(joint)
     scale = joint_covariances[5, 5] / map_a.covariances[5, 2, 2]  # of a landmark that only a has
     for m, motion in enumerate(motions):
         means_b = transform_points(motion, map_b.means[PAIRS[:, 1]])
@@ -204,7 +204,7 @@ def test_descriptors_are_averaged_by_counts_and_keep_their_length() -> None:
     a, b = both()
     for _ in range(2):
         a.step([None], [frame_of(LANDMARKS[NAMES_A], NAMES_A, 0.01)], identities=[NAMES_A])
-    b._maps.descriptors[b._maps.ids == 1] = looks(np.array([12]))  # b's view of landmark 4
+    b.state.maps.descriptors[b.state.maps.ids == 1] = looks(np.array([12]))  # b's view of landmark 4
     joint, _ = merge_filters(a, b, known_alignment(), PAIRS, np.random.default_rng(1))
     fused = joint.map().descriptors[4]
     expected = 3 * looks(np.array([4]))[0] + looks(np.array([12]))[0]
@@ -279,9 +279,9 @@ def test_what_lay_in_the_memory_of_new_rows_is_never_read(monkeypatch: pytest.Mo
         merged = joint.get_state()
         for _ in range(3):
             joint.step([MOVE, MOVE], [new_frame(), new_frame()])
-            joint._resample()
+            joint.state.resample()
         joint.rejuvenate()
-        joint._maps.make_room(len(joint._maps.ids), joint.descriptor_size)
+        joint.state.maps.make_room(len(joint.state.maps.ids), joint.descriptor_size)
         joint.step([MOVE, None], [new_frame(), None])
         states.append([a.get_state(), b.get_state(), merged, joint.get_state()])
     assert_same(*states)
@@ -349,22 +349,22 @@ def test_the_most_probable_particle_takes_both_pasts_into_account() -> None:
     rng = np.random.default_rng(2)
     a = map_once(NAMES_A, np.zeros(3), 0.05, rng, 50, moves=1)
     b = map_once(NAMES_B, A_FROM_B, 0.05, rng, 50, moves=1)
-    a._path_log_weights[:], b._path_log_weights[:] = rng.normal(size=(2, 50))
+    a.state.path_log_weights[:], b.state.path_log_weights[:] = rng.normal(size=(2, 50))
     joint, _ = merge_filters(a, b, known_alignment(), PAIRS, np.random.default_rng(1))
-    pasts = a._path_log_weights[parents_of(joint, 0, a)] + b._path_log_weights[parents_of(joint, 1, b)]
-    np.testing.assert_allclose(np.ptp(joint._path_log_weights - pasts), 0.0, atol=1e-6)
+    pasts = a.state.path_log_weights[parents_of(joint, 0, a)] + b.state.path_log_weights[parents_of(joint, 1, b)]
+    np.testing.assert_allclose(np.ptp(joint.state.path_log_weights - pasts), 0.0, atol=1e-6)
 
 
 def test_pairs_whose_maps_fit_each_other_survive() -> None:
     """Particles of b in which a common landmark stands ten deviations off do not outlive the merge."""
     a, b = both(sigma=0.05, particles=(50, 50))
-    maps = b._maps
+    maps = b.state.maps
     slots = maps.used_slots()
     values, counts = maps.dense(slots)
     values[1, 0, 35:] += 0.5  # landmark 1 of b is one of the common ones
     values[0, 2, 35:] += 9.0  # landmark 0 is b's alone: it tells which particles survive
     load_landmarks(maps, values, counts, maps.descriptors[slots], maps.ids[slots], maps.identities[slots], maps.next_id)
     joint, renamed = merge_filters(a, b, known_alignment(), PAIRS, np.random.default_rng(1))
-    ids, means, _, _ = joint._dense()
+    ids, means, _, _ = dense(joint)
     row = ids.tolist().index(dict(renamed.tolist())[0])
     assert np.abs(means[row, 2] - LANDMARKS[NAMES_B[0], 2]).max() < 1.0

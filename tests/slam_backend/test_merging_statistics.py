@@ -156,7 +156,7 @@ def test_what_maps_contradict_each_other_by_is_added_first_and_scales_only_beyon
     """
     rng = np.random.default_rng(5)
     a, b = contradicting(sigma, claimed, rng)
-    a._maps.blocks[a._maps.row_of[5], :, 3:] *= 900.0  # a's own landmark 5
+    a.state.maps.blocks[a.state.maps.row_of[5], :, 3:] *= 900.0  # a's own landmark 5
     map_a, map_b = a.map(), b.map()
     joint, _ = merge_filters(a, b, known_alignment(), PAIRS, rng)
     rows_a, rows_b = PAIRS.T

@@ -15,12 +15,12 @@ SCATTER = np.array([[3e-2, 1e-3, 2e-3], [1e-3, 2e-2, -1e-3], [2e-3, -1e-3, 5e-3]
 
 def plain_mixture(slam: FastSlam, min_count: int) -> LandmarkMap:
     """Return the same map by sums over all that `dense` copies."""
-    maps, best = slam._maps, slam.best_particle
+    maps, best = slam.state.maps, slam.best_particle
     slots = maps.used_slots()
     counts = maps.of_particle(best, slots)[1]
     slots, counts = slots[counts >= min_count], counts[counts >= min_count]
     dense, times = maps.dense(slots)
-    weights = np.exp(slam._log_weights) * (times > 0)
+    weights = np.exp(slam.state.log_weights) * (times > 0)
     weights /= weights.sum(axis=1, keepdims=True)
     mixed = np.einsum("ncm,nm->nc", dense, weights)
     offsets = dense[:, :3] - mixed[:, :3, None]
@@ -40,7 +40,7 @@ def test_the_kernel_agrees_with_plain_sums() -> None:
     for num_particles, seed in ((1, 5), (8, 6), (70, 7)):
         slam = filter_with_gaps(num_particles, seed)
         for least in (1, 2):
-            raw = map_mixture(slam._maps, slam.best_particle, slam._log_weights, SCATTER, least)
+            raw = map_mixture(slam.state.maps, slam.best_particle, slam.state.log_weights, SCATTER, least)
             np.testing.assert_array_equal(raw[1], raw[1].transpose(0, 2, 1))
             found = LandmarkMap(*raw)
             plain = plain_mixture(slam, least)
@@ -55,10 +55,10 @@ def test_the_kernel_agrees_with_plain_sums() -> None:
 def test_to_ask_for_a_mixture_changes_nothing() -> None:
     """Maps that wait to be brought up to date still wait afterwards."""
     slam = filter_with_gaps(33, 8)
-    before = slam._maps.get_state()
+    before = slam.state.maps.get_state()
     assert before["map_of"].any()
     slam.map("mixture")
-    after = slam._maps.get_state()
+    after = slam.state.maps.get_state()
     for name in ("map_of", "maps", "values", "counts"):
         np.testing.assert_array_equal(after[name], before[name])
 
@@ -66,12 +66,12 @@ def test_to_ask_for_a_mixture_changes_nothing() -> None:
 def test_what_no_particle_holds_is_not_read() -> None:
     """Places that no count vouches for may hold anything at all."""
     slam = filter_with_gaps(33, 9)
-    asked = slam._maps, slam.best_particle, slam._log_weights, SCATTER, 1
+    asked = slam.state.maps, slam.best_particle, slam.state.log_weights, SCATTER, 1
     before = map_mixture(*asked)
-    counts = slam._maps.counts
-    tiles = slam._maps.values.reshape(len(counts), -1, 9, LANES)
+    counts = slam.state.maps.counts
+    tiles = slam.state.maps.values.reshape(len(counts), -1, 9, LANES)
     unheld = np.broadcast_to(counts.reshape(len(counts), -1, 1, LANES) == 0, tiles.shape)
-    assert unheld[slam._maps.table[ROW_OF, slam._maps.used_slots()]].any()
+    assert unheld[slam.state.maps.table[ROW_OF, slam.state.maps.used_slots()]].any()
     tiles[unheld] = np.nan
     for one, other in zip(before, map_mixture(*asked), strict=True):
         np.testing.assert_array_equal(one, other)

@@ -51,12 +51,12 @@ def test_unknown_starts_do_not_blur_the_pose() -> None:
     before, particles = slam.pose_from_start(1), slam.particles_from_start(1)
     state = slam.get_state()
     motions = np.random.default_rng(5).normal(0.0, 0.5, (13, 3))
-    for name in ("_starts", "_poses", "_means"):  # (K, 3, P), P >= M
+    for name in ("starts", "poses", "means"):  # (K, 3, P), P >= M
         state[name][1, :, :13] = compose(motions, state[name][1, :, :13].T).T
     turn = np.tile(np.eye(3), (13, 1, 1))
     turn[:, :2, :2] = np.array([[[np.cos(t), -np.sin(t)], [np.sin(t), np.cos(t)]] for t in motions[:, 2]])
-    covariances = state["_covariances"][1, :, :13].T[:, UNPACK]
-    state["_covariances"][1, :, :13] = (turn @ covariances @ turn.transpose(0, 2, 1))[:, *np.triu_indices(3)].T
+    covariances = state["covariances"][1, :, :13].T[:, UNPACK]
+    state["covariances"][1, :, :13] = (turn @ covariances @ turn.transpose(0, 2, 1))[:, *np.triu_indices(3)].T
     slam.set_state(state)
     after = slam.pose_from_start(1)
     assert np.allclose(between(before.mean, after.mean), 0.0, atol=1e-3)  # resampling noise of the estimate before

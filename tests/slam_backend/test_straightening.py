@@ -54,7 +54,7 @@ def test_a_filter_that_never_rejuvenates_can_be_told_to() -> None:
         slam = driven(111, NEVER, rejuvenate_every=every)[1]._find(0)[0].filter
         before = slam.map()
         assert slam.rejuvenate().reason == ""
-        assert (slam._rejuvenation is None) == (every is None)
+        assert (slam.state.rejuvenation is None) == (every is None)
         after = slam.map()
         moved = after.means[np.isin(after.ids, before.ids)] - before.means[np.isin(before.ids, after.ids)]
         assert np.abs(moved).max() > 0.01
@@ -77,7 +77,7 @@ def test_a_merge_is_that_of_straightened_maps() -> None:
     assert_same(team.merged_maps(team.events[1]), tuple(side.map() for side in sides))
     watch = team._find(0)[0].watches[0]
     for side, of_side, before in zip(watch.sides, sides, watch.before, strict=True):
-        assert_same(side.trunk["filter"]["_poses"], of_side.get_state()["_poses"])
+        assert_same(side.trunk["filter"]["poses"], of_side.get_state()["poses"])
         assert len(before) == len(of_side.map())
 
 
@@ -176,7 +176,7 @@ def test_the_spread_of_motions_is_that_of_the_particles_that_a_merge_makes() -> 
     motion = paired(a, b, alignment, pairs, np.random.default_rng(2)).motion
     foretold = motion_covariance(motion, alignment)
     joint, _ = merge_filters(a, b, alignment, pairs, np.random.default_rng(2))
-    starts = joint._starts[1, :, : joint.num_particles].T
+    starts = joint.state.starts[1, :, : joint.num_particles].T
     np.testing.assert_allclose(foretold, np.cov(starts.T, bias=True), atol=1e-12)
 
 

@@ -48,7 +48,7 @@ def test_a_trial_leaves_both_filters_as_they_are() -> None:
     tried, doubt = trial
     assert tried.joint is not None
     joint = tried.joint[0]
-    np.testing.assert_allclose(tried.alignment.transform, mean_pose(joint._starts[1, :, : joint.num_particles]))
+    np.testing.assert_allclose(tried.alignment.transform, mean_pose(joint.state.starts[1, :, : joint.num_particles]))
     assert_same(tried.alignment.inliers, plan.alignment.inliers)
     assert 0.0 < doubt < 1.0
 
@@ -89,5 +89,5 @@ def test_a_pair_merges_by_the_motion_of_its_trial_when_two_agree() -> None:
     assert any(event.alignment.missed == "paths" for event in refused)
     assert merge.alignment is last.alignment
     joint = team._groups[0].trunk.filter
-    starts = joint._starts[1, :, : joint.num_particles]
+    starts = joint.state.starts[1, :, : joint.num_particles]
     np.testing.assert_allclose(merge.alignment.transform, mean_pose(starts), atol=1e-12)

@@ -17,7 +17,7 @@ from vslam_env.vslam_v0 import parallel_env
 COUNT_ARRAYS = """
 import gc
 from numba.core.runtime import _nrt_python, rtsys
-from slam_backend.warming import warm_up
+from slam_backend.warm_up import warm_up
 from vslam_env import vslam_v0
 
 def play():

@@ -20,15 +20,13 @@ much as the best known ones contradict each other: they would take anything for 
 """
 
 import math
-from dataclasses import replace
 
 import numpy as np
 
-from slam_backend.core.packed_symmetric import UNPACK, UPPER
 from slam_backend.core.validation import FloatArray, IntArray
-from slam_backend.fastslam.consistency import ConsistencyTest
 from slam_backend.fastslam.filter import FastSlam
-from slam_backend.geometry import compose, inverse, rotation, wrap_angle
+from slam_backend.fastslam.state import FilterState
+from slam_backend.geometry import inverse, wrap_angle
 from slam_backend.maps.alignment import Alignment
 from slam_backend.maps.fusion import fuse_descriptors
 from slam_backend.team.filter_merging.landmarks import (
@@ -42,61 +40,6 @@ from slam_backend.team.filter_merging.landmarks import (
     write_joint,
 )
 from slam_backend.team.filter_merging.pairing import Pairing, pair_up
-
-
-def joined_robots(
-    a: FastSlam, from_a: IntArray, b: FastSlam, from_b: IntArray, motion: FloatArray, rng: np.random.Generator
-) -> FastSlam:
-    """Return a filter of both groups' robots, a's first, without a map.
-
-    Args:
-        a, b: The filters of either group.
-        from_a, from_b: (M,) which particle of either each joint particle pairs.
-        motion: (M, 3) by which each joint particle moves what stems from b into a's map frame.
-        rng: From which the joint filter's own stream is seeded.
-    """
-    same = a.options.num_particles == len(motion)
-    options = a.options if same else replace(a.options, num_particles=len(motion))
-    stream = np.random.default_rng(rng.integers(2**63, size=4))
-    joint = FastSlam.from_options(a.num_robots + b.num_robots, options, stream)
-    _join_poses(joint, a, from_a, b, from_b, motion)
-    joint._blind[:] = np.concatenate([a._blind, b._blind])
-    joint._frame[:] = a._frame
-    return joint
-
-
-def _join_poses(
-    joint: FastSlam, a: FastSlam, from_a: IntArray, b: FastSlam, from_b: IntArray, motion: FloatArray
-) -> None:
-    """Write the poses of both groups, those of b moved by each particle's `motion` (M, 3)."""
-    k, count = a.num_robots, len(motion)
-    for name in ("_poses", "_starts", "_means"):
-        target, of_a, of_b = getattr(joint, name), getattr(a, name), getattr(b, name)
-        target[:k, :, :count] = of_a[:, :, from_a]
-        target[k:, :, :count] = compose(motion, of_b[:, :, from_b].transpose(0, 2, 1)).transpose(0, 2, 1)
-    joint._look_at_starts()
-    turn = np.zeros((count, 3, 3))
-    turn[:, :2, :2], turn[:, 2, 2] = rotation(motion[:, 2]), 1.0
-    spread_b = b._covariances[:, :, from_b].transpose(0, 2, 1)[..., UNPACK]
-    moved = turn @ spread_b @ turn.transpose(0, 2, 1)
-    joint._covariances[:k, :, :count] = a._covariances[:, :, from_a]
-    joint._covariances[k:, :, :count] = moved[..., *UPPER].transpose(0, 2, 1)
-
-
-def finish(joint: FastSlam, a: FastSlam, b: FastSlam, renamed: IntArray) -> None:
-    """Give a joint filter, whose map is loaded, its step count, warnings, estimates and logs.
-
-    `renamed` is that of `merge_filters`.
-    """
-    joint._look_at_weights()
-    joint._steps = max(a._steps, b._steps)
-    joint._consistency = ConsistencyTest.joined(a._consistency, b._consistency)
-    joint._estimates = joint._mixtures()
-    joint._widen()
-    joint._robot_logs = [log.copy() for log in a._logs] + [log.renamed(renamed[:, 0], renamed[:, 1]) for log in b._logs]
-    if joint._rejuvenation is not None and a._rejuvenation is not None and b._rejuvenation is not None:
-        starts = [slam._starts[:, :, : slam.num_particles] for slam in (a, b, joint)]
-        joint._rejuvenation.join(a._rejuvenation, b._rejuvenation, starts, (a._frame, b._frame), renamed, joint._camera)
 
 
 def inverse_alignment(alignment: Alignment) -> Alignment:
@@ -142,12 +85,11 @@ def merge_filters(
     if pairing is None:
         pairing = paired(a, b, alignment, pairs, rng, num_particles, known)
     from_a, from_b, motion, evidence, extra, scale = pairing
-    fitting, told = agreed(a._maps, b._maps, pairs)
+    fitting, told = agreed(a.state.maps, b.state.maps, pairs)
     pairs = np.concatenate([fitting, told])
-    joint = joined_robots(a, from_a, b, from_b, motion, rng)
-    joint._path_log_weights[:] = a._path_log_weights[from_a] + b._path_log_weights[from_b] + evidence
+    joint = FilterState.joined(a.state, from_a, b.state, from_b, motion, evidence, rng)
 
-    of_a, of_b = Landmarks.of(a._maps, from_a), Landmarks.of(b._maps, from_b)
+    of_a, of_b = Landmarks.of(a.state.maps, from_a), Landmarks.of(b.state.maps, from_b)
     ids_a, ids_b = of_a.ids, of_b.ids
     shared_a, shared_b = np.searchsorted(ids_a, pairs[:, 0]), np.searchsorted(ids_b, pairs[:, 1])
     model = a.options.existence
@@ -167,10 +109,10 @@ def merge_filters(
     rows_a[len(ids_a) :], rows_b[len(ids_a) :], rows_b[shared_a] = -1, own, shared_b
     counts, names = joint_counts(of_a, of_b, rows_a, rows_b), np.concatenate([identities, of_b.identities[own]])
     hold_once(counts, names)
-    next_id = a._maps.next_id
+    next_id = a.state.maps.next_id
     new_ids = next_id + np.arange(len(own))
     held = np.flatnonzero((counts > 0).any(axis=1))
-    joint._maps.load_names(
+    joint.maps.load_names(
         counts[held],
         stack_descriptors(descriptors, looks_b[own])[held],
         np.concatenate([ids_a, new_ids])[held],
@@ -181,12 +123,12 @@ def merge_filters(
     # Either map bears half of what they do not explain.
     scales = np.full(len(counts), scale)
     if len(told):
-        sides = Landmarks.of(a._maps, from_a, told[:, 0]), Landmarks.of(b._maps, from_b, told[:, 1])
+        sides = Landmarks.of(a.state.maps, from_a, told[:, 0]), Landmarks.of(b.state.maps, from_b, told[:, 1])
         scales[np.searchsorted(ids_a, told[:, 0])] = np.maximum(scale, contradictions(*sides, motion, 0.5 * extra))
-    write_joint(of_a, of_b, rows_a[held], rows_b[held], motion, 0.5 * extra, scales[held], joint._maps.blocks)
+    write_joint(of_a, of_b, rows_a[held], rows_b[held], motion, 0.5 * extra, scales[held], joint.maps.blocks)
     renamed = np.concatenate([pairs[:, ::-1], np.column_stack([ids_b[own], new_ids])]).astype(np.int64)
-    finish(joint, a, b, renamed)
-    return joint, renamed
+    joint.finish_join(a.state, b.state, renamed)
+    return FastSlam.from_filter_state(joint), renamed
 
 
 def paired(
@@ -199,8 +141,8 @@ def paired(
         a, b, alignment, pairs, rng, num_particles, known: As of `merge_filters`, which draws it first of all.
     """
     count = max(a.num_particles, b.num_particles) if num_particles is None else num_particles
-    pairs, _ = agreed(a._maps, b._maps, pairs)
-    common_a, common_b = Landmarks.of(a._maps, ids=pairs[:, 0]), Landmarks.of(b._maps, ids=pairs[:, 1])
+    pairs, _ = agreed(a.state.maps, b.state.maps, pairs)
+    common_a, common_b = Landmarks.of(a.state.maps, ids=pairs[:, 0]), Landmarks.of(b.state.maps, ids=pairs[:, 1])
     return pair_up(a.weights, common_a, b.weights, common_b, alignment, count, rng, known)
 
 

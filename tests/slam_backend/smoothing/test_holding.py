@@ -202,7 +202,7 @@ def test_what_particles_no_longer_show_is_claimed_all_the_same():
     off[:, 2] = wrap_angle(off[:, 2])
     shown = np.asarray(slam.weights * off.T @ off)
     both = shown[None].copy()
-    add_share(slam._frame, said.mean[None], both)
+    add_share(slam.state.gauge_covariance, said.mean[None], both)
     assert np.trace(shown[:2, :2]) < np.trace(said.covariance[:2, :2])
     np.testing.assert_allclose(np.sqrt(np.diag(both[0])), np.sqrt(np.diag(said.covariance)), rtol=0.25)
 
@@ -211,8 +211,8 @@ def test_starts_that_are_given_stay_and_an_exact_pose_needs_no_share():
     """All particles keep the start that they were given; once told where the robot is, the filter is sure of it."""
     slam, _, drawn = open_run()
     assert drawn
-    assert slam._frame.any()
-    starts = slam._starts[0, :, : slam.num_particles]
+    assert slam.state.gauge_covariance.any()
+    starts = slam.state.starts[0, :, : slam.num_particles]
     np.testing.assert_array_equal(starts, np.repeat(starts[:, :1], slam.num_particles, axis=1))
     slam.step([None], [None], poses=[np.array([1.0, 2.0, 0.3])])
     np.testing.assert_allclose(slam.pose().covariance, 0.0, atol=1e-12)
@@ -242,8 +242,8 @@ def test_maps_of_all_particles_claim_their_share():
     slopes = np.zeros((len(widened), 3, 3))
     slopes[:, 0, 0] = slopes[:, 1, 1] = 1.0
     slopes[:, 0, 2], slopes[:, 1, 2] = -widened.means[:, 1], widened.means[:, 0]
-    share = slopes @ slam._frame @ slopes.transpose(0, 2, 1)
-    slam._frame[:] = 0.0
+    share = slopes @ slam.state.gauge_covariance @ slopes.transpose(0, 2, 1)
+    slam.state.gauge_covariance[:] = 0.0
     narrow = slam.map("mixture")
     np.testing.assert_array_equal(widened.means, narrow.means)
     np.testing.assert_allclose(widened.covariances - narrow.covariances, share, atol=1e-12)

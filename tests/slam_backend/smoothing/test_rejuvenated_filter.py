@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from filter_contents import dense
 from same_bits import assert_same
 from small_problems import small_run
 
@@ -42,7 +43,7 @@ def test_a_rejuvenation_waits_for_enough_to_read():
     run = small_run()
     slam = rejuvenated(run, every=2, smoothing=SmoothingOptions(effort=0.5, free_sightings=0))
     tried = [slam.step(**reading).rejuvenation is not None for reading in run.readings()]
-    graph = slam._rejuvenation.get_state()["graph"]
+    graph = slam.state.rejuvenation.get_state()["graph"]
     assert tried[1]  # at first there is nothing to redo
     assert np.diff(np.flatnonzero(tried)).max() > 2
     assert len(graph["points"]) > 0
@@ -86,9 +87,9 @@ def test_when_a_landmark_was_seen_last_is_told_by_the_reports():
             slam = twin
         report = slam.step(reading["odometry"], [with_false_points(reading["measurements"][0], rng)])
         seen |= {name: step for name in report.associations[0].tolist() if name >= 0}
-        slots = slam._maps.used_slots()
-        names = slam._maps.ids[slots].tolist()
-        assert slam._maps.last_seen[slots].tolist() == [seen.get(name, 0) for name in names]
+        slots = slam.state.maps.used_slots()
+        names = slam.state.maps.ids[slots].tolist()
+        assert slam.state.maps.last_seen[slots].tolist() == [seen.get(name, 0) for name in names]
         taken_over += sum(owners.get(slot, name) != name for slot, name in zip(slots, names, strict=True))
         owners |= dict(zip(slots, names, strict=True))
         renewed += report.rejuvenation is not None
@@ -102,11 +103,11 @@ def test_all_particles_then_hold_the_same_landmarks_and_names_stay():
     slam = rejuvenated(run, every=21)
     for reading in run.readings():
         slam.step(**reading)
-    ids, _, covariances, counts = slam._dense()
+    ids, _, covariances, counts = dense(slam)
     seen = np.bincount(np.concatenate([names[0] for names in run.names]))
-    slots = slam._maps.used_slots()
-    np.testing.assert_array_equal(slam._maps.ids[slots], ids)
-    np.testing.assert_array_equal(counts, np.repeat(seen[slam._maps.identities[slots]][:, None], 30, axis=1))
+    slots = slam.state.maps.used_slots()
+    np.testing.assert_array_equal(slam.state.maps.ids[slots], ids)
+    np.testing.assert_array_equal(counts, np.repeat(seen[slam.state.maps.identities[slots]][:, None], 30, axis=1))
     full = covariances.transpose(0, 2, 1)[..., [[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
     assert np.linalg.eigvalsh(full).min() > 0.0
 
@@ -121,8 +122,8 @@ def test_landmarks_that_no_sighting_supports_are_given_up(left, monkeypatch):
         kept.append(new.ids[:left])
         renew_all(new._replace(ids=new.ids[:left], tiles=new.tiles[:left], counts=new.counts[:left]))
 
-    renew_all = slam._renew
-    monkeypatch.setattr(slam, "_renew", renew)
+    renew_all = slam.state._replace_particles
+    monkeypatch.setattr(slam.state, "_replace_particles", renew)
     readings = list(run.readings())
     for reading in readings[:EVERY]:
         slam.step(**reading)

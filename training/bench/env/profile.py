@@ -42,7 +42,7 @@ PHASES = (
     Phase("landmark sensor", ((LandmarkSensor, "measure"),)),
     Phase("scans", ((Scan, "measure"),)),
     Phase("grid painting", ((SharedGrids, "step"),)),
-    Phase("filters", ((FastSlam, "_step_checked"),)),
+    Phase("filters", ((FastSlam, "step_checked"),)),
     Phase("team, alignment", ((TeamSlam, "step"),)),
     Phase("errors", ((Episode, "standing"),)),
     Phase("observations", ((observation, "observe_team"),)),
