@@ -29,218 +29,26 @@ from vslam_env.simulation.scenario import draw_setting
 from vslam_env.snapshots import EnvState, check_parts, check_state, objects_of, sequence_state, state_version
 from vslam_env.world import World, WorldSource, check_source, is_one_building
 
-
-def infos_of(
-    agents: Sequence[str],
-    groups: Sequence[tuple[int, ...]],
-    standing: Standing,
-    terms: Mapping[str, Sequence[float]],
-    invalid: Sequence[int],
-) -> dict[str, dict[str, Any]]:
-    """Return each agent's figures; `map_rmse` is the cutoff of the map error while nothing is matched.
-
-    `collisions` (ticks), `distance` [m], `bytes_sent` and `merges` count since the reset.
-
-    Args:
-        agents: Names of the K robots.
-        groups: Per robot who shares its map, as far as it knows.
-        standing: Of the team.
-        terms: By name, per robot: what each term of the reward has paid for the step.
-        invalid: Per robot 1 if its action was masked.
-    """
-    errors, rmses, recalls, precisions, _, pose_errors, heading_errors, _, _, distances, _ = standing.figures
-    collisions, bytes_sent = standing.counts
-    infos: dict[str, dict[str, Any]] = {}
-    for robot, agent in enumerate(agents):
-        group = groups[robot]
-        infos[agent] = info = {
-            "map_error": errors[robot],
-            "map_rmse": rmses[robot],
-            "map_recall": recalls[robot],
-            "map_precision": precisions[robot],
-            "pose_error": pose_errors[robot],
-            "heading_error": heading_errors[robot],
-            "coverage": standing.coverage,
-            "group": group[0],
-            "group_size": len(group),
-            "merges": standing.merges,
-            "collisions": collisions[robot],
-            "distance": distances[robot],
-            "bytes_sent": bytes_sent[robot],
-            "invalid_action": invalid[robot],
-        }
-        for name, paid in terms.items():
-            info["reward/" + name] = paid[robot]
-    return infos
-
-
-def observations_of(
-    agents: Sequence[str], belief: TeamBelief, readings: TeamReadings | Sequence[Readings], goal: bool, flat: bool
-) -> dict[str, Any]:
-    """Return each agent's observation after a tick.
-
-    Args:
-        agents: Names of the K robots.
-        belief: What they believe.
-        readings: What they have read in the tick, in one piece or not, with images if these are to be shown.
-        goal: Whether actions are masked.
-        flat: One vector instead of named arrays.
-
-    Returns:
-        By agent fresh arrays by name, as `vslam_env.belief.observation` says; flat ones as one vector, or as
-        `{"observation", "action_mask"}` where actions are masked.
-    """
-    if not isinstance(readings, TeamReadings):
-        readings = TeamReadings.gathered(readings)
-    shown = observed(belief.view(), readings.scans, goal)
-    if readings.images is not None:
-        for observation, image in zip(shown, readings.images, strict=True):
-            observation["image"] = image[:, :, None].copy()
-    if not flat:
-        return dict(zip(agents, shown, strict=True))
-    return {
-        agent: {"observation": flatten(each), "action_mask": each["action_mask"]} if goal else flatten(each)
-        for agent, each in zip(agents, shown, strict=True)
-    }
-
-
 AgentID = str
 STATE_PER_ROBOT = 12
-
-
-class EnvKnowledge(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # PettingZoo has no type information
-    """All that can be asked of an environment.
-
-    Attributes:
-        possible_agents: Names of the robots.
-        observation_spaces: By name.
-        action_spaces: By name.
-        _tap: Where readings can be listened to.
-        _episode: The running one; None before the first reset.
-        _standing: How the team stood after the last step or reset.
-    """
-
-    possible_agents: list[AgentID]
-    observation_spaces: dict[AgentID, spaces.Space[Any]]
-    action_spaces: dict[AgentID, spaces.Space[Any]]
-    _tap: Tap
-    _episode: Episode | None
-    _standing: Standing
-    _max_cycles: int
-
-    def observation_space(self, agent: AgentID) -> spaces.Space[Any]:
-        """Return the space of an agent's observations; always the same object."""
-        self._index(agent)
-        return self.observation_spaces[agent]
-
-    def action_space(self, agent: AgentID) -> spaces.Space[Any]:
-        """Return the space of an agent's actions; always the same object."""
-        self._index(agent)
-        return self.action_spaces[agent]
-
-    def state(self) -> NDArray[np.float32]:
-        """Return the truth for centralised critics, as one float32 vector.
-
-        Per robot: true pose (x, y, cos, sin, world frame), pose as estimated (x, y, cos, sin, laid at the true start),
-        map error, map recall, heading error, first robot of its group; then coverage and merges of the team.
-        """
-        episode = self._running_episode("state")
-        true, believed = episode.true_path[-1], episode.believed_poses()
-        rows = [np.column_stack([poses[:, :2], np.cos(poses[:, 2]), np.sin(poses[:, 2])]) for poses in (true, believed)]
-        standing = self._standing
-        frames = [group[0] for group in episode.belief.known_groups]
-        scored = np.column_stack([standing.map_errors, standing.map_recalls, standing.heading_errors, frames])
-        return np.concatenate([np.hstack([*rows, scored]).ravel(), [standing.coverage, standing.merges]]).astype(
-            np.float32
-        )
-
-    # ------------------------------------------------------------------ beyond PettingZoo
-
-    def belief(self, agent: AgentID) -> Belief:
-        """Return what an agent's robot believes; it holds nothing of the truth."""
-        return self._running_episode("belief").belief.belief(self._index(agent))
-
-    @property
-    def events(self) -> tuple[MergeEvent, ...]:
-        """All attempts and merges since the reset, in order."""
-        return self._running_episode("events").belief.events
-
-    @property
-    def readings(self) -> tuple[Readings, ...]:
-        """What each robot perceived in the last tick."""
-        return self._running_episode("readings").readings.of_each()
-
-    @property
-    def world(self) -> World:
-        """The true world of this episode, its landmarks included."""
-        return self._running_episode("world").world
-
-    @property
-    def true_landmarks(self) -> FloatArray:
-        """(N, 3) float64 [m], world frame. The landmarks that count, those that some robot could ever see; a copy."""
-        return self._running_episode("true_landmarks").ledger.true_positions.copy()
-
-    @property
-    def true_poses(self) -> FloatArray:
-        """(K, 3) float64 [m, m, rad], world frame."""
-        return self._running_episode("true_poses").true_poses
-
-    @property
-    def true_start_poses(self) -> FloatArray:
-        """(K, 3) float64 [m, m, rad], world frame."""
-        return self._running_episode("true_start_poses").true_starts.copy()
-
-    @property
-    def episode(self) -> Episode:
-        """The running episode, for diagnosis: the simulator's books, paths, seeds."""
-        return self._running_episode("episode")
-
-    @property
-    def recorder(self) -> Recorder | None:
-        """A function to be called with the readings of every tick, those of the reset included; may be assigned."""
-        return self._tap.recorder
-
-    @recorder.setter
-    def recorder(self, recorder: Recorder | None) -> None:
-        if recorder is not None and not callable(recorder):
-            raise bad_argument("recorder", "a function or None", recorder, "It is called with a tuple of Readings.")
-        self._tap.recorder = recorder
-
-    @property
-    def max_cycles(self) -> int:
-        """After so many steps the episode is truncated; may be assigned."""
-        return self._max_cycles
-
-    @max_cycles.setter
-    def max_cycles(self, max_cycles: int) -> None:
-        self._max_cycles = check_int("max_cycles", max_cycles, 1, "Give a number of steps.")
-
-    def scene(self) -> Scene:
-        """Return what a picture shows now."""
-        return scene_of(self._running_episode("scene"), self._standing)
-
-    def _running_episode(self, name: str) -> Episode:
-        if self._episode is None:
-            raise RuntimeError(f"{name}: expected a running episode, got none. Call reset() first.")
-        return self._episode
-
-    def _index(self, agent: AgentID) -> int:
-        if not isinstance(agent, str) or agent not in self.possible_agents:
-            raise bad_argument("agent", f"one of {self.possible_agents}", agent, "Use a name of possible_agents.")
-        return self.possible_agents.index(agent)
-
-
 RENDER_MODES = ("human", "rgb_array")
 
 
-class ExplorationEnv(EnvKnowledge):
+class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # PettingZoo has no type information
     """Robots that do not know where they start explore a building, build maps, and merge these when they fit.
 
     `vslam_v0.parallel_env` describes the arguments; what is observed is described in `vslam_env.belief.observation`.
 
     Attributes:
         config: All that defines this environment.
+        possible_agents: Names of the robots.
+        observation_spaces: By name.
+        action_spaces: By name.
     """
+
+    possible_agents: list[AgentID]
+    observation_spaces: dict[AgentID, spaces.Space[Any]]
+    action_spaces: dict[AgentID, spaces.Space[Any]]
 
     metadata: ClassVar[dict[str, Any]] = {
         "name": "vslam_env/Exploration-v0",
@@ -394,6 +202,97 @@ class ExplorationEnv(EnvKnowledge):
         """Close the window, if there is one."""
         self._window.close()
 
+    def observation_space(self, agent: AgentID) -> spaces.Space[Any]:
+        """Return the space of an agent's observations; always the same object."""
+        self._index(agent)
+        return self.observation_spaces[agent]
+
+    def action_space(self, agent: AgentID) -> spaces.Space[Any]:
+        """Return the space of an agent's actions; always the same object."""
+        self._index(agent)
+        return self.action_spaces[agent]
+
+    def state(self) -> NDArray[np.float32]:
+        """Return the truth for centralised critics, as one float32 vector.
+
+        Per robot: true pose (x, y, cos, sin, world frame), pose as estimated (x, y, cos, sin, laid at the true start),
+        map error, map recall, heading error, first robot of its group; then coverage and merges of the team.
+        """
+        episode = self._running_episode("state")
+        true, believed = episode.true_path[-1], episode.believed_poses()
+        rows = [np.column_stack([poses[:, :2], np.cos(poses[:, 2]), np.sin(poses[:, 2])]) for poses in (true, believed)]
+        standing = self._standing
+        frames = [group[0] for group in episode.belief.known_groups]
+        scored = np.column_stack([standing.map_errors, standing.map_recalls, standing.heading_errors, frames])
+        return np.concatenate([np.hstack([*rows, scored]).ravel(), [standing.coverage, standing.merges]]).astype(
+            np.float32
+        )
+
+    # ------------------------------------------------------------------ beyond PettingZoo
+
+    def belief(self, agent: AgentID) -> Belief:
+        """Return what an agent's robot believes; it holds nothing of the truth."""
+        return self._running_episode("belief").belief.belief(self._index(agent))
+
+    @property
+    def events(self) -> tuple[MergeEvent, ...]:
+        """All attempts and merges since the reset, in order."""
+        return self._running_episode("events").belief.events
+
+    @property
+    def readings(self) -> tuple[Readings, ...]:
+        """What each robot perceived in the last tick."""
+        return self._running_episode("readings").readings.of_each()
+
+    @property
+    def world(self) -> World:
+        """The true world of this episode, its landmarks included."""
+        return self._running_episode("world").world
+
+    @property
+    def true_landmarks(self) -> FloatArray:
+        """(N, 3) float64 [m], world frame. The landmarks that count, those that some robot could ever see; a copy."""
+        return self._running_episode("true_landmarks").ledger.true_positions.copy()
+
+    @property
+    def true_poses(self) -> FloatArray:
+        """(K, 3) float64 [m, m, rad], world frame."""
+        return self._running_episode("true_poses").true_poses
+
+    @property
+    def true_start_poses(self) -> FloatArray:
+        """(K, 3) float64 [m, m, rad], world frame."""
+        return self._running_episode("true_start_poses").true_starts.copy()
+
+    @property
+    def episode(self) -> Episode:
+        """The running episode, for diagnosis: the simulator's books, paths, seeds."""
+        return self._running_episode("episode")
+
+    @property
+    def recorder(self) -> Recorder | None:
+        """A function to be called with the readings of every tick, those of the reset included; may be assigned."""
+        return self._tap.recorder
+
+    @recorder.setter
+    def recorder(self, recorder: Recorder | None) -> None:
+        if recorder is not None and not callable(recorder):
+            raise bad_argument("recorder", "a function or None", recorder, "It is called with a tuple of Readings.")
+        self._tap.recorder = recorder
+
+    @property
+    def max_cycles(self) -> int:
+        """After so many steps the episode is truncated; may be assigned."""
+        return self._max_cycles
+
+    @max_cycles.setter
+    def max_cycles(self, max_cycles: int) -> None:
+        self._max_cycles = check_int("max_cycles", max_cycles, 1, "Give a number of steps.")
+
+    def scene(self) -> Scene:
+        """Return what a picture shows now."""
+        return scene_of(self._running_episode("scene"), self._standing)
+
     # ------------------------------------------------------------------ snapshots
 
     def get_state(self) -> EnvState:
@@ -465,6 +364,16 @@ class ExplorationEnv(EnvKnowledge):
         observations = observations_of(agents, belief, episode.readings, *self._shown_as)
         return observations, infos_of(agents, belief.known_groups, self._standing, terms, invalid)
 
+    def _running_episode(self, name: str) -> Episode:
+        if self._episode is None:
+            raise RuntimeError(f"{name}: expected a running episode, got none. Call reset() first.")
+        return self._episode
+
+    def _index(self, agent: AgentID) -> int:
+        if not isinstance(agent, str) or agent not in self.possible_agents:
+            raise bad_argument("agent", f"one of {self.possible_agents}", agent, "Use a name of possible_agents.")
+        return self.possible_agents.index(agent)
+
 
 def _unpickled(made_from: tuple[Any, ...], max_cycles: int, state: EnvState) -> ExplorationEnv:
     """Return the environment that `ExplorationEnv.__reduce__` took apart."""
@@ -472,3 +381,77 @@ def _unpickled(made_from: tuple[Any, ...], max_cycles: int, state: EnvState) -> 
     env.max_cycles = max_cycles
     env.set_state(state)
     return env
+
+
+def infos_of(
+    agents: Sequence[str],
+    groups: Sequence[tuple[int, ...]],
+    standing: Standing,
+    terms: Mapping[str, Sequence[float]],
+    invalid: Sequence[int],
+) -> dict[str, dict[str, Any]]:
+    """Return each agent's figures; `map_rmse` is the cutoff of the map error while nothing is matched.
+
+    `collisions` (ticks), `distance` [m], `bytes_sent` and `merges` count since the reset.
+
+    Args:
+        agents: Names of the K robots.
+        groups: Per robot who shares its map, as far as it knows.
+        standing: Of the team.
+        terms: By name, per robot: what each term of the reward has paid for the step.
+        invalid: Per robot 1 if its action was masked.
+    """
+    errors, rmses, recalls, precisions, _, pose_errors, heading_errors, _, _, distances, _ = standing.figures
+    collisions, bytes_sent = standing.counts
+    infos: dict[str, dict[str, Any]] = {}
+    for robot, agent in enumerate(agents):
+        group = groups[robot]
+        infos[agent] = info = {
+            "map_error": errors[robot],
+            "map_rmse": rmses[robot],
+            "map_recall": recalls[robot],
+            "map_precision": precisions[robot],
+            "pose_error": pose_errors[robot],
+            "heading_error": heading_errors[robot],
+            "coverage": standing.coverage,
+            "group": group[0],
+            "group_size": len(group),
+            "merges": standing.merges,
+            "collisions": collisions[robot],
+            "distance": distances[robot],
+            "bytes_sent": bytes_sent[robot],
+            "invalid_action": invalid[robot],
+        }
+        for name, paid in terms.items():
+            info["reward/" + name] = paid[robot]
+    return infos
+
+
+def observations_of(
+    agents: Sequence[str], belief: TeamBelief, readings: TeamReadings | Sequence[Readings], goal: bool, flat: bool
+) -> dict[str, Any]:
+    """Return each agent's observation after a tick.
+
+    Args:
+        agents: Names of the K robots.
+        belief: What they believe.
+        readings: What they have read in the tick, in one piece or not, with images if these are to be shown.
+        goal: Whether actions are masked.
+        flat: One vector instead of named arrays.
+
+    Returns:
+        By agent fresh arrays by name, as `vslam_env.belief.observation` says; flat ones as one vector, or as
+        `{"observation", "action_mask"}` where actions are masked.
+    """
+    if not isinstance(readings, TeamReadings):
+        readings = TeamReadings.gathered(readings)
+    shown = observed(belief.view(), readings.scans, goal)
+    if readings.images is not None:
+        for observation, image in zip(shown, readings.images, strict=True):
+            observation["image"] = image[:, :, None].copy()
+    if not flat:
+        return dict(zip(agents, shown, strict=True))
+    return {
+        agent: {"observation": flatten(each), "action_mask": each["action_mask"]} if goal else flatten(each)
+        for agent, each in zip(agents, shown, strict=True)
+    }

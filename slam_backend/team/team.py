@@ -8,14 +8,19 @@ team watches whether its maps contradict each other, and if they do it undoes th
 their group go on with a fork of the joint filter, which is told on their return what they have read meanwhile.
 """
 
-from collections.abc import Sequence
-from typing import Literal
+import copy
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from slam_backend.core.validation import FloatArray, IntArray, bad_argument, check_kind
+from slam_backend.core.state_checks import refusing
+from slam_backend.core.validation import FloatArray, IntArray, bad_argument, check_int, check_kind, check_seed
 from slam_backend.fastslam.consistency import Consistency
+from slam_backend.fastslam.filter import FastSlam
+from slam_backend.fastslam.options import MOST_ROBOTS, FilterOptions
 from slam_backend.fastslam.particle_maps import write_outline
 from slam_backend.fastslam.relative_poses import Standpoints
 from slam_backend.fastslam.reports import (
@@ -29,7 +34,7 @@ from slam_backend.fastslam.reports import (
 )
 from slam_backend.fastslam.step_input import StepInput, check_step
 from slam_backend.geometry import inverse
-from slam_backend.maps.alignment import Alignment
+from slam_backend.maps.alignment import Alignment, AlignmentOptions
 from slam_backend.maps.alignment_types import PairAttempts, count_attempts, refusals_of
 from slam_backend.maps.landmark_map import LandmarkMap, TeamOutlines
 from slam_backend.models.measurements import Measurements, TeamMeasurements
@@ -40,11 +45,265 @@ from slam_backend.team.group_merging import MergePlan, contradicted, merge_group
 from slam_backend.team.groups import Group, Lineup
 from slam_backend.team.merge_attempt import attempt
 from slam_backend.team.merge_rollback import Undoing
-from slam_backend.team.state import TeamState
+from slam_backend.team.merge_scheduler import AttemptOptions, AttemptSchedule
+from slam_backend.team.options import MergeOptions
+from slam_backend.team.shared_records import Records
+from slam_backend.team.state_checks import TeamCheck
+
+Rejuvenation = tuple[tuple[int, ...], RejuvenationReport]  # of a filter: who goes by it, and what came of it
 
 
-class TeamKnowledge(TeamState):
-    """All that can be asked of a team."""
+class TeamSlam:
+    """Visual FastSLAM for a team whose robots do not know where they start.
+
+    Args:
+        num_robots: K.
+        alignment: When two maps are believed to fit together.
+        attempts: When a pair of groups tries.
+        merging: How filters are merged, and when a merge is undone.
+        seed: Of all random streams of the team: an int or a `numpy.random.SeedSequence`.
+        **fastslam_options: Of each filter; the fields of `FilterOptions`.
+
+    Raises:
+        ValueError: If an argument is unknown or out of its range; the text names it.
+    """
+
+    def __init__(
+        self,
+        num_robots: int,
+        alignment: AlignmentOptions | None = None,
+        seed: int | np.random.SeedSequence = 0,
+        attempts: AttemptOptions | None = None,
+        merging: MergeOptions | None = None,
+        **fastslam_options: Any,
+    ) -> None:
+        count = check_int("num_robots", num_robots, 1, "A team has at least one robot.", MOST_ROBOTS)
+        known = {field.name for field in fields(FilterOptions)}
+        for name in fastslam_options:
+            if name not in known:
+                cure = f"Options of the filters are {', '.join(sorted(known))}."
+                raise bad_argument(name, "a known argument", "a name that no option has", cure)
+        options = FilterOptions(**fastslam_options)
+        for name, value, kind in (
+            ("alignment", alignment, AlignmentOptions),
+            ("attempts", attempts, AttemptOptions),
+            ("merging", merging, MergeOptions),
+        ):
+            if value is not None and not isinstance(value, kind):
+                raise bad_argument(name, f"{kind.__name__} or None", value, f"Build one: {kind.__name__}(...).")
+        if isinstance(seed, np.random.Generator):
+            raise bad_argument("seed", "an int >= 0 or a SeedSequence", seed, "A team spawns a stream for each robot.")
+        sequence = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(check_seed(seed))
+        own, *streams, of_forks = sequence.spawn(2 + count)
+        self._rng = np.random.default_rng(own)
+        self._alignment = AlignmentOptions() if alignment is None else alignment
+        self._merging = MergeOptions() if merging is None else merging
+        self._schedule = AttemptSchedule(AttemptOptions() if attempts is None else attempts, self._alignment)
+        groups = [
+            Group(Branch((robot,), (robot,), FastSlam.from_options(1, options, rng), {robot: -1}, robot))
+            for robot, rng in enumerate(map(np.random.default_rng, streams))
+        ]
+        self._groups, self._records, self._num_robots = groups, Records(count, of_forks), count
+        self._events: list[MergeEvent] = []
+        self._together = reach(None, count)
+        self._numbers = frozenset(range(count))
+        self._settle()
+        self._last_lineup: Lineup | None = None
+        self._step = 0
+        self._epoch = 0
+        self._size = 0
+
+    # ------------------------------------------------------------------ one step
+
+    def step(
+        self,
+        odometry: FloatArray | Sequence[ArrayLike | None],
+        measurements: Sequence[Measurements | None] | TeamMeasurements,
+        contacts: ArrayLike | None = None,
+        identities: Sequence[ArrayLike | None] | None = None,
+        poses: Sequence[ArrayLike | None] | None = None,
+    ) -> TeamReport:
+        """Let robots lose and find each other, step each filter, weigh the last merges, and let one pair of groups try.
+
+        Robots pass on what they hear: who reaches another through others is in contact with it. Where robots of a
+        group lose contact, the largest part (of equal ones that with the lowest robot) keeps the joint filter; each
+        other part goes on with a fork of it, and the joint filter holds their poses. On return the joint filter takes
+        in what they have read meanwhile, at most 20 steps of it per step; until it has caught up they go by their
+        fork. Parts that meet away from the joint filter join likewise. Only the robots that keep the joint filter
+        align and merge.
+
+        Args:
+            odometry: Per robot (3,) [m, m, rad], or None; see `FastSlam.step`. (K, 3) where all have moved.
+            measurements: Per robot its frame, or None; or the frames of all in one piece.
+            contacts: (K, K) bool, symmetric: who hears whom now; the diagonal means nothing. None = all.
+            identities: Per robot (n_i,) int, see `FastSlam.step`.
+            poses: Per robot (3,), see `FastSlam.step`.
+
+        Raises:
+            ValueError: If an argument is ill-formed; the team is then as before.
+        """
+        count, networks = self._num_robots, self._together
+        if contacts is not None:
+            networks = reach(check_contacts(contacts, count), count)
+        lineup, size = self.lineup, self._size or self._descriptor_size()
+        camera = lineup.branches[0].filter.options.camera
+        inputs = check_step(count, size, camera, odometry, measurements, identities, poses)
+        records, before = self._records, len(self._events)
+        if contacts is not None or lineup.is_split:
+            lineup = self._regrouped(networks)
+        if lineup.oldest is not None:
+            records.log.record(self._step, inputs)
+        findings, rejuvenations = self._advance(lineup, inputs)
+        if lineup.is_watched:
+            self._doubt()
+        renamings = self._attempt(networks) if self._schedule.is_due(self._step) else ()
+        if self._is_stale:
+            self._settle()
+            lineup = self.lineup
+        oldest = self._step + 1 if lineup.oldest is None else lineup.oldest
+        if lineup is not self._last_lineup:
+            self._note_dropped(lineup)
+            records.log.forget_before(oldest)
+        events, entries = tuple(self._events[before:]), tuple(records.entries)
+        report = TeamReport(
+            self._step, findings, lineup.groups, events, renamings, lineup.maps, entries, oldest, rejuvenations
+        )
+        records.entries.clear()
+        self._step += 1
+        return report
+
+    def _regrouped(self, networks: IntArray) -> Lineup:
+        """Let robots of each group lose and find each other, and return who goes by which filter then."""
+        was_split = self.lineup.is_split
+        for group in self._groups:
+            group.regroup(networks, self._records)
+        if was_split or any(len(group.branches) > 1 for group in self._groups):
+            self._settle()
+        return self.lineup
+
+    def _advance(self, lineup: Lineup, inputs: StepInput) -> tuple[Findings, tuple[Rejuvenation, ...]]:
+        """Step all filters with what their robots have just read; return what `TeamReport` tells of it."""
+        step, records, findings = self._step, self._records, Findings.none_yet(inputs)
+        rejuvenations: tuple[Rejuvenation, ...] = ()
+        for branch, intake in zip(lineup.branches, lineup.intakes, strict=True):
+            report = take_in(branch, step, intake, inputs, findings)
+            if report.num_created:
+                records.note_created(branch.number, step, report)
+            if len(intake.robots) > 1:  # a robot that nobody hears sends nothing
+                records.exchange.record_step(report, branch.filter.descriptor_size)
+            if report.rejuvenation is not None:
+                rejuvenations += ((intake.robots, report.rejuvenation),)
+        findings.close()
+        return findings, rejuvenations
+
+    def merge(self, robot_a: int, robot_b: int, alignment: Alignment, known: bool = False) -> Renaming:
+        """Merge the joint filters of two robots' groups with a given alignment, unasked whether it is right.
+
+        The merge is then watched like any other; `MergeOptions(watch_steps=0)` makes it final.
+
+        Args:
+            robot_a: A robot of one group that goes by its joint filter.
+            robot_b: Such a robot of the other.
+            alignment: Motion from the map frame of b's group to that of a's; `inliers` are rows of `map(robot_a)` and
+                `map(robot_b)`, none if the landmarks in common are not known.
+            known: The motion is drawn from the alignment's covariance as it stands. Else the landmarks in common
+                correct it, for each pair of particles by itself, and the covariance counts where they are few.
+
+        Returns:
+            How landmark ids changed; `robots_a` is the group whose frame stays, the one with the lowest robot.
+
+        Raises:
+            ValueError: If the robots share a group already, or one is out of contact with its joint filter, or the
+                alignment is a refusal or names rows that do not exist or the same one twice; the team is then as
+                before.
+        """
+        groups = self._group_of(robot_a), self._group_of(robot_b)
+        if groups[0] is groups[1]:
+            expected = f"a robot outside the group {groups[0].robots}"
+            raise bad_argument("robot_b", expected, robot_b, "They share a map already.")
+        for name, robot, group in zip(("robot_a", "robot_b"), (robot_a, robot_b), groups, strict=True):
+            if robot not in group.trunk.live:
+                cure = "Merge through a robot that goes by the joint filter."
+                raise bad_argument(name, f"one of {group.trunk.live}", robot, cure)
+        if not isinstance(alignment, Alignment) or not alignment.success:
+            got = f"a refusal ({alignment.reason})" if isinstance(alignment, Alignment) else alignment
+            raise bad_argument("alignment", "a successful Alignment", got, "Align the two maps first.")
+        if groups[1].robots < groups[0].robots:
+            groups, alignment = groups[::-1], inverse_alignment(alignment)
+        renaming = self._merge(MergePlan.of(*groups, alignment), known)
+        self._settle()
+        return renaming
+
+    def _merge(self, plan: MergePlan, known: bool = False) -> Renaming:
+        """Merge two groups as planned, and write it down."""
+        epoch = self._epoch + 1
+        joint, renaming = merge_groups(plan, self._merging, self._records, self._rng, epoch, known)
+        self._epoch = epoch
+        self._events.append(MergeEvent(self._step, "merge", renaming.robots_a, renaming.robots_b, plan.alignment))
+        self._replace(plan.groups, [joint])
+        return renaming
+
+    def _replace(self, old: Sequence[Group], new: Sequence[Group]) -> None:
+        """Put some groups in the place of others."""
+        self._groups = [group for group in self._groups if all(group is not other for other in old)] + list(new)
+        self._groups.sort(key=lambda group: group.robots)
+        self._is_stale = True
+
+    def _doubt(self) -> None:
+        """Weigh the evidence about the merges that can still be undone, and undo what contradicts itself."""
+        due = self._step % self._merging.watch_every == 0
+        for group in list(self._groups):
+            if due and group.undoing is None:
+                false = contradicted(group.trunk, self._merging, self._alignment)
+                group.undoing = None if false is None else Undoing.of(group.trunk, false.number)
+            if group.undoing is not None:
+                self._undo(group, group.undoing)
+                continue
+            for branch in group.branches:
+                while branch.watches and branch.watches[0].steps >= self._merging.watch_steps:
+                    branch.watches.pop(0)
+                    self._is_stale = True
+
+    def _undo(self, group: Group, undoing: Undoing) -> None:
+        """Go on with taking back a merge; it is done when all sides have caught up and are in contact."""
+        merges = undoing.merges(group.trunk)
+        if not merges:  # the joint filter is another one now, whose window is over
+            group.undoing, self._is_stale = None, True
+            return
+        caught_up = undoing.catch_up(group.trunk, self._records.log)
+        if not caught_up or not all(watch.together(group.trunk.live) for watch in merges):
+            return
+        self._epoch += 1
+        self._replace([group], undone(group, undoing, self._records, self._epoch))
+        for watch in merges:
+            pair = (watch.sides[0].robots, watch.sides[1].robots)
+            self._events.append(MergeEvent(self._step, "undo", *pair, watch.alignment))
+        self._schedule.bar(pair, self._step + self._merging.barred_steps)
+
+    def _attempt(self, networks: IntArray) -> tuple[Renaming, ...]:
+        """Let a pair of groups try, and merge those whose attempt is a success."""
+        options = self._schedule, self._alignment, self._merging
+        tried = attempt(self._groups, networks, self._step, *options, self._records, self._rng)
+        if tried is None:
+            return ()
+        self._events.append(tried.event)
+        return () if tried.plan is None else (self._merge(tried.plan),)
+
+    def _note_dropped(self, lineup: Lineup) -> None:
+        """Write down which maps are gone since the last lineup."""
+        self._records.entries += [MapDropped(number) for number in sorted(self._numbers - lineup.numbers)]
+        self._last_lineup, self._numbers = lineup, lineup.numbers
+
+    def _descriptor_size(self) -> int:
+        """Return the length of the descriptors in use, 0 before the first one; it stays the same from there on."""
+        self._size = max([branch.filter.descriptor_size for branch in self.lineup.branches])
+        return self._size
+
+    def _settle(self) -> None:
+        """Find out who goes by which filter now."""
+        self.lineup, self._is_stale = Lineup.of(self._groups), False
+
+    # ------------------------------------------------------------------ what is known
 
     @property
     def num_robots(self) -> int:
@@ -250,207 +509,56 @@ class TeamKnowledge(TeamState):
             return self.lineup.places[robot]
         raise bad_argument("robot", f"an index from 0 to {self.num_robots - 1}", robot, "Count robots from 0.")
 
+    # ------------------------------------------------------------------ snapshots
 
-Rejuvenation = tuple[tuple[int, ...], RejuvenationReport]  # of a filter: who goes by it, and what came of it
+    @property
+    def kept_readings(self) -> Mapping[int, StepInput]:
+        """Readings of the last steps that some filter may take in later, by step; to be looked at."""
+        return self._records.log.kept
 
+    @property
+    def filter_options(self) -> FilterOptions:
+        """What all filters assume, but for their number of particles."""
+        return self._groups[0].trunk.filter.options
 
-class TeamSlam(TeamKnowledge):
-    """Visual FastSLAM for a team whose robots do not know where they start.
+    def get_state(self) -> dict[str, Any]:
+        """Return all that decides how the team goes on, random streams included.
 
-    Args:
-        num_robots: K.
-        alignment: When two maps are believed to fit together.
-        attempts: When a pair of groups tries.
-        merging: How filters are merged, and when a merge is undone.
-        seed: Of all random streams of the team: an int or a `numpy.random.SeedSequence`.
-        **fastslam_options: Of each filter; the fields of `FilterOptions`.
+        What is never written to (snapshots kept for an undo, readings, reports) is shared, all else is copied.
+        """
+        return {
+            "step": self._step,
+            "epoch": self._epoch,
+            "rng": copy.deepcopy(self._rng.bit_generator.state),
+            "events": tuple(self._events),
+            "groups": [group.get_state() for group in self._groups],
+            "numbers": sorted(self._numbers),
+            "alignment": self._alignment,
+            "merging": self._merging,
+            "schedule": self._schedule.get_state(),
+            "records": self._records.get_state(),
+        }
 
-    Raises:
-        ValueError: If an argument is unknown or out of its range; the text names it.
-    """
-
-    # ------------------------------------------------------------------ one step
-
-    def step(
-        self,
-        odometry: FloatArray | Sequence[ArrayLike | None],
-        measurements: Sequence[Measurements | None] | TeamMeasurements,
-        contacts: ArrayLike | None = None,
-        identities: Sequence[ArrayLike | None] | None = None,
-        poses: Sequence[ArrayLike | None] | None = None,
-    ) -> TeamReport:
-        """Let robots lose and find each other, step each filter, weigh the last merges, and let one pair of groups try.
-
-        Robots pass on what they hear: who reaches another through others is in contact with it. Where robots of a
-        group lose contact, the largest part (of equal ones that with the lowest robot) keeps the joint filter; each
-        other part goes on with a fork of it, and the joint filter holds their poses. On return the joint filter takes
-        in what they have read meanwhile, at most 20 steps of it per step; until it has caught up they go by their
-        fork. Parts that meet away from the joint filter join likewise. Only the robots that keep the joint filter
-        align and merge.
-
-        Args:
-            odometry: Per robot (3,) [m, m, rad], or None; see `FastSlam.step`. (K, 3) where all have moved.
-            measurements: Per robot its frame, or None; or the frames of all in one piece.
-            contacts: (K, K) bool, symmetric: who hears whom now; the diagonal means nothing. None = all.
-            identities: Per robot (n_i,) int, see `FastSlam.step`.
-            poses: Per robot (3,), see `FastSlam.step`.
+    def set_state(self, state: Mapping[str, Any]) -> None:
+        """Go on exactly as the team that gave `state`.
 
         Raises:
-            ValueError: If an argument is ill-formed; the team is then as before.
+            ValueError: If `state` is not one of `get_state`, or of a team of another size.
         """
-        count, networks = self._num_robots, self._together
-        if contacts is not None:
-            networks = reach(check_contacts(contacts, count), count)
-        lineup, size = self.lineup, self._size or self._descriptor_size()
-        camera = lineup.branches[0].filter.options.camera
-        inputs = check_step(count, size, camera, odometry, measurements, identities, poses)
-        records, before = self._records, len(self._events)
-        if contacts is not None or lineup.is_split:
-            lineup = self._regrouped(networks)
-        if lineup.oldest is not None:
-            records.log.record(self._step, inputs)
-        findings, rejuvenations = self._advance(lineup, inputs)
-        if lineup.is_watched:
-            self._doubt()
-        renamings = self._attempt(networks) if self._schedule.is_due(self._step) else ()
-        if self._is_stale:
-            self._settle()
-            lineup = self.lineup
-        oldest = self._step + 1 if lineup.oldest is None else lineup.oldest
-        if lineup is not self._last_lineup:
-            self._note_dropped(lineup)
-            records.log.forget_before(oldest)
-        events, entries = tuple(self._events[before:]), tuple(records.entries)
-        report = TeamReport(
-            self._step, findings, lineup.groups, events, renamings, lineup.maps, entries, oldest, rejuvenations
-        )
-        records.entries.clear()
-        self._step += 1
-        return report
+        with refusing("state"):
+            TeamCheck(self._num_robots, self.kept_readings, (self.filter_options,)).check("state", state)
+        self.go_on_from(state)
 
-    def _regrouped(self, networks: IntArray) -> Lineup:
-        """Let robots of each group lose and find each other, and return who goes by which filter then."""
-        was_split = self.lineup.is_split
-        for group in self._groups:
-            group.regroup(networks, self._records)
-        if was_split or any(len(group.branches) > 1 for group in self._groups):
-            self._settle()
-        return self.lineup
-
-    def _advance(self, lineup: Lineup, inputs: StepInput) -> tuple[Findings, tuple[Rejuvenation, ...]]:
-        """Step all filters with what their robots have just read; return what `TeamReport` tells of it."""
-        step, records, findings = self._step, self._records, Findings.none_yet(inputs)
-        rejuvenations: tuple[Rejuvenation, ...] = ()
-        for branch, intake in zip(lineup.branches, lineup.intakes, strict=True):
-            report = take_in(branch, step, intake, inputs, findings)
-            if report.num_created:
-                records.note_created(branch.number, step, report)
-            if len(intake.robots) > 1:  # a robot that nobody hears sends nothing
-                records.exchange.record_step(report, branch.filter.descriptor_size)
-            if report.rejuvenation is not None:
-                rejuvenations += ((intake.robots, report.rejuvenation),)
-        findings.close()
-        return findings, rejuvenations
-
-    def merge(self, robot_a: int, robot_b: int, alignment: Alignment, known: bool = False) -> Renaming:
-        """Merge the joint filters of two robots' groups with a given alignment, unasked whether it is right.
-
-        The merge is then watched like any other; `MergeOptions(watch_steps=0)` makes it final.
-
-        Args:
-            robot_a: A robot of one group that goes by its joint filter.
-            robot_b: Such a robot of the other.
-            alignment: Motion from the map frame of b's group to that of a's; `inliers` are rows of `map(robot_a)` and
-                `map(robot_b)`, none if the landmarks in common are not known.
-            known: The motion is drawn from the alignment's covariance as it stands. Else the landmarks in common
-                correct it, for each pair of particles by itself, and the covariance counts where they are few.
-
-        Returns:
-            How landmark ids changed; `robots_a` is the group whose frame stays, the one with the lowest robot.
-
-        Raises:
-            ValueError: If the robots share a group already, or one is out of contact with its joint filter, or the
-                alignment is a refusal or names rows that do not exist or the same one twice; the team is then as
-                before.
-        """
-        groups = self._group_of(robot_a), self._group_of(robot_b)
-        if groups[0] is groups[1]:
-            expected = f"a robot outside the group {groups[0].robots}"
-            raise bad_argument("robot_b", expected, robot_b, "They share a map already.")
-        for name, robot, group in zip(("robot_a", "robot_b"), (robot_a, robot_b), groups, strict=True):
-            if robot not in group.trunk.live:
-                cure = "Merge through a robot that goes by the joint filter."
-                raise bad_argument(name, f"one of {group.trunk.live}", robot, cure)
-        if not isinstance(alignment, Alignment) or not alignment.success:
-            got = f"a refusal ({alignment.reason})" if isinstance(alignment, Alignment) else alignment
-            raise bad_argument("alignment", "a successful Alignment", got, "Align the two maps first.")
-        if groups[1].robots < groups[0].robots:
-            groups, alignment = groups[::-1], inverse_alignment(alignment)
-        renaming = self._merge(MergePlan.of(*groups, alignment), known)
+    def go_on_from(self, state: Mapping[str, Any]) -> None:
+        """Go on from a state that was checked."""
+        self._step, self._epoch = state["step"], state["epoch"]
+        self._rng.bit_generator.state = copy.deepcopy(state["rng"])
+        self._events = list(state["events"])
+        at_hand = {group.robots: group.trunk.filter for group in self._groups}  # filling is faster than building
+        self._groups = [Group.from_state(group, at_hand) for group in state["groups"]]
         self._settle()
-        return renaming
-
-    def _merge(self, plan: MergePlan, known: bool = False) -> Renaming:
-        """Merge two groups as planned, and write it down."""
-        epoch = self._epoch + 1
-        joint, renaming = merge_groups(plan, self._merging, self._records, self._rng, epoch, known)
-        self._epoch = epoch
-        self._events.append(MergeEvent(self._step, "merge", renaming.robots_a, renaming.robots_b, plan.alignment))
-        self._replace(plan.groups, [joint])
-        return renaming
-
-    def _replace(self, old: Sequence[Group], new: Sequence[Group]) -> None:
-        """Put some groups in the place of others."""
-        self._groups = [group for group in self._groups if all(group is not other for other in old)] + list(new)
-        self._groups.sort(key=lambda group: group.robots)
-        self._is_stale = True
-
-    def _doubt(self) -> None:
-        """Weigh the evidence about the merges that can still be undone, and undo what contradicts itself."""
-        due = self._step % self._merging.watch_every == 0
-        for group in list(self._groups):
-            if due and group.undoing is None:
-                false = contradicted(group.trunk, self._merging, self._alignment)
-                group.undoing = None if false is None else Undoing.of(group.trunk, false.number)
-            if group.undoing is not None:
-                self._undo(group, group.undoing)
-                continue
-            for branch in group.branches:
-                while branch.watches and branch.watches[0].steps >= self._merging.watch_steps:
-                    branch.watches.pop(0)
-                    self._is_stale = True
-
-    def _undo(self, group: Group, undoing: Undoing) -> None:
-        """Go on with taking back a merge; it is done when all sides have caught up and are in contact."""
-        merges = undoing.merges(group.trunk)
-        if not merges:  # the joint filter is another one now, whose window is over
-            group.undoing, self._is_stale = None, True
-            return
-        caught_up = undoing.catch_up(group.trunk, self._records.log)
-        if not caught_up or not all(watch.together(group.trunk.live) for watch in merges):
-            return
-        self._epoch += 1
-        self._replace([group], undone(group, undoing, self._records, self._epoch))
-        for watch in merges:
-            pair = (watch.sides[0].robots, watch.sides[1].robots)
-            self._events.append(MergeEvent(self._step, "undo", *pair, watch.alignment))
-        self._schedule.bar(pair, self._step + self._merging.barred_steps)
-
-    def _attempt(self, networks: IntArray) -> tuple[Renaming, ...]:
-        """Let a pair of groups try, and merge those whose attempt is a success."""
-        options = self._schedule, self._alignment, self._merging
-        tried = attempt(self._groups, networks, self._step, *options, self._records, self._rng)
-        if tried is None:
-            return ()
-        self._events.append(tried.event)
-        return () if tried.plan is None else (self._merge(tried.plan),)
-
-    def _note_dropped(self, lineup: Lineup) -> None:
-        """Write down which maps are gone since the last lineup."""
-        self._records.entries += [MapDropped(number) for number in sorted(self._numbers - lineup.numbers)]
-        self._last_lineup, self._numbers = lineup, lineup.numbers
-
-    def _descriptor_size(self) -> int:
-        """Return the length of the descriptors in use, 0 before the first one; it stays the same from there on."""
-        self._size = max([branch.filter.descriptor_size for branch in self.lineup.branches])
-        return self._size
+        self._last_lineup, self._size = None, 0
+        self._numbers = frozenset(state["numbers"])
+        self._alignment, self._merging = state["alignment"], state["merging"]
+        self._schedule.set_state(state["schedule"])
+        self._records.set_state(state["records"])

@@ -207,7 +207,7 @@ class TeamBelief:
 
     def set_state(self, state: Mapping[str, Any]) -> None:
         """Go on exactly as the beliefs that gave `state`, which was checked."""
-        self._team._go_on_from(state["team"])
+        self._team.go_on_from(state["team"])
         self._tick = state["tick"]
         self._grids.set_state(state["grids"])
         for slots, candidates in zip(self._slots, state["slots"], strict=True):
