@@ -299,8 +299,8 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         """Return all that decides how the environment goes on: world, filters, random streams, resets to come.
 
         An environment that is set to it returns the same bytes for the same actions from there on. What never changes
-        in an episode is shared with the environment, all else copied. `vslam_env.save_state` writes it to disk. The
-        recorder, the window and what reward terms of your own remember are not part of it.
+        in an episode is shared with the environment, its arrays read-only; all else is copied. `vslam_env.save_state`
+        writes it to disk. The recorder, the window and what reward terms of your own remember are not part of it.
         """
         episode = self._episode
         return {

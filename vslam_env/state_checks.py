@@ -45,7 +45,7 @@ from vslam_env.navigation import GRID_SIZE
 from vslam_env.navigation._grid_kernels import HALF_WIDTH
 from vslam_env.navigation.candidate_slots import NUM_SLOTS
 from vslam_env.sensors import EyeFrames, Frames, LandmarkSensor, Scan, StereoSensor
-from vslam_env.simulation.episode import Episode
+from vslam_env.simulation.episode import Episode, num_shared
 from vslam_env.simulation.scenario import Setting
 from vslam_env.world import World
 
@@ -411,12 +411,7 @@ def check_slots(name: str, slots: Any) -> None:
 
 def check_path(name: str, path: Sequence[Any], own: Sequence[FloatArray], count: int) -> None:
     """Refuse what are no poses (K, 3) after each tick; the first ones that an episode holds itself are passed over."""
-    known = min(len(path), len(own))
-    try:
-        known = known if list(path[:known]) == list(own[:known]) else 0
-    except ValueError:  # of arrays that are other ones
-        known = 0
-    for poses in path[known:]:
+    for poses in path[num_shared(path, own) :]:
         check_floats(name, poses, (count, 3), -1e9, 1e9)
 
 

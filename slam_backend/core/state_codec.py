@@ -23,6 +23,8 @@ import numpy as np
 from numpy.random import SeedSequence
 from numpy.typing import NDArray
 
+from slam_backend.core.read_only import as_read_only
+
 ALIGNMENT = 64  # bytes; where arrays begin
 MOST_BYTES = 1 << 30  # of a file: a state has some megabytes
 MOST_TABLE = 1 << 26  # bytes of a table: Python takes up to twenty times as many to hold it
@@ -278,8 +280,7 @@ class _Reader:
             raise ValueError("a truth value that is neither 0 nor 1")
         array = flat.view(dtype).reshape(shape[::-1] if by_columns else shape)
         array = (array.T if by_columns else array).copy("A")
-        array.setflags(write=bool(writeable))
-        return array
+        return array if writeable else as_read_only(array)
 
     def _taken(self, size: int) -> memoryview:
         """Return the next bytes that are not in the table."""

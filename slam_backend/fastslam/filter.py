@@ -168,24 +168,24 @@ class FastSlam:
         """
         count, size = self.num_robots, self.descriptor_size
         inputs = check_step(count, size, self.options.camera, odometry, measurements, identities, poses)
-        findings = Findings.none_yet(inputs)
-        report = self.step_checked(inputs, seats_of(tuple(range(count))), findings)
-        findings.close()
-        return report
+        return self.step_checked(inputs, seats_of(tuple(range(count))), *Findings.none_yet(inputs))
 
-    def step_checked(self, inputs: StepInput, seats: Seats, findings: Findings, step: int | None = None) -> StepReport:
+    def step_checked(
+        self, inputs: StepInput, seats: Seats, findings: Findings, told: IntArray, step: int | None = None
+    ) -> StepReport:
         """Do what `step` does with readings that `check_step` returned.
 
         Args:
             inputs: What these robots, and perhaps others, read; it is not written to.
             seats: Rows of these robots there.
-            findings: Of `inputs`; what becomes of these robots' measurements is written there.
+            findings: Of `inputs`.
+            told: Their buffer, see `Findings.none_yet`; what becomes of these robots' measurements is written there.
             step: Number of the step in the logs; None: the next one.
         """
         state = self.state
         if step is not None:
             state.next_step = step
-        long_unseen, created, new, matched, rejected, ess, nis, is_depleted = state.update(inputs, seats, findings.told)
+        long_unseen, created, new, matched, rejected, ess, nis, is_depleted = state.update(inputs, seats, told)
         if is_depleted:
             state.resample()
         report = StepReport(findings, seats.rows, created, new, matched, rejected, ess, nis, is_depleted)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from slam_backend.core.blas import on_one_thread
 from slam_backend.core.jit import in_place
+from slam_backend.core.read_only import with_constants, with_read_only
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.fastslam import _kernels
 from slam_backend.fastslam.options import FilterOptions
@@ -224,7 +225,7 @@ class RejuvenationStep:
         refused = [row for row, name in enumerate(ids.tolist()) if name < 0]
         if refused and not self._never:
             rows = np.array(refused)
-            self._refused[robot][step] = Refused(rows, descriptors[rows])
+            self._refused[robot][step] = with_read_only(Refused(rows, descriptors[rows]))
 
     def count(self, matched: int, long_unseen: int) -> None:
         """Count a step, what was matched or started in it, and how much of it to landmarks not seen for long."""
@@ -438,7 +439,7 @@ class RejuvenationStep:
     # ------------------------------------------------------------------ snapshots
 
     def get_state(self) -> dict[str, Any]:
-        """Return all that decides how it goes on; the graph's arrays, which cannot be written, are shared."""
+        """Return all that decides how it goes on; arrays of graphs and of what was refused are shared and read-only."""
         draft = self._draft
         return {
             "graph": None if self._graph is None else self._graph.to_mapping(),
@@ -452,15 +453,15 @@ class RejuvenationStep:
         """Go on exactly as the one that gave `state`."""
         self._graph = None
         if state["graph"] is not None:
-            self._hold(PathGraph(**state["graph"]))
+            self._hold(PathGraph.of_mapping(state["graph"]))
         self._draft = None
         if state["draft"] is not None:
             graph, damping, steps = state["draft"]
-            self._draft = Draft(graph=PathGraph(**graph), damping=damping, steps=steps)
+            self._draft = Draft(graph=PathGraph.of_mapping(graph), damping=damping, steps=steps)
         for name in SCHEDULE:
             setattr(self, name, state["schedule"][name])
-        self._guesses = [Guesses(*guesses) for guesses in state["guesses"]]
-        self._refused = [dict(refused) for refused in state["refused"]]
+        self._guesses = [Guesses(steps.copy(), poses.copy()) for steps, poses in state["guesses"]]
+        self._refused = [dict(with_constants(refused)) for refused in state["refused"]]
 
 
 def _told(graph: PathGraph, reason: str) -> Rejuvenation:

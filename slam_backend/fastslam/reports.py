@@ -2,10 +2,11 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self
 
 import numpy as np
 
+from slam_backend.core.read_only import Act, as_constant, as_read_only, mapped
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from slam_backend.fastslam._kernels import STOOD
 from slam_backend.fastslam._kernels.layout import ASSOCIATED, COUNT, CREATED, REJECTED
@@ -13,7 +14,7 @@ from slam_backend.fastslam.step_input import UNHEARD, StepInput, Turn
 
 
 class Findings(NamedTuple):
-    """What became of N robots' measurements in one step; nobody writes to it when the step is over.
+    """What became of N robots' measurements in one step; read-only.
 
     Attributes:
         told: (2, n) int64. Of all measurements used, one robot's after the other's: the landmark that each was taken
@@ -27,25 +28,30 @@ class Findings(NamedTuple):
     masks: Mapping[int, BoolArray]
 
     @classmethod
-    def none_yet(cls, inputs: StepInput) -> Self:
-        """Return room for what becomes of some readings; until it is written all measurements are rejected."""
-        told = np.empty((2, len(inputs.sightings)), np.int64)
-        told.fill(REJECTED)
-        return cls(told, inputs.turns, inputs.masks)
+    def none_yet(cls, inputs: StepInput) -> tuple[Self, IntArray]:
+        """Return what becomes of some readings, and the room (2, n) int64 where the step is to write it.
+
+        Until it is written all measurements are rejected.
+        """
+        room = np.empty((2, len(inputs.sightings)), np.int64)
+        room.fill(REJECTED)
+        return cls(as_read_only(room), inputs.turns, inputs.masks), room
 
     @classmethod
     def gathered(cls, associations: Sequence[IntArray], created: Sequence[IntArray]) -> Self:
         """Return those of robots of each of which both are known, (n_i,) ids."""
-        told = np.stack([np.concatenate(associations), np.concatenate(created)])
+        told = as_read_only(np.stack([np.concatenate(associations), np.concatenate(created)]))
         turns, begin = [], 0
         for own in associations:
             turns.append((STOOD, begin, begin + len(own), False, False, len(own)))
             begin += len(own)
         return cls(told, turns, {})
 
-    def close(self) -> None:
-        """Let nobody write to it any more: reports and journals share it."""
-        self.told.setflags(write=False)
+    def with_arrays(self, act: Act) -> Self:
+        """Return the same with `act` done to each array; itself if that changes nothing."""
+        before = self.told, self.masks
+        after = mapped(before, act)
+        return self if after is before else type(self)(after[0], self.turns, after[1])
 
     def num_given(self, row: int) -> int:
         """Return how many measurements a robot was given, used or not."""
@@ -214,7 +220,7 @@ class Renaming:
     Attributes:
         robots_a: Group a before the merge; its landmark ids stay.
         robots_b: Group b before the merge.
-        ids_b: (k, 2) int64. Rows (id in b's map, id in the joint map); fused landmarks carry the id of a.
+        ids_b: (k, 2) int64, read-only. Rows (id in b's map, id in the joint map); fused landmarks carry the id of a.
         maps: Numbers of a's map, of b's and of the joint one. The first two are kept until their `MapDropped`: an undo
             takes them up again as they were.
     """
@@ -223,6 +229,13 @@ class Renaming:
     robots_b: tuple[int, ...]
     ids_b: IntArray
     maps: tuple[int, int, int]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "ids_b", as_constant(self.ids_b))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Let copies and what was pickled be read-only, too."""
+        return Renaming, (self.robots_a, self.robots_b, self.ids_b, self.maps)
 
 
 @dataclass(frozen=True, slots=True)
@@ -247,7 +260,7 @@ class LandmarksCreated(NamedTuple):
         number: Of the map.
         robot: Who read it.
         step: When it was read; with a replay that is earlier than the step of the report.
-        ids: (n,) int64. Id of the landmark that each of its measurements created, -1 = none.
+        ids: (n,) int64, read-only. Id of the landmark that each of its measurements created, -1 = none.
     """
 
     number: int

@@ -7,10 +7,20 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from slam_backend.core.read_only import with_constants, with_read_only
 from slam_backend.core.validation import FloatArray, IntArray, bad_argument, check_array, check_choice, check_int
 from slam_backend.fastslam._kernels.layout import COVERED, DID, LOGGED, MOTION, MOVED, NAME, PLACED, THOUGHT, USED
 from slam_backend.fastslam._kernels.run_log import write_rows
-from slam_backend.smoother.log_arrays import EXACT, ODOMETRY, REJECTED, STOOD, LogArrays, LogStep, join
+from slam_backend.smoother.log_arrays import (
+    EXACT,
+    ODOMETRY,
+    REJECTED,
+    STOOD,
+    LogArrays,
+    LogStep,
+    has_been_checked,
+    join,
+)
 
 ROWS = 256  # of a chunk: so many steps,
 MEASUREMENTS = 2048  # and so many measurements, unless one frame alone has more
@@ -92,7 +102,7 @@ class RobotLog:
             raise self._refusal(step, odometry, pose, points, ids, covariances)
         start, t = self._num_measurements, self._num_rows
         if t == ROWS or (start and start + n > MEASUREMENTS):
-            self._chunks.append(self._unfinished())
+            self._chunks.append(with_read_only(self._unfinished()))
             self._open(max(MEASUREMENTS, n))
             start = t = 0
         elif n > len(self._ids):  # one huge frame after steps that have none
@@ -284,7 +294,7 @@ class RobotLog:
         return _restored({"chunks": chunks, "unfinished": state["unfinished"].renamed(unique, new[order], keep)})
 
     def get_state(self) -> dict[str, Any]:
-        """Return the log as it stands; finished chunks are shared and cannot be written, the rest is a copy."""
+        """Return the log as it stands; finished chunks are shared and read-only, the rest is a copy."""
         return {"chunks": tuple(self._chunks), "unfinished": self._unfinished()}
 
     def set_state(self, state: Mapping[str, Any]) -> None:
@@ -298,7 +308,7 @@ class RobotLog:
                 raise bad_argument("state", "a dict from RobotLog.get_state", f"no {name!r}", "Pass it unchanged.")
         last: LogArrays = state["unfinished"]
         t, n = len(last), len(last.ids)
-        self._chunks = list(state["chunks"])
+        self._chunks = [chunk if has_been_checked(chunk) else with_constants(chunk) for chunk in state["chunks"]]
         self._open(max(MEASUREMENTS, n))
         self._num_rows, self._num_measurements = t, n
         self._steps[:t], self._kinds[:t], self._motions[:t], self._given[:t] = (

@@ -415,7 +415,7 @@ class FilterState:
     # ------------------------------------------------------------------ snapshots
 
     def get_state(self) -> dict[str, Any]:
-        """Return all that decides how the filter goes on, its random stream included. Shares nothing with it."""
+        """Return all that decides how the filter goes on, its random stream included; what it shares is read-only."""
         logs = tuple(log.get_state() for log in self.logs)  # first, for it informs the smoother as well
         state: dict[str, Any] = {name: getattr(self, name).copy() for name in KEPT}
         state |= {"steps": self.next_step, "estimates": self.estimates.copy(), "maps": self.maps.get_state()}

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from slam_backend.core.jit import in_place, jit
+from slam_backend.core.read_only import as_read_only
 from slam_backend.core.state_checks import (
     BOOL,
     CURE,
@@ -144,8 +145,8 @@ def count_bad_values(values: FloatArray, counts: Any, num_particles: int, farthe
     """Return how many landmarks that particles hold are no Gaussians in the world.
 
     Args:
-        values: (n, 9 P) float64 [m, m^2]. Blocks of lanes, as in `MapStore`.
-        counts: (n, P) int32. 0 where the particle lacks the landmark.
+        values: (n, 9 P) float64 [m, m^2], read-only. Blocks of lanes, as in `MapStore`.
+        counts: (n, P) int32, read-only. 0 where the particle lacks the landmark.
         num_particles: M.
         farthest: [m].
         largest: [m^2].
@@ -180,7 +181,7 @@ def check_maps(name: str, maps: Any, m: int, options: FilterOptions) -> None:
     n = len(ids)
     check_indices(f"{name}['counts']", maps["counts"], (n, padded), 0, MOST_LANDMARKS, m, INT32)
     check_kept(f"{name}['values']", maps["values"], FLOAT64, (n, 9 * padded))
-    if n and count_bad_values(maps["values"], maps["counts"], m, FARTHEST, LARGEST):
+    if n and count_bad_values(as_read_only(maps["values"]), as_read_only(maps["counts"]), m, FARTHEST, LARGEST):
         refuse(f"{name}['values']", "means and positive variances", "others")
     check_indices(f"{name}['maps']", maps["maps"], (None, padded), 0, m - 1, m, INT32)
     check_indices(f"{name}['maps']", maps["maps"], (None, padded), 0, padded - 1, dtype=INT32)  # of lanes beyond M, too

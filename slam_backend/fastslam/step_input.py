@@ -6,10 +6,11 @@ A refused step leaves no trace. The table holds the measurements of all robots i
 import math
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
+from slam_backend.core.read_only import Act, as_read_only, mapped, with_constants, with_read_only
 from slam_backend.core.validation import BoolArray, Float32Array, FloatArray, IntArray, bad_argument, check_array
 from slam_backend.fastslam import _kernels
 from slam_backend.fastslam._kernels import IDLE
@@ -25,6 +26,8 @@ UNHEARD = (IDLE, 0, 0, 0, 0, -1)
 class StepInput(NamedTuple):
     """What N robots read in one step, checked, as filters take it; it is not written to.
 
+    Kernels are compiled for arrays that can be written; those that are kept are read-only.
+
     Attributes:
         turns: Of each robot.
         table: (N, 6) int64. The same.
@@ -34,7 +37,7 @@ class StepInput(NamedTuple):
             -1, which are not.
         sightings: (n, 9) [m, m^2] all robots' measurements, one robot's after the other's, in robot axes: points (3)
             relative to the camera centre, and their covariances (6), upper triangles by rows, where they have any.
-        descriptors: (n, d), its own: kernels are compiled for arrays that can be written.
+        descriptors: (n, d).
         names: (n,) the caller's names, or (0,) where no robot has any.
         silent: Robots of which there is nothing to take in. An empty frame is something: it says that nothing was there
             to see.
@@ -48,6 +51,16 @@ class StepInput(NamedTuple):
     descriptors: Float32Array
     names: IntArray
     silent: frozenset[int]
+
+    def with_arrays(self, act: Act) -> Self:
+        """Return the same with `act` done to each array; itself if that changes nothing."""
+        before = self[1:-1]  # turns and silent hold none
+        after = mapped(before, act)
+        return self if after is before else type(self)._make((self.turns, *after, self.silent))
+
+    def with_copies(self) -> Self:
+        """Return the same with arrays of its own, which kernels take."""
+        return self.with_arrays(np.ndarray.copy)
 
 
 class Seats(NamedTuple):
@@ -87,11 +100,11 @@ class InputLog:
         return self._steps
 
     def record(self, step: int, inputs: StepInput) -> None:
-        """Keep what all robots read in a step, later than all before."""
-        self._steps[step] = inputs
+        """Keep what all robots read in a step, later than all before; nobody is to write to it afterwards."""
+        self._steps[step] = with_read_only(inputs)
 
     def read(self, step: int) -> StepInput:
-        """Return what all robots read in a step that is kept."""
+        """Return what all robots read in a step that is kept; read-only."""
         return self._steps[step]
 
     def forget_before(self, step: int) -> None:
@@ -100,12 +113,16 @@ class InputLog:
             del self._steps[oldest]
 
     def get_state(self) -> dict[str, Any]:
-        """Return what is kept; inputs are never written to, and are shared."""
+        """Return what is kept; inputs are read-only and shared."""
         return {"steps": dict(self._steps)}
 
     def set_state(self, state: Mapping[str, Any]) -> None:
         """Go on with what `get_state` returned."""
-        self._steps = dict(state["steps"])
+        own = self._steps
+        steps: Mapping[int, StepInput] = state["steps"]
+        self._steps = {
+            step: inputs if own.get(step) is inputs else with_constants(inputs) for step, inputs in steps.items()
+        }
 
 
 NO_SIGHTINGS = np.zeros((0, 9))
@@ -192,7 +209,7 @@ def seen_by_each(frames: Sequence[Measurements | None], names: Sequence[IntArray
         if frame is not None and count:
             own: Used = frame.points, frame.covariances, frame.descriptors, called
             if called is not None and called.min() < 0:
-                masks[robot] = called >= 0
+                masks[robot] = as_read_only(called >= 0)
                 own = _masked(*own, masks[robot])
             used.append(own)
             end += len(own[0])

@@ -14,6 +14,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from slam_backend.core.read_only import as_read_only
 from slam_backend.core.validation import (
     MOST,
     BoolArray,
@@ -154,7 +155,7 @@ class StereoFrontEnd:
         self.options = FrontEndOptions() if options is None else options
         middle = (0.5 * (camera.width - 1), 0.5 * (camera.height - 1))
         centre = check_array("centre_px", middle if centre_px is None else centre_px, (2,), "Give column and row.")
-        self._centre: FloatArray = np.append(centre, 0.0)
+        self._centre: FloatArray = as_read_only(np.append(centre, 0.0))
         self._kind = KINDS[self.options.descriptor]
         span = camera.focal_px * camera.baseline
         self._least, self._largest = span / camera.max_range, span / self.options.nearest

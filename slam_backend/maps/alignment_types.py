@@ -3,8 +3,8 @@
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
-from typing import Literal, Self
+from dataclasses import dataclass, fields
+from typing import Any, Literal, Self
 
 import numpy as np
 
@@ -157,6 +157,10 @@ class Alignment:
         inliers = check_array("inliers", self.inliers, (None, 2), "Give rows (a, b).", dtype=np.int64)
         for name, array in (("covariance", covariance), ("inliers", inliers)):
             object.__setattr__(self, name, as_read_only(array))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Let copies and what was pickled be read-only, too."""
+        return Alignment, tuple(getattr(self, field.name) for field in fields(self))
 
     @property
     def transform(self) -> FloatArray:

@@ -138,6 +138,10 @@ class LandmarkMap:
         for name, array in fields.items():
             object.__setattr__(self, name, as_read_only(array))
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Let copies and what was pickled be read-only, too; the constructor might change covariances by rounding."""
+        return unchecked_map, tuple(getattr(self, name) for name in FIELDS)
+
     def __len__(self) -> int:
         return len(self.means)
 

@@ -1,11 +1,13 @@
 """`PathGraph`: key poses of all robots, the odometry between them, and what was measured there. It never changes."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from slam_backend.core.read_only import as_read_only, with_constants
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from slam_backend.geometry import between, wrap_angle
 from slam_backend.smoother._kernels import rename
@@ -94,8 +96,7 @@ class PathGraph:
     latest: IntArray
 
     def __post_init__(self) -> None:
-        for column in vars(self).values():
-            column.setflags(write=False)
+        vars(self).update({name: as_read_only(column) for name, column in vars(self).items()})
 
     @classmethod
     def at_starts(cls, starts: FloatArray) -> "PathGraph":
@@ -139,6 +140,13 @@ class PathGraph:
             latest=np.full(k, -1),
         )
 
+    @classmethod
+    def of_mapping(cls, columns: Mapping[str, NDArray[Any]]) -> "PathGraph":
+        """Return the graph of which `to_mapping` returned the arrays; what can be written of them is copied."""
+        graph = object.__new__(cls)
+        vars(graph).update(with_constants(columns))
+        return graph
+
     def reordered(self, order: IntArray) -> "PathGraph":
         """Return the graph in which robot i is the one that was `order[i]`; (K,) a permutation."""
         robots = self.robots.copy()
@@ -148,15 +156,14 @@ class PathGraph:
         )
 
     def with_columns(self, **columns: NDArray[Any]) -> "PathGraph":
-        """Return the graph with some columns in place of its own, which cannot be written either from now on.
+        """Return the graph with read-only views of some columns in place of its own.
 
-        As `dataclasses.replace`, but that those that stay are not looked at anew.
+        As `dataclasses.replace`, but that those that stay are not looked at again. The caller must not write to the
+        arrays afterwards.
         """
         assert columns.keys() <= vars(self).keys()
-        for column in columns.values():
-            column.setflags(write=False)
         other = object.__new__(PathGraph)
-        vars(other).update(vars(self), **columns)
+        vars(other).update(vars(self), **{name: as_read_only(column) for name, column in columns.items()})
         return other
 
     def known_as(self, ids: IntArray) -> IntArray:
@@ -166,7 +173,7 @@ class PathGraph:
         return result
 
     def to_mapping(self) -> dict[str, Any]:
-        """Return all arrays by name; they cannot be written."""
+        """Return all arrays by name; they are read-only."""
         return dict(vars(self))
 
     @property

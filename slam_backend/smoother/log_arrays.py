@@ -8,6 +8,7 @@ from weakref import WeakSet
 import numpy as np
 from numpy.typing import NDArray
 
+from slam_backend.core.read_only import Act, mapped, with_constants, with_read_only
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 
 STOOD: Final = 0  # kinds of motion
@@ -42,7 +43,7 @@ COLUMNS = ("steps", "kinds", "motions", "given", "starts", "points", "ids", "cov
 
 @dataclass(frozen=True, slots=True, weakref_slot=True, eq=False, kw_only=True)
 class LogArrays:
-    """T steps with n measurements in all. The arrays cannot be written.
+    """T steps with n measurements in all. The arrays cannot be written; those that are shared are `with_read_only`.
 
     Attributes:
         steps: (T,) int64. Index of each step in the run, ascending; steps in which nothing happened may be left out.
@@ -74,10 +75,16 @@ class LogArrays:
         return len(self.steps)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "LogArrays":
-        return self  # it cannot change
+        return with_constants(self)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _from_columns, (self._columns(),)  # a pickle alone would forget that the arrays are read-only
+
+    def with_arrays(self, act: Act) -> "LogArrays":
+        """Return the same with `act` done to each array; itself if that changes nothing."""
+        before = self._columns()
+        after = mapped(before, act)
+        return self if after is before else LogArrays(**after)
 
     @property
     def nbytes(self) -> int:
@@ -135,18 +142,19 @@ _checked: WeakSet[LogArrays] = WeakSet()
 
 
 def has_been_checked(rows: Any) -> bool:
-    """Tell whether all of a log's arrays were looked at before: they cannot be written."""
+    """Tell whether all of a log's arrays were looked at before, and nobody can have written to them since."""
     return type(rows) is LogArrays and rows in _checked
 
 
 def note_checked(rows: LogArrays) -> None:
-    """Remember that all of a log's arrays were looked at."""
-    _checked.add(rows)
+    """Remember that all of a log's arrays were looked at, if they are read-only."""
+    if with_read_only(rows) is rows:
+        _checked.add(rows)
 
 
 def _from_columns(columns: dict[str, Any]) -> LogArrays:
     """Build a log from its arrays, as unpickling does."""
-    return LogArrays(**columns)
+    return with_read_only(LogArrays(**columns))
 
 
 def join(parts: Sequence[LogArrays]) -> LogArrays:

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
+from slam_backend.core.read_only import with_constants
 from slam_backend.core.validation import IntArray
 from slam_backend.fastslam.filter import FastSlam
 from slam_backend.fastslam.reports import Findings, StepReport
@@ -85,12 +86,13 @@ class Branch:
     def from_state(cls, state: Mapping[str, Any], at_hand: FastSlam | None = None) -> "Branch":
         """Build a branch from `get_state`; a filter at hand is filled in place of a new one."""
         slam = restored_filter(state["filter"], at_hand)
-        rest = {name: state[name] for name in ("robots", "live", "number", "epoch", "report", "split_from")}
+        rest = {name: state[name] for name in ("robots", "live", "number", "epoch", "split_from")}
         return cls(
             filter=slam,
             known=dict(state["known"]),
             watches=[watch.copy() for watch in state["watches"]],
             split_counts=dict(state["split_counts"]),
+            report=with_constants(state["report"]),
             **rest,
         )
 
@@ -145,7 +147,9 @@ class Intake(NamedTuple):
         return cls(robots, seats_of(rows), frozenset(robot % TURNS for robot in smoothing))
 
 
-def take_in(branch: Branch, step: int, intake: Intake, inputs: StepInput, findings: Findings) -> StepReport:
+def take_in(
+    branch: Branch, step: int, intake: Intake, inputs: StepInput, findings: Findings, told: IntArray
+) -> StepReport:
     """Let a filter take in what some of its robots read in one step.
 
     If there is nothing to take in the filter stays as it is, bit for bit, so that a later replay finds it unchanged.
@@ -155,7 +159,8 @@ def take_in(branch: Branch, step: int, intake: Intake, inputs: StepInput, findin
         step: Number of the step; the filter's logs bear it, whenever it is taken in.
         intake: Of the branch and these robots.
         inputs: Of all robots of the team, checked by `check_step`.
-        findings: Of `inputs`; what becomes of these robots' measurements is written there.
+        findings: Of `inputs`.
+        told: Their buffer, see `Findings.none_yet`; what becomes of these robots' measurements is written there.
     """
     robots, seats, turns = intake
     for robot in robots:
@@ -167,7 +172,7 @@ def take_in(branch: Branch, step: int, intake: Intake, inputs: StepInput, findin
         return report
     slam = branch.filter
     slam.may_smooth = step % TURNS in turns
-    branch.report = report = slam.step_checked(inputs, seats, findings, step)
+    branch.report = report = slam.step_checked(inputs, seats, findings, told, step)
     if report.num_created:
         for watch in branch.watches:
             watch.note(branch.robots, report)
@@ -237,6 +242,7 @@ def replay(
         step = min(due.values())
         robots = tuple(sorted(robot for robot, first in due.items() if first == step))
         inputs = log.read(step)
-        report = take_in(branch, step, Intake.of(branch, robots), inputs, Findings.none_yet(inputs))
+        intake = Intake.of(branch, robots)
+        report = take_in(branch, step, intake, inputs.with_copies(), *Findings.none_yet(inputs))
         done.append(ReplayedStep(step, robots, inputs, report))
     return done

@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from slam_backend.core.read_only import with_constants, with_read_only
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.fastslam.reports import StepReport
 from slam_backend.geometry import transform_points
@@ -33,7 +34,7 @@ from slam_backend.team.options import MergeOptions
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Side:
-    """One group as it was just before a merge; nothing of it is written to.
+    """One group as it was just before a merge; its arrays are read-only.
 
     Attributes:
         trunk: State of its joint filter's branch, the watches of earlier merges among it.
@@ -45,9 +46,16 @@ class Side:
 
     @classmethod
     def of(cls, trunk: Mapping[str, Any]) -> "Side":
-        """Return a side with this trunk."""
+        """Return a side with this trunk, whose arrays nobody is to write to afterwards."""
         earlier = [side.oldest for watch in trunk["watches"] for side in watch.sides]
-        return cls(trunk, min([1 + min(trunk["known"].values()), *earlier]))
+        return cls(with_read_only(trunk), min([1 + min(trunk["known"].values()), *earlier]))
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "trunk", with_constants(self.trunk))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Let copies and what was pickled be read-only, too."""
+        return Side, (self.trunk, self.oldest)
 
     @property
     def robots(self) -> tuple[int, ...]:

@@ -8,6 +8,9 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from slam_backend.core.read_only import with_constants
+from slam_backend.core.state_checks import refusing
+from slam_backend.fastslam.state_checks import check_filter
 from slam_backend.fastslam.step_input import InputLog
 from slam_backend.team.branches import MOST_REPLAYED, Branch, ReplayedStep, replay
 from slam_backend.team.merge_monitor import Side, Watch
@@ -31,8 +34,16 @@ class Undoing:
 
     @classmethod
     def of(cls, trunk: Branch, number: int) -> "Undoing":
-        """Begin to take back the merge that made map `number`, which a joint filter watches."""
-        sides = [Branch.from_state(side.trunk) for side in _sides(trunk.watches[-1], number)]
+        """Begin to take back the merge that made map `number`, which a joint filter watches.
+
+        Raises:
+            ValueError: If a filter from before it is damaged: states share the dicts that hold it with the team.
+        """
+        before = [side.trunk for side in _sides(trunk.watches[-1], number)]
+        for side in before:
+            with refusing("state"):
+                check_filter("state['filter']", side["filter"], (trunk.filter.options,))
+        sides = [Branch.from_state(side) for side in before]
         return cls(number, sides, [[] for _ in sides])
 
     def merges(self, trunk: Branch) -> list[Watch]:
@@ -63,7 +74,7 @@ class Undoing:
     def from_state(cls, state: Mapping[str, Any]) -> "Undoing":
         """Go on with what `get_state` returned."""
         sides = [Branch.from_state(side) for side in state["sides"]]
-        return cls(state["number"], sides, [list(done) for done in state["replayed"]])
+        return cls(state["number"], sides, [list(with_constants(done)) for done in state["replayed"]])
 
 
 def _down_to(watch: Watch, number: int) -> Iterator[Watch]:

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from slam_backend.core.read_only import as_constant, with_constants
 from slam_backend.core.validation import MOST, FloatArray, bad_argument, check_int, known_names
 from slam_backend.geometry import wrap_angle
 from slam_backend.maps.alignment import RIVAL_ANGLE, RIVAL_DISTANCE, Alignment, AlignmentOptions, candidate_matches
@@ -157,7 +158,7 @@ class AttemptSchedule:
         """
         frames = pair[0][0], pair[1][0]
         before = self._trials.get(frames)
-        self._trials[frames] = motion
+        self._trials[frames] = as_constant(motion)
         if before is None:
             return math.inf
         x, y, turn = (motion - before).tolist()
@@ -189,7 +190,7 @@ class AttemptSchedule:
         self._bars = [*(bar for bar in self._bars if bar[0] != pair), (pair, until)]
 
     def get_state(self) -> dict[str, Any]:
-        """Return the options and a copy of the memory."""
+        """Return the options and a copy of the memory; arrays are read-only."""
         memory: dict[str, Any] = {"records": copy.deepcopy(self._records), "bars": tuple(self._bars)}
         memory |= {"doubts": dict(self._doubts), "trials": dict(self._trials)}
         fixed = {"options": self._options, "alignment": self._alignment, "straightening": self.straightening}
@@ -201,7 +202,7 @@ class AttemptSchedule:
         self.straightening = state["straightening"]
         self._records = copy.deepcopy(state["records"])
         self._bars = list(state["bars"])
-        self._doubts, self._trials = dict(state["doubts"]), dict(state["trials"])
+        self._doubts, self._trials = dict(state["doubts"]), dict(with_constants(state["trials"]))
 
 
 def _touches(pair: PairKey, barred: PairKey) -> bool:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from slam_backend.core.read_only import as_read_only, with_constants
 from slam_backend.fastslam.reports import LandmarksCreated, MapCopied, MapEntry, StepReport
 from slam_backend.fastslam.step_input import InputLog
 from slam_backend.team.branches import ReplayedStep
@@ -46,7 +47,8 @@ class Records:
         """Write down which landmarks a step of the filter of a map created."""
         for robot in report.rows:
             if robot >= 0 and report.findings.names_created(robot):
-                self.entries.append(LandmarksCreated(number, robot, step, report.findings.created(robot)))
+                created = as_read_only(report.findings.created(robot))
+                self.entries.append(LandmarksCreated(number, robot, step, created))
 
     def note_replay(self, number: int, replayed: Sequence[ReplayedStep]) -> None:
         """Write down which landmarks a replay created in a map."""
@@ -68,5 +70,5 @@ class Records:
         self.log.set_state(state["log"])
         self.exchange.set_state(state["exchange"])
         self.rng.bit_generator.state = copy.deepcopy(state["rng"])
-        self.entries = list(state["entries"])
+        self.entries = list(with_constants(state["entries"]))
         self._next_number = state["next_number"]

@@ -183,17 +183,17 @@ class TeamSlam:
 
     def _advance(self, lineup: Lineup, inputs: StepInput) -> tuple[Findings, tuple[Rejuvenation, ...]]:
         """Step all filters with what their robots have just read; return what `TeamReport` tells of it."""
-        step, records, findings = self._step, self._records, Findings.none_yet(inputs)
+        step, records = self._step, self._records
+        findings, told = Findings.none_yet(inputs)
         rejuvenations: tuple[Rejuvenation, ...] = ()
         for branch, intake in zip(lineup.branches, lineup.intakes, strict=True):
-            report = take_in(branch, step, intake, inputs, findings)
+            report = take_in(branch, step, intake, inputs, findings, told)
             if report.num_created:
                 records.note_created(branch.number, step, report)
             if len(intake.robots) > 1:  # a robot that nobody hears sends nothing
                 records.exchange.record_step(report, branch.filter.descriptor_size)
             if report.rejuvenation is not None:
                 rejuvenations += ((intake.robots, report.rejuvenation),)
-        findings.close()
         return findings, rejuvenations
 
     def merge(self, robot_a: int, robot_b: int, alignment: Alignment, known: bool = False) -> Renaming:
@@ -524,7 +524,7 @@ class TeamSlam:
     def get_state(self) -> dict[str, Any]:
         """Return all that decides how the team goes on, random streams included.
 
-        What is never written to (snapshots kept for an undo, readings, reports) is shared, all else is copied.
+        Snapshots kept for an undo, readings and reports are shared and read-only, all else is copied.
         """
         return {
             "step": self._step,

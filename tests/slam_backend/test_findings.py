@@ -36,9 +36,9 @@ def test_each_robot_finds_what_became_of_what_it_measured(ids: list[list[int]], 
 def test_measurements_that_were_not_used_are_rejected(seeds: list[int]) -> None:
     """Each robot is told of all that it was given: of the used ones what was written, of the others -1."""
     inputs = checked(list(map(reading, seeds)))
-    findings = Findings.none_yet(inputs)
+    findings, room = Findings.none_yet(inputs)
     assert (findings.told == -1).all()
-    findings.told[:] = np.arange(2 * len(inputs.sightings)).reshape(2, -1)
+    room[:] = np.arange(2 * len(inputs.sightings)).reshape(2, -1)
     for robot, turn in enumerate(inputs.turns):
         _, begin, end, _, _, count = turn
         mask = inputs.masks.get(robot, np.full(max(count, 0), True))
@@ -56,3 +56,5 @@ def test_nobody_writes_into_what_reports_and_journals_share() -> None:
         assert report.associations[0].tolist() == [0]
         with pytest.raises(ValueError, match="read-only"):
             report.findings.told[:] = 77
+        with pytest.raises(ValueError, match="cannot set WRITEABLE"):
+            report.findings.told.setflags(write=True)

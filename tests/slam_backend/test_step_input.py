@@ -48,7 +48,7 @@ def checked(readings: list[Reading]) -> StepInput:
 
 def stepped(slam: FastSlam, inputs: StepInput, *rows: int) -> StepReport:
     """Let a filter take in what the robots in some rows have read."""
-    return slam.step_checked(inputs, seats_of(rows), Findings.none_yet(inputs))
+    return slam.step_checked(inputs, seats_of(rows), *Findings.none_yet(inputs))
 
 
 def said(report: StepReport) -> tuple[Any, ...]:

@@ -179,7 +179,11 @@ def test_a_history_keeps_nothing_but_itself() -> None:
         drive.on(mates)
     strokes = drive.grids.get_state()["strokes"]
     assert strokes
-    assert all(own.shared.base is None and own.poses.base is None for own in strokes)
+    for own in strokes:
+        for array in (own.shared, own.poses):
+            assert isinstance(array.base, memoryview)
+            assert array.base.nbytes == array.nbytes
+            assert array.base.obj.base is None
 
 
 def test_radios_that_lose_half_leave_walls_as_thin_as_they_are() -> None:

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from slam_backend.core.read_only import as_constant, as_read_only, with_constants, with_read_only
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from slam_backend.fastslam.relative_poses import Standpoints
 from slam_backend.fastslam.reports import MapDropped, MergeUndone, Renaming, TeamReport
@@ -16,7 +17,7 @@ from vslam_env.navigation import SeenGrid, TeamGrids, ray_directions
 
 
 class Strokes(NamedTuple):
-    """What the readings of one tick wrote into the grids, as `TeamGrids.paint_readings` takes it.
+    """What the readings of one tick wrote into the grids, as `TeamGrids.paint_readings` takes it. Arrays are read-only.
 
     Attributes:
         tick: Of the readings.
@@ -71,7 +72,7 @@ def caught_up(history: Sequence[Strokes], tellings: Iterable[Telling]) -> tuple[
         poses[ticks, taker, readers] = compose(motion, poses[ticks, giver, readers])
     rows = (shared != before).any(axis=(1, 2))
     after = [
-        strokes._replace(shared=shared[row].copy(), poses=poses[row].copy()) if rows[row] else strokes
+        strokes._replace(shared=as_constant(shared[row]), poses=as_constant(poses[row])) if rows[row] else strokes
         for row, strokes in enumerate(history)
     ]
     late = np.flatnonzero(missed.any(axis=(1, 2)))
@@ -97,7 +98,7 @@ def separated(
         held = then.get(strokes.tick, np.zeros_like(own))
         shared = strokes.shared.copy()
         shared[robots] = held[robots] | own[robots]
-        after.append(strokes._replace(shared=shared))
+        after.append(strokes._replace(shared=as_read_only(shared)))
         if (missing := own & ~held).any():
             again.append(strokes._replace(shared=missing))
     return after, again
@@ -163,7 +164,7 @@ class SharedGrids:
             renaming: Of the merge.
         """
         sides = renaming.robots_a, renaming.robots_b
-        grids = {robot: self._grids[robot].get_state() for robot in sides[0] + sides[1]}
+        grids = with_read_only({robot: self._grids[robot].get_state() for robot in sides[0] + sides[1]})
         self._kept.append(Kept(tick, sides, renaming.maps, grids, tuple(self._strokes)))
 
     def step(
@@ -196,7 +197,7 @@ class SharedGrids:
             self.meet(tick, mates, points.starts)
         self.team.paint_readings(self._shared, points.poses, scans, bumps, *self._hardware)
         if self._kept or self._oldest_parting is not None:
-            self._strokes.append(Strokes(tick, self._shared, points.poses.copy(), scans.copy(), bumps.copy()))
+            self._strokes.append(with_constants(Strokes(tick, self._shared_then, points.poses, scans, bumps)))
 
     def _follow(self, tick: int, report: TeamReport) -> None:
         """Keep grids for an undo, undo, and forget what can no longer be undone."""
@@ -271,14 +272,16 @@ class SharedGrids:
 
     def _paint(self, strokes: Strokes) -> None:
         """Paint what was read in an earlier tick."""
-        strokes.bumps.setflags(write=False)  # as the world gives them: kernels are compiled for one of both
-        self.team.paint_readings(*strokes[1:], *self._hardware)
+        _, shared, poses, scans, bumps = strokes
+        # Copies: kernels are compiled for arrays as the world gives them, of which bumps alone are read-only.
+        self.team.paint_readings(shared.copy(), poses.copy(), scans.copy(), bumps, *self._hardware)
 
     def _settle(self, tick: int, mates: Sequence[tuple[int, ...]]) -> None:
         """Take note of who goes by the same filter as whom from a tick on."""
         self._mates = tuple(mates)
         together = np.array([[robot in group for robot in range(len(mates))] for group in mates])
         self._shared = together.astype(np.int64)
+        self._shared_then = as_constant(self._shared)  # as strokes hold it
         self._parted[(self._parted == TOGETHER) & ~together] = tick
         self._parted[together] = TOGETHER
         self._look_for_parted(tick)
@@ -295,7 +298,7 @@ class SharedGrids:
         return {id(one): one for history in (self._strokes, *(k.strokes for k in self._kept)) for one in history}
 
     def get_state(self) -> dict[str, Any]:
-        """Return all that decides how the grids go on; what is never written to is shared."""
+        """Return all that decides how the grids go on; what is shared is read-only."""
         return {
             "grids": [grid.get_state() for grid in self._grids],
             "mates": self._mates,
@@ -310,4 +313,4 @@ class SharedGrids:
             grid.set_state(seen)
         self._parted[:] = state["parted"]
         self._settle(0, state["mates"])
-        self._kept, self._strokes = list(state["kept"]), deque(state["strokes"])
+        self._kept, self._strokes = with_constants(list(state["kept"])), deque(with_constants(state["strokes"]))

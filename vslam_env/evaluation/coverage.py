@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend.core.jit import device, in_place
+from slam_backend.core.read_only import as_constant, as_read_only
 from slam_backend.core.validation import FloatArray
 from slam_backend.geometry import inverse, transform_points
 from vslam_env.navigation import FREE, GRID_SIZE, TeamGrids, cell_of
@@ -108,7 +109,7 @@ def _update(
 
 
 class CoverageMeter:
-    """Where the cells of the free floor lie in each robot's grid, laid at its true start pose; it never changes.
+    """Where the cells of the free floor lie in each robot's grid, laid at its true start pose; read-only.
 
     Args:
         free_area_cells: (n, 2) float64 [m], world frame. Centres of the cells of the free floor.
@@ -123,9 +124,9 @@ class CoverageMeter:
 
     def __init__(self, free_area_cells: FloatArray, true_starts: FloatArray) -> None:
         own = [_flat_cells(transform_points(inverse(start), free_area_cells)) for start in np.asarray(true_starts)]
-        self.cells = np.ascontiguousarray(free_area_cells)
-        self.laid = np.concatenate(own, axis=1)
-        self.bounds = np.cumsum([0, *(part.shape[1] for part in own)])
+        self.cells = as_constant(np.ascontiguousarray(free_area_cells))
+        self.laid = as_read_only(np.concatenate(own, axis=1))
+        self.bounds = as_read_only(np.cumsum([0, *(part.shape[1] for part in own)]))
 
 
 class Coverage:

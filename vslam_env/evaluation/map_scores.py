@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from slam_backend.core.jit import in_place, inlined
+from slam_backend.core.read_only import with_constants, with_read_only
 from slam_backend.core.validation import FloatArray, IntArray, check_float
 from slam_backend.fastslam.relative_poses import OWN, SIGMAS, START, Standpoints
 from slam_backend.fastslam.reports import LandmarksCreated, MapCopied, MapDropped, Renaming, TeamReport
@@ -125,7 +126,7 @@ def _note_claims(book: IntArray, ids: IntArray, true_ids: IntArray, claim_of: In
     Args:
         book: (n,) int64. What the landmark of each id claims; changed.
         ids: (m,) int64. Of the landmarks that measurements created, -1 = none.
-        true_ids: (m,) int64. The landmark behind each measurement; -1 for a false point.
+        true_ids: (m,) int64, read-only. The landmark behind each measurement; -1 for a false point.
         claim_of: (N',) int64. What is noted of each of these.
 
     Returns:
@@ -168,7 +169,7 @@ class ClaimLedger:
             report: Of the step.
             true_ids: Per robot (n_i or more,) int64. The landmark behind each measurement; -1 for a false point.
         """
-        self._seen[report.step] = true_ids
+        self._seen[report.step] = with_read_only(true_ids)
         for entry in report.entries:
             if isinstance(entry, LandmarksCreated):
                 self._enter(entry.number, entry.ids, self._seen[entry.step][entry.robot])
@@ -226,7 +227,7 @@ class ClaimLedger:
         )  # fmt: skip
 
     def get_state(self) -> dict[str, Any]:
-        """Return a copy of the books, for the same world's landmarks."""
+        """Return a copy of the books, for the same world's landmarks; what was seen is read-only and shared."""
         return {
             "books": self._books.copy(),
             "row_of": dict(self._row_of),
@@ -236,7 +237,8 @@ class ClaimLedger:
 
     def set_state(self, state: Mapping[str, Any]) -> None:
         """Go on with books that `get_state` returned."""
-        self._books, self._row_of, self._seen = state["books"].copy(), dict(state["row_of"]), dict(state["seen"])
+        self._books, self._row_of = state["books"].copy(), dict(state["row_of"])
+        self._seen = dict(with_constants(state["seen"]))
         self._go_by(state["map_of"])
 
     def _go_by(self, map_of: tuple[int, ...]) -> None:

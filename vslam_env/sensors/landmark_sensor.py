@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from slam_backend.core.read_only import as_read_only
 from slam_backend.core.validation import (
     BoolArray,
     FloatArray,
@@ -19,7 +20,7 @@ from slam_backend.models.measurements import Measurements, TeamMeasurements
 from vslam_env.sensors._landmark_kernels import BEYOND, FARTHEST, make_up, measure, mix_in
 from vslam_env.world._kernels import detect
 from vslam_env.world.spec import Landmarks
-from vslam_env.world.visibility import marks_of, view_limits, visible_landmarks
+from vslam_env.world.visibility import by_rows, marks_of, view_limits, visible_landmarks
 
 MOST_POINTS = 10_000  # of a frame; time ends before
 
@@ -117,21 +118,21 @@ class LandmarkSensor:
         self, config: LandmarkSensorConfig, walls: FloatArray, landmarks: Landmarks, robot_radius: float = 0.2
     ) -> None:
         self.config = config
-        self._walls = check_array("walls", walls, (None, 4), "Give rows x1 y1 x2 y2 in metres.")
+        self._walls = as_read_only(check_array("walls", walls, (None, 4), "Give rows x1 y1 x2 y2 in metres."))
         self._landmarks = landmarks
         descriptors = landmarks.descriptors.astype(np.float64)
-        self._points = np.hstack([landmarks.positions, descriptors])
+        self._points = as_read_only(np.hstack([landmarks.positions, descriptors]))
         self.robot_radius = check_float("robot_radius", robot_radius, "Give metres.", at_least=0.0)
         camera = config.camera
         lens = camera.focal_px, camera.baseline, camera.sigma_px, camera.sigma_disparity_px
-        self._optics = np.array([*camera.mount, *lens, config.farthest])
+        self._optics = as_read_only(np.array([*camera.mount, *lens, config.farthest]))
         self._view = view_limits(camera, config.max_incidence)
-        walls_by_rows = self._walls.T.copy()
-        self._sight = marks_of(landmarks), landmarks.walls.copy(), walls_by_rows, self.robot_radius, self._view
+        self._sight = marks_of(landmarks), landmarks.walls, by_rows(self._walls), self.robot_radius, self._view
         self._frame_shape = config.max_measurements, self._points.shape[1]
         self._no_false_points = np.empty((0, self._points.shape[1]))
         # False points look like landmarks of this world: the common part of all descriptors and a part of their own.
-        self._common = descriptors.mean(axis=0) if len(landmarks) else np.zeros(descriptors.shape[1])
+        common = descriptors.mean(axis=0) if len(landmarks) else np.zeros(descriptors.shape[1])
+        self._common = as_read_only(common)
         self._own_share = np.sqrt(max(0.0, 1.0 - float(self._common @ self._common)))
 
     def visible(self, poses: FloatArray) -> BoolArray:

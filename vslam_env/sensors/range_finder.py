@@ -4,9 +4,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from slam_backend.core.read_only import as_read_only
 from slam_backend.core.validation import FloatArray, check_array, check_float, check_int
 from slam_backend.models.camera import StereoCamera
-from vslam_env.world._kernels import cast_scans, rays_at
+from vslam_env.world._kernels import cast_scans
+from vslam_env.world.visibility import by_rows, ray_fan
 
 MOST_RAYS = 100_000  # of a robot; memory ends before
 
@@ -44,15 +46,15 @@ class Scan:
 
     Attributes:
         config: What they look at and how well.
-        ray_angles: (R,) float64 [rad], robot frame.
+        ray_angles: (R,) float64 [rad], robot frame. Read-only.
     """
 
     def __init__(self, config: ScanConfig, walls: FloatArray, robot_radius: float = 0.2) -> None:
         self.config = config
-        self.ray_angles = config.ray_angles
+        self.ray_angles = as_read_only(config.ray_angles)
         walls = check_array("walls", walls, (None, 4), "Give rows x1 y1 x2 y2 in metres.")
         robot_radius = check_float("robot_radius", robot_radius, "Give metres.", at_least=0.0)
-        fan = *rays_at(self.ray_angles), walls.T.copy()
+        fan = *ray_fan(config.ray_angles), by_rows(walls)
         self._sight = *fan, robot_radius, config.max_range, config.sigma  # as the kernel expects it
 
     def measure(self, poses: FloatArray, rng: np.random.Generator) -> FloatArray:

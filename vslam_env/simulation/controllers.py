@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from slam_backend.core.read_only import as_read_only
 from slam_backend.core.validation import FloatArray
 from vslam_env.actions import MAX_SPEED, MAX_TURN
 from vslam_env.config import EnvConfig
@@ -54,12 +55,14 @@ class GoalDriver:
         return np.array(follow_path(pose, self._path, MAX_SPEED, MAX_TURN, self._heading))
 
     def get_state(self) -> dict[str, Any]:
-        """Return where it is heading, and by which way."""
-        return {"goal": self._goal, "heading": self._heading, "path": self._path}
+        """Return where it is heading, and by which way. Arrays are read-only."""
+        goal, path = (None if array is None else as_read_only(array) for array in (self._goal, self._path))
+        return {"goal": goal, "heading": self._heading, "path": path}
 
     def set_state(self, state: Mapping[str, Any]) -> None:
-        """Go on as the driver that gave `state`; goals and paths are replaced as a whole and can be shared."""
-        self._goal, self._heading, self._path = state["goal"], state["heading"], state["path"]
+        """Go on as the driver that gave `state`, with copies of goal and path."""
+        goal, self._heading, path = state["goal"], state["heading"], state["path"]
+        self._goal, self._path = (None if array is None else array.copy() for array in (goal, path))
 
 
 class Drivers:

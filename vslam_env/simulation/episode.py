@@ -5,9 +5,11 @@ from dataclasses import dataclass
 from itertools import combinations
 from operator import add
 from typing import Any
+from weakref import ref
 
 import numpy as np
 
+from slam_backend.core.read_only import as_constant, with_constants, with_read_only
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from slam_backend.geometry import between, compose
 from slam_backend.maps.alignment import Alignment
@@ -51,6 +53,21 @@ def true_alignment(
 Recorder = Callable[[tuple[Readings, ...]], None]
 
 
+def num_shared(path: Sequence[FloatArray], own: Sequence[FloatArray]) -> int:
+    """Return how many of the first entries of a path are the same arrays as of another, all that both have or none."""
+    known = min(len(path), len(own))
+    try:
+        return known if list(path[:known]) == list(own[:known]) else 0
+    except ValueError:  # of arrays that are other ones
+        return 0
+
+
+def path_of(path: Sequence[FloatArray], own: list[FloatArray]) -> list[FloatArray]:
+    """Return a path whose arrays no other holder can change; the first ones are taken from an own path if it can be."""
+    known = num_shared(path, own)
+    return own[:known] + [as_constant(poses) for poses in path[known:]]
+
+
 @dataclass(slots=True)
 class Tap:
     """Where readings can be listened to: an environment keeps it over its episodes."""
@@ -70,8 +87,6 @@ class Episode:
 
     Attributes:
         setting: What was drawn at the reset; of these:
-        given_setting: The setting in the last state that was set, from which `setting` was built again if it came from
-            elsewhere; None: no state was set.
         world: Walls and landmarks.
         true_starts: (K, 3) float64 [m, m, rad], world frame.
         belief_seed: From which the team's beliefs draw.
@@ -80,8 +95,8 @@ class Episode:
         ledger: What their landmarks are in truth.
         tick: Ticks since the reset.
         readings: Of the last tick; none before `begin`.
-        true_path: Poses (K, 3) after each tick, world frame.
-        estimated_path: Poses (K, 3) as estimated after each tick, each in the robot's own start frame.
+        true_path: Poses (K, 3) after each tick, world frame; read-only.
+        estimated_path: Poses (K, 3) as estimated after each tick, each in the robot's own start frame; read-only.
         merge_ticks: Tick and groups of each merge.
     """
 
@@ -90,7 +105,7 @@ class Episode:
         self._tap = Tap() if tap is None else tap
         self._all_hear_all = config.always_in_contact
         self._streams = {name: np.random.default_rng(0) for name in setting.stream_states}
-        self.given_setting: Setting | None = None
+        self._given = ref(setting)
         self._settle(setting)
         self.body = Body(
             radius=config.robot_radius, ray_angles=config.scan.ray_angles, scan_range=config.scan.max_range
@@ -129,6 +144,14 @@ class Episode:
     def begin(self) -> None:
         """Let the robots take their first frame."""
         self._perceive(None)
+
+    @property
+    def given_setting(self) -> Setting | None:
+        """The setting in the last state that was set, from which the own one was built again if it came from elsewhere.
+
+        None if nobody else holds it; the episode goes by nothing in it.
+        """
+        return self._given()
 
     @property
     def true_poses(self) -> FloatArray:
@@ -171,7 +194,7 @@ class Episode:
     # ------------------------------------------------------------------ snapshots
 
     def get_state(self) -> dict[str, Any]:
-        """Return all that decides how the episode goes on; what never changes is shared, all else is copied."""
+        """Return all that decides how the episode goes on; what is shared is read-only."""
         return {
             "setting": self.setting,
             "tick": self.tick,
@@ -181,13 +204,13 @@ class Episode:
             "ledger": self.ledger.get_state(),
             "coverage": self._coverage.get_state(),
             "counts": (self._collisions, self._distances.copy(), self._error_integrals.copy()),
-            "last": (self.readings, self._frames),
+            "last": with_read_only((self.readings, self._frames)),
             "paths": (tuple(self.true_path), tuple(self.estimated_path), tuple(self.merge_ticks)),
         }
 
     def set_state(self, state: Mapping[str, Any], setting: Setting) -> None:
         """Go on exactly as the episode that gave `state`, which was checked, in its setting."""
-        self.given_setting = state["setting"]
+        self._given = ref(state["setting"])
         if setting is not self.setting:
             self._settle(setting)
         self._simulator.set_state(state["simulator"])
@@ -198,8 +221,11 @@ class Episode:
         self._coverage.set_state(state["coverage"])
         self.tick = state["tick"]
         self._collisions, self._distances[:], self._error_integrals[:] = state["counts"]
-        self.readings, self._frames = state["last"]
-        self.true_path, self.estimated_path, self.merge_ticks = (list(path) for path in state["paths"])
+        self.readings, self._frames = with_constants(state["last"])
+        true_path, estimated_path, merge_ticks = state["paths"]
+        self.true_path = path_of(true_path, self.true_path)
+        self.estimated_path = path_of(estimated_path, self.estimated_path)
+        self.merge_ticks = list(merge_ticks)
 
     # ------------------------------------------------------------------ within
 
@@ -232,8 +258,8 @@ class Episode:
             self.merge_ticks.append((self.tick, made.robots_a, made.robots_b))
         if config.oracle_merge:
             self._merge_by_oracle(reach(heard, config.num_robots))
-        self.true_path.append(poses.copy())  # whoever writes to that moves no robot
-        self.estimated_path.append(self.belief.points.own.copy())
+        self.true_path.append(as_constant(poses))
+        self.estimated_path.append(as_constant(self.belief.points.own))
 
     def _contacts(self, poses: FloatArray) -> BoolArray:
         """Return who hears whom (K, K)."""

@@ -5,7 +5,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from slam_backend.core.read_only import as_read_only
+from slam_backend.core.read_only import as_constant, as_read_only
 from slam_backend.core.validation import FloatArray, bad_argument
 from vslam_env.config import EnvConfig
 from vslam_env.evaluation.coverage import CoverageMeter
@@ -16,13 +16,13 @@ from vslam_env.sensors.stereo.textures import check_textures
 from vslam_env.world import FreeSpace, World, WorldSource, draw_bias, draw_world_seed, make_world, place_landmarks
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, slots=True, weakref_slot=True, kw_only=True, eq=False)
 class Setting:
-    """A world with the robots' starts and sensors in it. Episodes and their snapshots share it, for it never changes.
+    """A world with the robots' starts and sensors in it. Episodes and their snapshots share it; arrays are read-only.
 
     Attributes:
         world: Walls and landmarks.
-        true_starts: (K, 3) float64 [m, m, rad], world frame. Read-only.
+        true_starts: (K, 3) float64 [m, m, rad], world frame.
         bias: (K, 2) float64. What each robot's odometry misreads throughout the episode, see `draw_bias`.
         belief_seed: From which the team's beliefs draw.
         stream_states: Where the random streams (odometry, sensor, scan, radio) stand before the first frame, by name.
@@ -41,6 +41,10 @@ class Setting:
     scan: Scan
     coverage: CoverageMeter
     countable: np.ndarray
+
+    def __post_init__(self) -> None:
+        for name in ("true_starts", "bias", "countable"):
+            object.__setattr__(self, name, as_constant(getattr(self, name)))
 
     def parts(self) -> tuple[Any, ...]:
         """Return what the setting is made of; what follows from that is left out."""
@@ -142,13 +146,13 @@ def draw_setting(
     return Setting(
         world=world,
         true_starts=as_read_only(true_starts),
-        bias=draw_bias(config.odometry, config.num_robots, streams["odometry"]),
+        bias=as_read_only(draw_bias(config.odometry, config.num_robots, streams["odometry"])),
         belief_seed=belief_seed,
         stream_states={name: stream.bit_generator.state for name, stream in streams.items()},
         sensor=eyes,
         scan=Scan(config.scan, world.walls, config.robot_radius),
         coverage=CoverageMeter(free_space.free_area_cells, true_starts),
-        countable=countable,
+        countable=as_read_only(countable),
     )
 
 

@@ -8,10 +8,10 @@ import numpy as np
 from slam_backend.core.validation import BoolArray, FloatArray, bad_argument, check_array, check_float, check_int
 from slam_backend.geometry import wrap_angle
 from slam_backend.models.camera import StereoCamera
-from vslam_env.world._kernels import cast_scans, rays_at, seen_from_somewhere
+from vslam_env.world._kernels import cast_scans, seen_from_somewhere
 from vslam_env.world._kernels.clearance import clearance_raster, distances_to_walls
 from vslam_env.world.spec import FARTHEST_PLACE, Landmarks, World
-from vslam_env.world.visibility import view_limits, visible_landmarks
+from vslam_env.world.visibility import by_rows, ray_fan, view_limits, visible_landmarks
 
 CELL = 0.1  # [m] side of a raster cell
 AREA_STEP = 2  # free area is counted in squares of 2 x 2 raster cells
@@ -171,7 +171,7 @@ class FreeSpace:
         headings = rng.uniform(-np.pi, np.pi, 8)
         poses, free = np.empty((len(headings), 3)), np.zeros((len(headings), 1))
         poses[:, :2], poses[:, 2] = position, headings
-        cast_scans(poses, *rays_at(np.zeros(1)), self.world.walls.T.copy(), 0.0, VIEW_AHEAD, 0.0, free)
+        cast_scans(poses, *ray_fan(np.zeros(1)), by_rows(self.world.walls), 0.0, VIEW_AHEAD, 0.0, free)
         return float(headings[int(np.argmax(free[:, 0] >= VIEW_AHEAD))])
 
     def check_starts(self, start_poses: Any, num_robots: int | None = None) -> FloatArray:

@@ -6,6 +6,7 @@ import numpy as np
 import pymunk
 
 from slam_backend.core.jit import in_place
+from slam_backend.core.read_only import as_read_only
 from slam_backend.core.validation import FloatArray, check_array, check_float
 from vslam_env.world.spec import World
 
@@ -98,8 +99,7 @@ class Simulator:
             body.position = place
             self._space.add(body, pymunk.Circle(body, radius + SKIN))
             self._bodies.append(body)
-        self.bumped = self._nobody = np.zeros(len(self._bodies), dtype=np.bool_)
-        self._nobody.setflags(write=False)
+        self.bumped = self._nobody = as_read_only(np.zeros(len(self._bodies), dtype=np.bool_))
 
     def step(self, commands: Any) -> bool:
         """Drive all robots for one tick.
@@ -125,8 +125,7 @@ class Simulator:
             way = goals[:, :2] - self.poses[:, :2]
             goals[:, :2] = self._move_in_contact(way)
             achieved = np.sum((goals[:, :2] - self.poses[:, :2]) * way, axis=1)
-            self.bumped = achieved < (1.0 - SHORTFALL) * np.sum(way * way, axis=1)
-            self.bumped.setflags(write=False)
+            self.bumped = as_read_only(achieved < (1.0 - SHORTFALL) * np.sum(way * way, axis=1))
         self.poses = goals
         return not clear
 
@@ -166,5 +165,4 @@ class Simulator:
         robots = len(self._bodies)
         cure = "Give what get_state returned, for the same number of robots."
         self.poses = check_array("state['poses']", state["poses"], (robots, 3), cure)
-        self.bumped = check_array("state['bumped']", state["bumped"], (robots,), cure, dtype=np.bool_)
-        self.bumped.setflags(write=False)
+        self.bumped = as_read_only(check_array("state['bumped']", state["bumped"], (robots,), cure, dtype=np.bool_))

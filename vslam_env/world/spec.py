@@ -50,6 +50,10 @@ class Landmarks:
         for name, array in zip(self.__slots__, (positions, normals, walls, descriptors), strict=True):
             object.__setattr__(self, name, as_read_only(array))
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Let copies and what was pickled be read-only, too."""
+        return Landmarks, (self.positions, self.normals, self.walls, self.descriptors)
+
     def __len__(self) -> int:
         return len(self.positions)
 
@@ -118,6 +122,10 @@ class World:
             cure = "Give rows x y theta in metres and radians."
             starts: Any = check_array("world.start_poses", self.start_poses, (None, 3), cure, within=FARTHEST_PLACE)
             object.__setattr__(self, "start_poses", as_read_only(starts))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Let copies and what was pickled be read-only, too."""
+        return World, (self.name, self.walls, self.landmarks, self.start_poses)
 
     @property
     def bounds(self) -> tuple[float, float, float, float]:

@@ -2,9 +2,10 @@
 
 import numpy as np
 
+from slam_backend.core.read_only import as_read_only
 from slam_backend.core.validation import BoolArray, FloatArray
 from slam_backend.models.camera import StereoCamera
-from vslam_env.world._kernels import see
+from vslam_env.world._kernels import rays_at, see
 from vslam_env.world.spec import Landmarks
 
 
@@ -16,23 +17,27 @@ def view_limits(camera: StereoCamera, max_incidence: float) -> FloatArray:
         max_incidence: Between the line of sight and a face's normal [rad]; more oblique faces show nothing.
 
     Returns:
-        (7,) float64: its place in the robot frame [m], its range [m], tangents of half its fields of view across and
-        upright, cosine of `max_incidence`.
+        (7,) float64, read-only: its place in the robot frame [m], its range [m], tangents of half its fields of view
+        across and upright, cosine of `max_incidence`.
     """
-    return np.array(
-        [
-            *camera.mount,
-            camera.max_range,
-            np.tan(camera.half_fov),
-            np.tan(camera.half_vertical_fov),
-            np.cos(max_incidence),
-        ]
-    )
+    tangents = np.tan(camera.half_fov), np.tan(camera.half_vertical_fov)
+    return as_read_only(np.array([*camera.mount, camera.max_range, *tangents, np.cos(max_incidence)]))
 
 
 def marks_of(landmarks: Landmarks) -> FloatArray:
-    """Return positions [m] and normals of landmarks (5, N), world frame, by rows as kernels expect them."""
-    return np.vstack([landmarks.positions.T, landmarks.normals.T])
+    """Return positions [m] and normals of landmarks (5, N), world frame, by rows as kernels expect them; read-only."""
+    return as_read_only(np.vstack([landmarks.positions.T, landmarks.normals.T]))
+
+
+def by_rows(walls: FloatArray) -> FloatArray:
+    """Return walls (S, 4) [m] as rows (4, S) of coordinates, as kernels expect them; read-only."""
+    return as_read_only(walls.T.copy())
+
+
+def ray_fan(angles: FloatArray) -> tuple[FloatArray, float]:
+    """Return unit vectors (2, R) at angles (R,) [rad], read-only, and the tangent of the wedge that holds them all."""
+    rays, tan_half = rays_at(angles)
+    return as_read_only(rays), tan_half
 
 
 def visible_landmarks(
@@ -48,5 +53,5 @@ def visible_landmarks(
         view: From `view_limits`.
     """
     seen = np.empty((len(poses), len(landmarks)), dtype=np.bool_)
-    see(poses, marks_of(landmarks), landmarks.walls.copy(), walls.T.copy(), robot_radius, view, seen)
+    see(poses, marks_of(landmarks), landmarks.walls, by_rows(walls), robot_radius, view, seen)
     return seen

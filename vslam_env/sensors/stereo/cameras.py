@@ -6,12 +6,14 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from slam_backend.core.read_only import as_read_only
 from slam_backend.core.validation import Float32Array, FloatArray, IntArray, check_float, check_int
 from slam_backend.frontend.images import Image
 from slam_backend.models.camera import StereoCamera
 from vslam_env.sensors.stereo._render_kernels import expose, render, trace
 from vslam_env.sensors.stereo.textures import WallTextures
 from vslam_env.world._kernels import walls_in_wedge
+from vslam_env.world.visibility import by_rows
 
 VIEW = 60.0  # [m] farther walls are not drawn
 
@@ -79,10 +81,10 @@ class StereoEye:
         robot_radius: float = 0.2,
     ) -> None:
         self.camera, self.imaging, self.textures = camera, imaging, textures
-        self._walls, self._radius = walls.T.copy(), robot_radius
-        self._optics = np.array([camera.focal_px, 0.5 * (camera.width - 1), 0.5 * (camera.height - 1)])
+        self._walls, self._radius = by_rows(walls), robot_radius
+        self._optics = as_read_only(np.array([camera.focal_px, 0.5 * (camera.width - 1), 0.5 * (camera.height - 1)]))
         paint = textures.config
-        self._span = np.array([paint.ceiling, (paint.ceiling - paint.floor) / textures.rows])
+        self._span = as_read_only(np.array([paint.ceiling, (paint.ceiling - paint.floor) / textures.rows]))
         self._tan_half = (0.5 * camera.width + 1.0) / camera.focal_px
 
     def take(self, poses: FloatArray, robot: int, rng: np.random.Generator) -> tuple[Image, Image]:

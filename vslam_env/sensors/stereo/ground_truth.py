@@ -7,6 +7,7 @@ they are; a filter never learns of them.
 import cv2
 import numpy as np
 
+from slam_backend.core.read_only import as_constant, as_read_only
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.frontend import CornerOptions, harris_corners, usurf_descriptors
 from slam_backend.frontend.images import SMALLEST
@@ -33,8 +34,8 @@ class TextureCorners:
 
     Attributes:
         landmarks: The corners, in order of their faces; descriptors are u-SURF at working resolution.
-        faces: (N,) int64. Their faces, as in `WallTextures`.
-        offsets: (N, 2) float64 [m]. How far along the wall, and the height.
+        faces: (N,) int64, read-only. Their faces, as in `WallTextures`.
+        offsets: (N, 2) float64 [m], read-only. How far along the wall, and the height.
     """
 
     def __init__(
@@ -83,9 +84,10 @@ class TextureCorners:
         self, walls: FloatArray, landmarks: Landmarks, faces: IntArray, offsets: FloatArray, tolerance: float
     ) -> None:
         """Hold corners that were found."""
-        self.landmarks, self.faces, self.offsets, self._tolerance = landmarks, faces, offsets, tolerance
-        self._lengths = np.linalg.norm(walls[:, 2:] - walls[:, :2], axis=1)
-        self._begins = np.searchsorted(faces, np.arange(2 * len(walls) + 1))
+        self.landmarks, self.faces, self.offsets = landmarks, as_constant(faces), as_constant(offsets)
+        self._tolerance = tolerance
+        self._lengths = as_read_only(np.linalg.norm(walls[:, 2:] - walls[:, :2], axis=1))
+        self._begins = as_read_only(np.searchsorted(faces, np.arange(2 * len(walls) + 1)))
 
     @classmethod
     def found(

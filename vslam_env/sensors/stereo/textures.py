@@ -2,11 +2,13 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from slam_backend.core.read_only import as_constant, as_read_only
 from slam_backend.core.validation import FloatArray, IntArray, bad_argument, check_array, check_choice, check_float
 from slam_backend.frontend.images import Image
 
@@ -57,7 +59,7 @@ class TextureConfig:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WallTextures:
-    """The pictures of all faces, as sums from which the mean over any box follows.
+    """The pictures of all faces, as sums from which the mean over any box follows; read-only.
 
     Face 2 w is the left one of wall w, seen from its beginning, face 2 w + 1 the right one. Columns of a picture run
     from the beginning of the wall to its end, rows from the ceiling down.
@@ -76,6 +78,14 @@ class WallTextures:
     starts: IntArray
     columns: IntArray
     widths: FloatArray
+
+    def __post_init__(self) -> None:
+        for name in ("sums", "starts", "columns", "widths"):
+            object.__setattr__(self, name, as_constant(getattr(self, name)))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Let copies and what was pickled be read-only, too."""
+        return WallTextures, (self.config, self.sums, self.starts, self.columns, self.widths)
 
     @property
     def rows(self) -> int:
@@ -118,9 +128,7 @@ def draw_textures(walls: FloatArray, rng: np.random.Generator, config: TextureCo
                 picture = _draw_face(rows, count, config, poster, stream)
             sums[starts[face] : starts[face + 1]] = cv2.integral(picture, sdepth=cv2.CV_32S).T
     widths = np.repeat(lengths, 2) / columns
-    for array in (sums, starts, columns, widths):
-        array.setflags(write=False)
-    return WallTextures(config, sums, starts[:-1], columns, widths)
+    return WallTextures(config, *map(as_read_only, (sums, starts[:-1], columns, widths)))
 
 
 def check_textures(textures: WallTextures, walls: FloatArray) -> None:

@@ -1,0 +1,74 @@
+"""States share arrays with running filters and teams: nobody can write to them."""
+
+import copy
+import pickle
+
+import numpy as np
+import pytest
+from same_bits import assert_same
+from shared_arrays import scribble, shared, shared_and_writable
+from test_damaged_states import SUBJECTS, merged, play
+
+from slam_backend.core.read_only import as_constant, as_read_only, is_read_only, with_constants, with_read_only
+from slam_backend.core.state_codec import decoded, encoded
+from slam_backend.state_kinds import BACKEND_KINDS
+from slam_backend.team.merge_rollback import Undoing
+from slam_backend.team.options import MergeOptions
+
+
+@pytest.mark.parametrize("name", SUBJECTS)
+def test_what_a_state_shares_cannot_be_written(name: str) -> None:
+    """That holds for states of filters and teams, among each other as well, and for those that they are set to."""
+    subject, _ = SUBJECTS[name]()
+    state = subject.get_state()
+    assert shared(state, subject)
+    assert not shared_and_writable(state, subject)
+    assert not shared_and_writable(state, subject.get_state())
+    read = decoded(encoded(state, BACKEND_KINDS), BACKEND_KINDS)
+    for other in (pickle.loads(pickle.dumps(state)), copy.deepcopy(state), read, state):
+        subject.set_state(other)
+        assert not shared_and_writable(other, subject)
+
+
+@pytest.mark.parametrize("name", SUBJECTS)
+def test_what_is_written_into_a_state_changes_nothing(name: str) -> None:
+    """A filter or a team goes on alike when all that can be written of a state that it was set to is spoilt."""
+    subject, readings = SUBJECTS[name]()
+    start = subject.get_state()
+    play(subject, readings)
+    end = subject.get_state()
+    for other in (pickle.loads(pickle.dumps(start)), copy.deepcopy(start)):
+        subject.set_state(other)
+        assert scribble(other) > 0
+        play(subject, readings)
+        assert_same(subject.get_state(), end)
+    subject.set_state(start)
+    assert scribble(subject.get_state()) > 0
+    play(subject, readings)
+    assert_same(subject.get_state(), end)
+
+
+def test_what_is_replaced_in_a_state_from_before_a_merge_is_refused_at_its_undo() -> None:
+    """Dicts of a side are shared as well: no kernel goes by what somebody put into them."""
+    _, team = merged(merging=MergeOptions(watch_every=10_000))
+    maps = team.get_state()["groups"][0]["branches"][0]["watches"][0].sides[0].trunk["filter"]["maps"]
+    maps["map_of"] = np.full_like(maps["map_of"], 2**31)
+    trunk = team._groups[0].trunk
+    with pytest.raises(ValueError, match=r"state\['filter'\]\['maps'\]\['map_of'\]: expected integers"):
+        Undoing.of(trunk, trunk.watches[0].number)
+
+
+def test_parts_of_trees_are_copied_only_where_they_can_be_written() -> None:
+    """A part in which nothing can be written comes back itself, so that what was checked is not looked at again."""
+    own = np.arange(3.0)
+    fixed = as_read_only(own)
+    assert as_read_only(fixed) is as_constant(fixed) is fixed
+    tree = {"fixed": (fixed, [fixed[1:], 1]), "own": (own, "text")}
+    for act in (with_read_only, with_constants):
+        result = act(tree)
+        assert result["fixed"] is tree["fixed"]
+        assert is_read_only(result["own"][0])
+        assert np.shares_memory(result["own"][0], own) == (act is with_read_only)
+    assert tree["own"][0] is own
+    own.setflags(write=False)
+    assert not is_read_only(own)  # its owner can take that back
