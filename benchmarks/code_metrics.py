@@ -6,6 +6,7 @@ make metrics
 import ast
 import dis
 import os
+import re
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -24,7 +25,7 @@ from vslam_env import vslam_v0
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("slam_backend", "vslam_env", "agents", "training")
 NAMED_TUPLE = ("_replace", "_asdict", "_fields", "_make")
-OWN_OBJECTS = ("self", "cls", "joint", "twin", "copy")  # within a class: itself and what its own methods make
+PRIVATE = re.compile(r"_[a-z]\w*")
 MANY = 10  # arguments of a kernel
 
 
@@ -46,15 +47,34 @@ def module_name(file: Path) -> str:
 # ---------------------------------------------------------------------- what is written
 
 
-def private_accesses(file: Path) -> Iterator[tuple[int, str]]:
-    """Yield line and text of each access to a private attribute of an object that is not the accessing one."""
-    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
-        if not isinstance(node, ast.Attribute) or not node.attr.startswith("_") or node.attr in NAMED_TUPLE:
+def private_names(tree: ast.AST) -> set[str]:
+    """Return the private attributes that a class, or all classes of a module, give to their objects."""
+    found = {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store) and ast.unparse(node.value) == "self":
+            found.add(node.attr)
+        elif isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
+            found.add(node.target.id)
+    return {name for name in found if PRIVATE.fullmatch(name)}
+
+
+def private_accesses(file: Path, ours: set[str]) -> Iterator[tuple[int, str]]:
+    """Yield line and text of each access to a private attribute of an object of another of the project's classes.
+
+    Args:
+        file: A module.
+        ours: Private attributes of all classes of the project; others are those of libraries.
+    """
+    tree = ast.parse(file.read_text(encoding="utf-8"))
+    own: dict[ast.AST, set[str]] = {}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ClassDef):
+            own |= dict.fromkeys(ast.walk(node), private_names(node))
+    for node in ast.walk(tree):
+        if not isinstance(node, ast.Attribute) or node.attr not in ours or node.attr in NAMED_TUPLE:
             continue
-        owner = node.value
-        if node.attr.startswith("__") or (isinstance(owner, ast.Name) and owner.id in OWN_OBJECTS):
-            continue
-        yield node.lineno, ast.unparse(node)
+        if ast.unparse(node.value) not in ("self", "cls") and node.attr not in own.get(node, ()):
+            yield node.lineno, ast.unparse(node)
 
 
 def imports(file: Path, known: set[str]) -> set[str]:
@@ -169,7 +189,8 @@ def main() -> None:
         graph[module_name(file)] = imports(file, set(graph)) - {module_name(file)}
     folders = Counter(file.parent for file in files)
     widest, count = folders.most_common(1)[0]
-    private = [(file, *access) for file in files for access in private_accesses(file)]
+    ours = set().union(*(private_names(ast.parse(file.read_text(encoding="utf-8"))) for file in files))
+    private = [(file, *access) for file in files for access in private_accesses(file, ours)]
     circles = import_circles(graph)
     env_files, filter_files = step_of_environment(), step_of_filter()
     kernels = {kernel for kernel in all_kernels() if is_own(kernel.py_func.__code__.co_filename)}
@@ -181,7 +202,7 @@ def main() -> None:
         f"modules in the widest folder ({widest.relative_to(ROOT)})": count,
         "files from a measurement to its StepReport": len(filter_files),
         "files of a whole env.step without a merge": len(env_files),
-        "accesses to private attributes of other objects": len(private),
+        "accesses to private attributes of objects of other classes": len(private),
         "import circles between modules": len(circles),
         "kernels that are loaded for these": len(kernels),
         f"kernels with {MANY} or more parameters": long,

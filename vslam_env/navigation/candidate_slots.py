@@ -61,7 +61,7 @@ class CandidateSlots:
         self._settle(np.full((NUM_SLOTS, NUM_COLUMNS), np.nan))
 
     @classmethod
-    def _of(cls, rows: FloatArray) -> "CandidateSlots":
+    def over(cls, rows: FloatArray) -> "CandidateSlots":
         """Return empty slots whose rows (16, ...) are these."""
         self = cls.__new__(cls)
         rows.fill(np.nan)
@@ -117,9 +117,9 @@ class CandidateSlots:
         """
         poses = _together(pose, teammates)
         check_cells(cells)
-        self._renew(cells, known_bounds(cells), poses, 0)
+        self.renew(cells, known_bounds(cells), poses, 0)
 
-    def _renew(self, cells: NDArray[np.uint8], bounds: NDArray[np.int32], poses: FloatArray, robot: int) -> None:
+    def renew(self, cells: NDArray[np.uint8], bounds: NDArray[np.int32], poses: FloatArray, robot: int) -> None:
         """Bring the candidates of a robot up to date.
 
         Args:
@@ -175,7 +175,7 @@ class TeamSlots:
 
     def __init__(self, num_robots: int) -> None:
         self._rows = np.empty((num_robots, NUM_SLOTS, NUM_COLUMNS))
-        self.slots = list(map(CandidateSlots._of, self._rows))
+        self.slots = list(map(CandidateSlots.over, self._rows))
 
     def update(self, robot: int, grids: TeamGrids, poses: FloatArray) -> None:
         """Bring a robot's candidates up to date, as `CandidateSlots.update` does; nothing is checked.
@@ -185,7 +185,7 @@ class TeamSlots:
             grids: What the robots have seen.
             poses: As in `features`.
         """
-        self.slots[robot]._renew(grids.grids[robot].cells, grids.bounds[robot], poses[robot], robot)
+        self.slots[robot].renew(grids.grids[robot].cells, grids.bounds[robot], poses[robot], robot)
 
     def features(self, poses: FloatArray) -> NDArray[np.float32]:
         """Describe all robots' candidates to policies; nothing is checked.

@@ -82,7 +82,7 @@ class SeenGrid:
         return self
 
     @classmethod
-    def _of(cls, *arrays: NDArray[Any], read_only: bool = False) -> "SeenGrid":
+    def over(cls, *arrays: NDArray[Any], read_only: bool = False) -> "SeenGrid":
         """Return the grid that lies in some arrays, as `_arrays` has them."""
         return cls.__new__(cls)._adopt(*arrays, read_only=read_only)
 
@@ -157,11 +157,11 @@ class SeenGrid:
 
     def copy(self) -> "SeenGrid":
         """Return an independent grid, which can be written to, with the same content."""
-        return SeenGrid._of(self._evidence.copy(), self._cells.copy(), _no_changes(), self._bounds.copy())
+        return SeenGrid.over(self._evidence.copy(), self._cells.copy(), _no_changes(), self._bounds.copy())
 
     def frozen(self) -> "SeenGrid":
         """Return a view that refuses changes and shares memory with this grid: it follows changes made here."""
-        return SeenGrid._of(*self._arrays, read_only=True)
+        return SeenGrid.over(*self._arrays, read_only=True)
 
     def get_state(self) -> dict[str, Any]:
         """Return a copy of all that `set_state` needs to continue bit by bit."""

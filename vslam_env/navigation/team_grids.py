@@ -30,7 +30,7 @@ class TeamGrids:
         self.changes = np.full((num_robots, 1 + _painting.MOST_CHANGES), -1, np.int32)
         self.bounds = np.zeros((num_robots, 4), np.int32)
         self._room = np.empty((0, 0))
-        self.grids = list(map(SeenGrid._of, self._evidence, self.cells, self.changes, self.bounds))
+        self.grids = list(map(SeenGrid.over, self._evidence, self.cells, self.changes, self.bounds))
 
     def paint_readings(
         self,
