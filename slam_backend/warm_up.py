@@ -6,6 +6,7 @@ import numpy as np
 
 from slam_backend.core import state_checks
 from slam_backend.core.compilation import watch_compilation
+from slam_backend.core.kernel_compiler import Progress, compile_kernels, recorded_signatures
 from slam_backend.fastslam.existence import ExistenceModel
 from slam_backend.fastslam.filter import FastSlam
 from slam_backend.fastslam.state_checks import are_linked
@@ -30,15 +31,29 @@ STEPS = 4
 LANDMARKS = 12  # more than an alignment asks for
 
 
-def warm_up() -> float:
-    """Run tiny filters, a tiny team and a tiny pair of images along all paths that end in a kernel.
+def warm_up(workers: int | None = None, progress: Progress | None = None) -> float:
+    """Compile all kernels of the backend, or load them from the cache.
 
     Kernels are kept in numba's cache: beside the package if its folder can be written, else in the user's own cache
     folder, or where the variable NUMBA_CACHE_DIR says. A new version of the package, of numba or another processor
-    begins anew.
+    starts with an empty one. While one process fills it others wait.
+
+    Args:
+        workers: Processes that compile; None: one for each core. The script that calls this needs no main guard.
+        progress: Called with the number of kernels compiled, how many there are, and the seconds left [s], estimated.
 
     Returns:
         Seconds spent compiling; 0 if all kernels came from the cache.
+    """
+    seconds = compile_kernels(recorded_signatures("slam_backend"), workers, progress)
+    return seconds + run_all_paths()
+
+
+def run_all_paths() -> float:
+    """Run tiny filters, a tiny team and a tiny pair of images along all paths that end in a kernel.
+
+    Returns:
+        Seconds spent compiling in this process.
     """
     with watch_compilation(lambda name: None) as watch:
         angles = np.linspace(0.0, 2.0 * np.pi, LANDMARKS, endpoint=False)

@@ -28,6 +28,7 @@ from training.commands.replay_one import replay_kitti, replay_victoria
 from training.commands.replay_pairs import replay_stereo
 from training.commands.run import run
 from training.commands.train import train
+from training.commands.warm_up import warm_up
 from training.commands.worlds import worlds
 from training.experiments.interrupt import signals_answered
 
@@ -46,6 +47,7 @@ app.command("run")(run)
 app.command("drive")(drive_by_hand)
 app.command("train")(train)
 app.command("evaluate")(evaluate)
+app.command("warm-up")(warm_up)
 replay = typer.Typer(help="Run the backend on the log of real robots.", no_args_is_help=True)
 replay.command("mrclam")(replay_mrclam)
 replay.command("victoria")(replay_victoria)

@@ -2,8 +2,9 @@
 
 import numpy as np
 
-import slam_backend
 from slam_backend.core.compilation import watch_compilation
+from slam_backend.core.kernel_compiler import Progress, compile_kernels, recorded_signatures
+from slam_backend.warm_up import run_all_paths
 from vslam_env.config import EnvConfig
 from vslam_env.environment import ExplorationEnv
 from vslam_env.sensors import LandmarkSensorConfig
@@ -14,16 +15,21 @@ STARTS = np.array([[3.0, 4.0, 0.0], [3.0, 5.0, 0.1]])  # side by side, looking a
 STEPS = 3
 
 
-def warm_up() -> float:
-    """Warm the backend up, and let two robots see, merge and drive in a small room.
+def warm_up(workers: int | None = None, progress: Progress | None = None) -> float:
+    """Compile all kernels of the backend and of environments, or load them from the cache.
 
-    What rendered eyes need beyond that is compiled in their first steps.
+    What rendered stereo images need beyond that is compiled in their first steps. See `slam_backend.warm_up`.
+
+    Args:
+        workers: Processes that compile; None: one for each core.
+        progress: Called with the number of kernels compiled, how many there are, and the seconds left [s], estimated.
 
     Returns:
         Seconds spent compiling; 0 if all kernels came from the cache.
     """
+    seconds = compile_kernels(recorded_signatures("slam_backend", "vslam_env"), workers, progress)
     with watch_compilation(lambda name: None) as watch:
-        slam_backend.warm_up()
+        run_all_paths()
         eyes = LandmarkSensorConfig(false_points=2.0)
         config = EnvConfig(num_robots=2, action_type="goal", oracle_merge=True, landmark_sensor=eyes)
         env = ExplorationEnv(config, World("room", WALLS))
@@ -32,4 +38,4 @@ def warm_up() -> float:
         for _ in range(STEPS):
             valid = {agent: env.belief(agent).candidates.valid for agent in env.agents}
             env.step({agent: 1 + int(slots.argmax()) if slots.any() else 0 for agent, slots in valid.items()})
-    return watch.seconds
+    return seconds + watch.seconds

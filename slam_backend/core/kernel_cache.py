@@ -25,7 +25,17 @@ class KernelCache(FunctionCache):
 
     def __init__(self, cache: FunctionCache, stamp: Any) -> None:
         self.__dict__.update(cache.__dict__)
-        self._cache_file = CheckedFile(cache._cache_path, cache._impl.filename_base, stamp)  # type: ignore[no-untyped-call]
+        self._cache_file: CheckedFile = CheckedFile(cache._cache_path, cache._impl.filename_base, stamp)  # type: ignore[no-untyped-call]
+
+    @property
+    def folder(self) -> str:
+        """Folder of the cache's files."""
+        return str(self._cache_path)
+
+    def holds(self, signature: Any, codegen: Any) -> bool:
+        """Return whether a kernel is kept for a signature; it is not read."""
+        key = self._index_key(signature, codegen)  # type: ignore[no-untyped-call]
+        return self._cache_file.holds(key)
 
     def save_overload(self, sig: Any, data: Any) -> None:
         """Keep a kernel, if that can be: the disk may be full, or read-only by now."""
@@ -61,6 +71,11 @@ class CheckedFile(IndexDataCacheFile):
         """Return the kernel of a signature; None: there is none that can be used."""
         found = super().load(key)  # type: ignore[no-untyped-call]
         return found[1] if found is not None and found[0] == key else None
+
+    def holds(self, key: Any) -> bool:
+        """Return whether there is a file for a key."""
+        name = self._load_index().get(key)
+        return name is not None and Path(self._data_path(name)).exists()  # type: ignore[no-untyped-call]
 
     def _load_index(self) -> dict[Any, str]:
         content = _checked(self._index_path)

@@ -1,5 +1,7 @@
 """What a command shows while kernels are compiled, which happens once; later it shows nothing."""
 
+import math
+import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 
@@ -9,7 +11,7 @@ from rich.spinner import Spinner
 
 
 @contextmanager
-def compilation_shown(console: Console) -> Iterator[None]:
+def compilation_shown(console: Console) -> Iterator[Callable[[int, int, float], None]]:
     """Show, from the first compilation in the block on, that the user waits for the compiler, and afterwards how long.
 
     A terminal shows a spinner, anything else one line. Nothing is shown where all kernels come from the cache. The
@@ -17,24 +19,34 @@ def compilation_shown(console: Console) -> Iterator[None]:
 
     Args:
         console: Where to; one on stderr leaves the output of a command alone.
+
+    Yields:
+        The `progress` of `warm_up`.
     """
     from slam_backend.core.compilation import MESSAGE, watch_compilation
 
+    spinner = Spinner("dots", MESSAGE)
+    begun: list[float] = []
     with ExitStack() as stack:
-        shown: list[str] = []
 
-        def tell(name: str) -> None:
-            if not shown:
+        def begin(name: str = "") -> None:
+            if not begun:
+                begun.append(time.perf_counter())
                 if console.is_terminal:
-                    stack.enter_context(Live(Spinner("dots", MESSAGE), console=console, transient=True))
+                    stack.enter_context(Live(spinner, console=console, transient=True))
                 else:
                     console.print(MESSAGE, highlight=False)
-            shown.append(name)
 
-        watch = stack.enter_context(watch_compilation(tell))
-        yield
-    if shown:
-        console.print(f"Compiled in {watch.seconds:.0f} s; later runs take them from a cache.", highlight=False)
+        def progress(done: int, total: int, left: float) -> None:
+            begin()
+            time_left = "" if math.isnan(left) else f", about {left:.0f} s left"
+            spinner.update(text=f"{MESSAGE} {done} of {total}{time_left}")
+
+        stack.enter_context(watch_compilation(begin))
+        yield progress
+        seconds = time.perf_counter() - begun[0] if begun else 0.0
+    if begun:
+        console.print(f"Compiled in {seconds:.0f} s; later runs take them from a cache.", highlight=False)
 
 
 def prepare(*first_steps: Callable[[], object]) -> None:
@@ -43,8 +55,9 @@ def prepare(*first_steps: Callable[[], object]) -> None:
     Args:
         first_steps: Of the command, called in turn; what is wrong with its input shows before the long wait.
     """
-    from slam_backend.warm_up import warm_up
+    from vslam_env.warm_up import warm_up
 
-    with compilation_shown(Console(stderr=True)):
-        for step in (*first_steps, warm_up):
+    with compilation_shown(Console(stderr=True)) as progress:
+        for step in first_steps:
             step()
+        warm_up(progress=progress)
