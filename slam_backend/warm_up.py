@@ -1,14 +1,16 @@
 """All kernels of the backend are compiled, or loaded from the cache, before anything waits for them."""
 
+from collections.abc import Collection
 from typing import Literal
 
 import numpy as np
 
 from slam_backend.core import state_checks
 from slam_backend.core.compilation import watch_compilation
-from slam_backend.core.kernel_compiler import Progress, compile_kernels, recorded_signatures
+from slam_backend.core.kernel_compiler import Progress, Signatures, compile_kernels, recorded_signatures
 from slam_backend.fastslam.existence import ExistenceModel
 from slam_backend.fastslam.filter import FastSlam
+from slam_backend.fastslam.options import FilterOptions
 from slam_backend.fastslam.state_checks import are_linked
 from slam_backend.frontend import StereoFrontEnd
 from slam_backend.maps.alignment import align_maps
@@ -26,31 +28,66 @@ from slam_backend.team.merge_scheduler import AttemptOptions
 from slam_backend.team.options import MergeOptions
 from slam_backend.team.team import TeamSlam
 
-PROPOSALS: tuple[Literal["fastslam2", "fastslam1"], ...] = ("fastslam2", "fastslam1")
+# What a filter of the default options never calls, and how the kernels that only it calls begin, signature included.
+EXTRAS = {
+    "fastslam1": (),
+    "existence": ("slam_backend.fastslam._kernels.existence.",),
+    "clique": ("slam_backend.maps._kernels.max_clique.",),
+    "images": ("slam_backend.frontend.",),
+}
+STEP = "slam_backend.fastslam._kernels.step.take_turns"  # the filter's kernel
+FASTSLAM2 = "none"  # ends its signature without FastSLAM 1.0
 STEPS = 4
 LANDMARKS = 12  # more than an alignment asks for
 
 
-def warm_up(workers: int | None = None, progress: Progress | None = None) -> float:
-    """Compile all kernels of the backend, or load them from the cache.
+def warm_up(
+    options: FilterOptions | None = None,
+    *,
+    everything: bool = False,
+    workers: int | None = None,
+    progress: Progress | None = None,
+) -> float:
+    """Compile the kernels that a filter or a team needs, or load them from the cache.
 
     Kernels are kept in numba's cache: beside the package if its folder can be written, else in the user's own cache
     folder, or where the variable NUMBA_CACHE_DIR says. A new version of the package, of numba or another processor
     starts with an empty one. While one process fills it others wait.
 
     Args:
+        options: Of the filters; None: the default ones.
+        everything: Compile also what these options do not need. Else it is compiled when it is first called.
         workers: Processes that compile; None: one for each core. The script that calls this needs no main guard.
         progress: Called with the number of kernels compiled, how many there are, and the seconds left [s], estimated.
 
     Returns:
         Seconds spent compiling; 0 if all kernels came from the cache.
     """
-    seconds = compile_kernels(recorded_signatures("slam_backend"), workers, progress)
-    return seconds + run_all_paths()
+    extras = EXTRAS if everything else extras_of(FilterOptions() if options is None else options)
+    seconds = compile_kernels(needed(recorded_signatures("slam_backend"), extras), workers, progress)
+    return seconds + run_all_paths(extras)
 
 
-def run_all_paths() -> float:
+def extras_of(options: FilterOptions) -> set[str]:
+    """Return which of `EXTRAS` filters of some options need."""
+    wanted = {"fastslam1": options.proposal == "fastslam1", "existence": options.existence is not None}
+    return {name for name, is_wanted in wanted.items() if is_wanted}
+
+
+def needed(signatures: Signatures, extras: Collection[str]) -> dict[str, list[str]]:
+    """Return the signatures without those that only other extras need."""
+    left_out = tuple(start for extra, starts in EXTRAS.items() if extra not in extras for start in starts)
+    chosen = {name: list(words) for name, words in signatures.items() if not name.startswith(left_out)}
+    if "fastslam1" not in extras:
+        chosen[STEP] = [words for words in chosen[STEP] if words.endswith(FASTSLAM2)]
+    return chosen
+
+
+def run_all_paths(extras: Collection[str]) -> float:
     """Run tiny filters, a tiny team and a tiny pair of images along all paths that end in a kernel.
+
+    Args:
+        extras: Keys of `EXTRAS`.
 
     Returns:
         Seconds spent compiling in this process.
@@ -63,23 +100,25 @@ def run_all_paths() -> float:
         plain = Measurements(points, descriptors)
         given = Measurements(points, descriptors, np.tile(1e-4 * np.eye(3), (LANDMARKS, 1, 1)))
         move, still = np.array([0.0, 0.0, 0.01]), np.zeros(3)
-        for proposal in PROPOSALS:
+        for is_second in (True, False) if "fastslam1" in extras else (True,):
             for frame in (plain, given):
+                proposal: Literal["fastslam2", "fastslam1"] = "fastslam2" if is_second else "fastslam1"
                 slam = FastSlam(2, num_particles=4, proposal=proposal, resample_threshold=1.0)
                 slam.step([None, None], [frame, None])
                 for _ in range(STEPS):
                     slam.step([move, None], [frame, frame])
                 slam.step([None, None], [frame, frame], [names, some], [still, None])
                 slam.step([move, move], [None, None])
-        watching = FastSlam(num_particles=4, existence=ExistenceModel(), resample_threshold=1.0)
-        for _ in range(STEPS):
-            watching.step([move], [plain])
         few_keys = SmoothingOptions(max_keys=2, fresh_keys=1)  # logs come in parts, between which keys are joined
         smoothing = FastSlam(num_particles=4, rejuvenate_every=STEPS + 1, smoothing=few_keys)
         for _ in range(2 * (STEPS + 1)):
             smoothing.step([move], [plain])
-        for slam in (watching, smoothing):
-            slam.set_state(slam.get_state())
+        smoothing.set_state(smoothing.get_state())
+        if "existence" in extras:
+            watching = FastSlam(num_particles=4, existence=ExistenceModel(), resample_threshold=1.0)
+            for _ in range(STEPS):
+                watching.step([move], [plain])
+            watching.set_state(watching.get_state())
         state_checks.warm()
         root = np.array([-1])
         are_linked(root, root)  # of a state that was a pickle
@@ -99,8 +138,15 @@ def run_all_paths() -> float:
         team.standpoints(), team.outlines()
         own = team.map(0)
         map_error(own.means, names, points)
-        align_maps(own, own, "clique")
-        blocks = np.kron(np.random.default_rng(0).integers(0, 256, (8, 12)), np.ones((12, 12))).astype(np.uint8)
-        eye = StereoFrontEnd(StereoCamera(focal_px=100.0, width=128, height=96))
-        eye.measure(blocks[:, :128], blocks[:, 8:136])
+        if "clique" in extras:
+            align_maps(own, own, "clique")
+        if "images" in extras:
+            _measure_images()
     return watch.seconds
+
+
+def _measure_images() -> None:
+    """Let the stereo front end measure a tiny pair of images."""
+    blocks = np.kron(np.random.default_rng(0).integers(0, 256, (8, 12)), np.ones((12, 12))).astype(np.uint8)
+    eye = StereoFrontEnd(StereoCamera(focal_px=100.0, width=128, height=96))
+    eye.measure(blocks[:, :128], blocks[:, 8:136])

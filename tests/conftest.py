@@ -16,7 +16,7 @@ settings.load_profile("default")
 def pytest_sessionstart(session: pytest.Session) -> None:
     """Compile the kernels once, before workers start that would each compile them; all share one cache."""
     if session.config.getoption("dist", "no") != "no" and not hasattr(session.config, "workerinput"):
-        code = "import vslam_env; print(f'Kernels compiled in {vslam_env.warm_up():.0f} s.')"
+        code = "import vslam_env; print(f'Kernels compiled in {vslam_env.warm_up(everything=True):.0f} s.')"
         root = Path(__file__).parents[1]
         done = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True, check=False)
         if reporter := session.config.pluginmanager.getplugin("terminalreporter"):

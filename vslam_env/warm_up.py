@@ -4,7 +4,7 @@ import numpy as np
 
 from slam_backend.core.compilation import watch_compilation
 from slam_backend.core.kernel_compiler import Progress, compile_kernels, recorded_signatures
-from slam_backend.warm_up import run_all_paths
+from slam_backend.warm_up import EXTRAS, extras_of, needed, run_all_paths
 from vslam_env.config import EnvConfig
 from vslam_env.environment import ExplorationEnv
 from vslam_env.sensors import LandmarkSensorConfig
@@ -15,21 +15,32 @@ STARTS = np.array([[3.0, 4.0, 0.0], [3.0, 5.0, 0.1]])  # side by side, looking a
 STEPS = 3
 
 
-def warm_up(workers: int | None = None, progress: Progress | None = None) -> float:
-    """Compile all kernels of the backend and of environments, or load them from the cache.
-
-    What rendered stereo images need beyond that is compiled in their first steps. See `slam_backend.warm_up`.
+def warm_up(
+    config: EnvConfig | None = None,
+    *,
+    everything: bool = False,
+    workers: int | None = None,
+    progress: Progress | None = None,
+) -> float:
+    """Compile the kernels that an environment needs, or load them from the cache; see `slam_backend.warm_up`.
 
     Args:
+        config: Of the environment; None: the default one.
+        everything: Compile also what this configuration does not need. Else it is compiled when it is first called.
         workers: Processes that compile; None: one for each core.
         progress: Called with the number of kernels compiled, how many there are, and the seconds left [s], estimated.
 
     Returns:
         Seconds spent compiling; 0 if all kernels came from the cache.
     """
-    seconds = compile_kernels(recorded_signatures("slam_backend", "vslam_env"), workers, progress)
+    chosen = EnvConfig() if config is None else config
+    extras = set(EXTRAS) if everything else extras_of(chosen.belief.filter)
+    if chosen.sensor == "stereo":
+        extras.add("images")
+    signatures = needed(recorded_signatures("slam_backend", "vslam_env"), extras)
+    seconds = compile_kernels(signatures, workers, progress)
     with watch_compilation(lambda name: None) as watch:
-        run_all_paths()
+        run_all_paths(extras)
         eyes = LandmarkSensorConfig(false_points=2.0)
         config = EnvConfig(num_robots=2, action_type="goal", oracle_merge=True, landmark_sensor=eyes)
         env = ExplorationEnv(config, World("room", WALLS))

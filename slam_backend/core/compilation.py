@@ -61,13 +61,17 @@ def watch_compilation(tell: Callable[[str], None]) -> Iterator[CompilationWatch]
         yield watch
 
 
-def log_compilation() -> None:
-    """Log this process's first compilation with level INFO, and the name of each kernel with level DEBUG."""
+def log_compilation(tell_first: Callable[[str], object] = LOGGER.info) -> None:
+    """Announce the first compilation from now on, and log the name of each kernel with level DEBUG.
+
+    Args:
+        tell_first: Called with the announcement; logged with level INFO by default.
+    """
     first = iter([True])
 
     def tell(name: str) -> None:
         if next(first, False):
-            LOGGER.info(MESSAGE)
+            tell_first(MESSAGE)
         LOGGER.debug("Compiling %s", name)
 
     numba_event.register("numba:compile", CompilationWatch(tell))  # type: ignore[no-untyped-call]

@@ -94,6 +94,8 @@ def decoded(words: str) -> tuple[types.Type, ...]:
 
 
 def _type(word: str) -> Any:
+    if word == "none":
+        return types.none
     name, _, array = word.partition("[")
     element: Any = from_dtype(dtype(name))
     if not array:

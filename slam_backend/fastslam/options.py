@@ -131,7 +131,7 @@ class FilterOptions:
 
 
 def assumed(options: FilterOptions) -> FloatArray:
-    """Return what a filter assumes, (28,) float64, as `_kernels.layout` names the numbers.
+    """Return what a filter assumes, (27,) float64, as `_kernels.layout` names the numbers.
 
     The noise of the odometry (6,), see `OdometryModel`; of the camera (7,) the focal length [px], the baseline [m], the
     sigmas of image coordinates and of the disparity [px], and the mount [m]; the sigmas (3,) [m, m, rad] of the prior
@@ -145,7 +145,7 @@ def assumed(options: FilterOptions) -> FloatArray:
         options.descriptor_gate**2, options.descriptor_sigma**2, options.position_gate, options.dead_zone,
         options.dead_radius, options.ambiguity,
         np.log(options.new_landmark_density), options.landmark_walk,
-        options.proposal == "fastslam2", options.one_to_one,
+        options.one_to_one,
         options.smoothing.closure_after, options.resample_threshold,
     ], np.float64)  # fmt: skip
 

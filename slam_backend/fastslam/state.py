@@ -278,6 +278,7 @@ class FilterState:
         normals = self.rng.standard_normal((active, maps.num_particles, 3))
         means, covariances = self.estimates
         deleted: list[IntArray] = []
+        fastslam1 = None if self.options.proposal == "fastslam2" else 1
         for low, high, is_over in self._batches:
             summary = _kernels.take_turns(
                 low, high, is_over, now, self.packed_options, seats.array, inputs.table, inputs.moves, normals,
@@ -285,7 +286,7 @@ class FilterState:
                 maps.values, maps.counts, maps.odds, maps.table, maps.maps, maps.users, maps.free_rows, maps.tops,
                 maps.descriptors, maps.heads, inputs.sightings, inputs.descriptors, inputs.names,
                 self._associations, self._mahalanobis_sq, told, means, covariances,
-                pending.noted[len(pending.steps)], pending.measured, pending.num_measured,
+                pending.noted[len(pending.steps)], pending.measured, pending.num_measured, fastslam1,
             )  # fmt: skip
             if self.existence is not None and not is_over and (row := seats.rows[low]) >= 0:
                 _, begin, end, _, _, count = inputs.turns[row]

@@ -21,7 +21,7 @@ from slam_backend.warm_up import warm_up
 from vslam_env import vslam_v0
 
 def play():
-    warm_up()
+    warm_up(everything=True)
     env = vslam_v0.parallel_env()
     env.reset(seed=100)
     for _ in range(60):
@@ -71,7 +71,7 @@ def called_by(kernel: Dispatcher) -> Iterator[Dispatcher]:
 
 def test_kernels_that_work_in_place_neither_return_arrays_nor_call_kernels_that_do() -> None:
     """Nobody would free such an array: its counter would never come to zero."""
-    warm_up()
+    warm_up(everything=True)
     env = parallel_env()
     env.reset(seed=100)
     env.step({agent: env.action_space(agent).sample() for agent in env.agents})

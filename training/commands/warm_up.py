@@ -7,13 +7,14 @@ from rich.console import Console
 
 
 def warm_up(
+    everything: Annotated[bool, typer.Option("--all", help="Also what the default environment does not need.")] = False,
     workers: Annotated[int | None, typer.Option(help="Processes that compile; one for each core if left out.")] = None,
 ) -> None:
-    """Compile all kernels into the cache on disk; takes seconds if they are there already."""
+    """Compile the kernels into the cache on disk; takes seconds if they are there already."""
     import vslam_env
     from training.experiments.compilation import compilation_shown
 
     with compilation_shown(Console(stderr=True)) as progress:
-        seconds = vslam_env.warm_up(workers, progress)
+        seconds = vslam_env.warm_up(everything=everything, workers=workers, progress=progress)
     if not seconds:
-        Console().print("All kernels are in the cache.")
+        Console().print("The kernels are in the cache.")

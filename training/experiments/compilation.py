@@ -55,9 +55,11 @@ def prepare(*first_steps: Callable[[], object]) -> None:
     Args:
         first_steps: Of the command, called in turn; what is wrong with its input shows before the long wait.
     """
+    from slam_backend.core.compilation import log_compilation
     from vslam_env.warm_up import warm_up
 
     with compilation_shown(Console(stderr=True)) as progress:
         for step in first_steps:
             step()
         warm_up(progress=progress)
+    log_compilation(lambda text: Console(stderr=True).print(text, highlight=False))  # of what only some runs need

@@ -53,8 +53,8 @@ ASSOCIATED, CREATED = range(2)  # what becomes of measurements, (2, n)
 NOISE, CAMERA, RECOVERY = 0, 6, 13
 (
     DESCRIPTOR_GATE, DESCRIPTOR_VARIANCE, POSITION_GATE, DEAD_ZONE, DEAD_RADIUS, AMBIGUITY, LOG_P0, WALK,
-    IS_SIGHTING, IS_ONE_TO_ONE, LONG, RESAMPLE_THRESHOLD,
-) = range(16, 28)  # fmt: skip
+    IS_ONE_TO_ONE, LONG, RESAMPLE_THRESHOLD,
+) = range(16, 27)  # fmt: skip
 
 TILE = 9 * LANES  # particle m is lane m % LANES of block m // LANES
 BLOCK = np.uint32(LANES)  # to divide by: unsigned numbers take half the instructions

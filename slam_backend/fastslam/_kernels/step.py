@@ -28,7 +28,6 @@ from slam_backend.fastslam._kernels.layout import (
     IDLE,
     IDS,
     IS_ONE_TO_ONE,
-    IS_SIGHTING,
     LAST_SEEN,
     LOG_LIKELIHOOD,
     LOG_P0,
@@ -110,6 +109,7 @@ def take_turns(
     sightings: FloatArray, descriptors: Float32Array, names: IntArray,
     found: Int32Array, distances: FloatArray, told: IntArray,
     mean: FloatArray, covariance: FloatArray, noted: FloatArray, measured: FloatArray, num_measured: int,
+    fastslam1: int | None,
 ) -> tuple[int, int, int, int, int, int, float, float, bool]:  # fmt: skip
     """Move robots `low` to `high` - 1 in all particles, match, weigh and update landmarks (Algorithm 1, l. 6-8).
 
@@ -119,7 +119,7 @@ def take_turns(
         low, high: Whose turns are taken; the step begins with the first robot.
         is_over: Whether these were the last turns, and the step is concluded.
         now: Number of the step, above 0 if anyone asks when landmarks were seen last.
-        assumed: (28,) noise of the odometry, camera, and the rest, see `layout`.
+        assumed: (27,) noise of the odometry, camera, and the rest, see `layout`.
         rows: (K,) which of the N robots that `turns` tells of each is; -1: none, it did nothing at all.
         turns: (N, 6) int64. What each did: `IDLE`, `STOOD`, `MOVED`, or `PLACED`, with the pose already written; where
             its measurements begin and end among all n; whether these come with covariances, and with names.
@@ -137,6 +137,8 @@ def take_turns(
         told: (2, n), written: the slots of the landmarks that were started, -1 = none; in the end as in `summarise`.
         mean, covariance: (K, 3), (K, 3, 3), written in the end, as in `conclude`.
         noted, measured, num_measured: Of a journal, likewise, see `note_turns`.
+        fastslam1: None: the proposal of FastSLAM 2.0; a filter that has it never compiles the other one. Any number:
+            that of FastSLAM 1.0.
 
     Returns:
         What `conclude` returns; zeros before that.
@@ -171,7 +173,7 @@ def take_turns(
         own_poses, own_means, own_covariances = poses[robot], means[robot], covariances[robot]
         was_blind = blind[robot] > 0 and not placed
         lost = still if placed else recovery
-        if assumed[IS_SIGHTING] == 0.0:
+        if fastslam1 is not None:
             update_fastslam1(
                 own_poses, own_means, own_covariances, not placed, move, sigmas, normals[drawn],
                 values, counts, odds, row_of, map_of, maps, users, free_rows, free_slots, tops, ids, identities, stored,
