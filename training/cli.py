@@ -11,21 +11,10 @@ from rich.console import Console
 from rich.markup import escape
 
 from training.commands.bench import bench
-from training.commands.bench_alignment import bench_alignment
-from training.commands.bench_env import bench_env
-from training.commands.bench_exploration import bench_exploration
-from training.commands.bench_filter import bench_filter
-from training.commands.bench_mrclam import bench_mrclam
-from training.commands.bench_stereo import bench_stereo
-from training.commands.bench_train import bench_train
 from training.commands.drive import drive_by_hand
 from training.commands.evaluate import evaluate
 from training.commands.paper import paper
-from training.commands.paper_alignment import fig2, fig3, fig4
-from training.commands.paper_fig5 import fig5
-from training.commands.replay import replay_mrclam
-from training.commands.replay_one import replay_kitti, replay_victoria
-from training.commands.replay_pairs import replay_stereo
+from training.commands.replay import replay
 from training.commands.run import run
 from training.commands.train import train
 from training.commands.warm_up import warm_up
@@ -37,35 +26,16 @@ NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 INTERRUPTED = 130  # typer's status after a KeyboardInterrupt
 
 app = typer.Typer(
-    name="vslam",
-    help="Robots that do not know where they start explore, map and merge: runs, replays and figures.",
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-)
+    name="vslam", help="Robots that do not know where they start explore, map and merge: runs, replays and figures.",
+    no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
+)  # fmt: skip
 app.command("run")(run)
 app.command("drive")(drive_by_hand)
 app.command("train")(train)
 app.command("evaluate")(evaluate)
 app.command("warm-up")(warm_up)
-replay = typer.Typer(help="Run the backend on the log of real robots.", no_args_is_help=True)
-replay.command("mrclam")(replay_mrclam)
-replay.command("victoria")(replay_victoria)
-replay.command("kitti")(replay_kitti)
-replay.command("stereo")(replay_stereo)
 app.add_typer(replay, name="replay")
-bench.command("filter")(bench_filter)
-bench.command("stereo")(bench_stereo)
-bench.command("env")(bench_env)
-bench.command("exploration")(bench_exploration)
-bench.command("train")(bench_train)
-bench.command("alignment")(bench_alignment)
-bench.command("mrclam")(bench_mrclam)
 app.add_typer(bench, name="bench")
-paper.command("fig2")(fig2)
-paper.command("fig3")(fig3)
-paper.command("fig4")(fig4)
-paper.command("fig5")(fig5)
 app.add_typer(paper, name="paper")
 app.add_typer(worlds, name="worlds")
 

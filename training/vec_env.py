@@ -22,12 +22,10 @@ def make_vec_env(
     """Make environments of one configuration.
 
     Args:
-        config: Of all of them.
         num_envs: E; there are E x K slots.
         workers: Processes among which they are divided; 0: this one. Results do not depend on it. A script that asks
             for workers needs the guard `if __name__ == "__main__":`, for each of them imports it.
         seed: Of all; None: leave it to the learner's own `seed`.
-        render_mode: `"rgb_array"` or None.
 
     Raises:
         ValueError: If a number is refused.
@@ -133,21 +131,21 @@ class ExplorationVecEnv(VecEnv):  # type: ignore[misc]   # its types are not loo
         slots = self._indices(indices)
         if method_name == "action_masks" and self._masks is not None:
             return [self._masks[slot].copy() for slot in slots]
-        return self._slots.call(method_name, slots, method_args, method_kwargs)
+        return self._slots.ask("call", slots, method_name, method_args, method_kwargs)
 
     def has_attr(self, attr_name: str) -> bool:
         """Tell whether the environments have an attribute; `action_masks` is there with `goal` actions."""
         if attr_name == "action_masks":
             return MASK in getattr(self.observation_space, "spaces", {})
-        return self._slots.has(attr_name)
+        return all(self._slots.ask("has", range(self.num_envs), attr_name))
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
         """Return an attribute of the environment of each slot."""
-        return self._slots.get(attr_name, self._indices(indices))
+        return self._slots.ask("get", self._indices(indices), attr_name)
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
         """Set an attribute of the environment of each slot."""
-        self._slots.set(attr_name, self._indices(indices), value)
+        self._slots.ask("set", self._indices(indices), attr_name, value)
 
     def env_is_wrapped(self, wrapper_class: Callable[..., Any], indices: Any = None) -> list[bool]:
         """Say no for each slot: there are no Gymnasium wrappers around parallel environments."""
@@ -155,7 +153,7 @@ class ExplorationVecEnv(VecEnv):  # type: ignore[misc]   # its types are not loo
 
     def get_images(self) -> list[NDArray[np.uint8] | None]:
         """Return one picture per environment, not per slot."""
-        return self._slots.images()
+        return self.env_method("render", indices=self.first_slots)
 
     def get_state(self) -> dict[str, Any]:
         """Return all that decides how the environments go on, and the masks of their last observations."""

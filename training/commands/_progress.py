@@ -22,9 +22,6 @@ def trials_shown(
     """Show a bar over trials; all libraries work on one thread, and Ctrl-C becomes a question.
 
     Args:
-        console: Where to.
-        total: Of what is counted; None where it is not known.
-        completed: Of it, so far.
         timed: Whether something is timed: the bar is then drawn between trials only, so that no other thread of this
             process works meanwhile.
 
@@ -60,37 +57,22 @@ def trials_shown(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KeptPart:
-    """Trials of one kind that a run folder keeps.
+    """Trials of one kind that a run folder keeps."""
 
-    Attributes:
-        file: In which their rows are kept.
-        kind: The dataclass of a trial.
-        play: Runs a trial and returns its row; a function of a module, so that other processes find it.
-        trials: All, in order.
-        tell: Describes a row in a few words.
-        cost: About how long a trial takes, in an arbitrary unit.
-        processes: How many run at a time; 1: in this process.
-    """
-
-    file: str
-    kind: type[Any]
+    file: str  # In which their rows are kept
+    kind: type[Any]  # The dataclass of a trial
+    # Runs a trial and returns its row; a function of a module, so that other processes find it
     play: Callable[[Any], dict[str, Any]]
-    trials: Sequence[Any]
-    tell: Callable[[dict[str, Any]], str]
-    cost: Callable[[Any], int] = lambda trial: 1
-    processes: int = 1
+    trials: Sequence[Any]  # All, in order
+    tell: Callable[[dict[str, Any]], str]  # Describes a row in a few words
+    cost: Callable[[Any], int] = lambda trial: 1  # About how long a trial takes, in an arbitrary unit
+    processes: int = 1  # How many run at a time; 1: in this process
 
 
 def play_kept(
     console: Console, folder: "RunFolder", *parts: KeptPart, timed: bool = False
 ) -> list[list[dict[str, Any]]]:
     """Play what a folder does not hold yet under a bar, part after part; say how to go on if Ctrl-C ended it.
-
-    Args:
-        console: Where the bar is shown.
-        folder: Of the run.
-        parts: Played in turn.
-        timed: As `trials_shown` takes it.
 
     Returns:
         Per part the rows of all finished trials, in the order of the trials.
@@ -114,7 +96,7 @@ def play_kept(
     finished, wanted = sum(map(len, rows)), sum(len(part.trials) for part in parts)
     if finished < wanted:
         text = f"Stopped after {finished} of {wanted} trials; go on with --out {folder.path}."
-        console.print(text, soft_wrap=True, highlight=False)
+        console.print(text, soft_wrap=True)
     return rows
 
 
@@ -123,8 +105,6 @@ def share_shown(console: Console, text: str, *more: str, **fields: Any) -> Itera
     """Show a bar over the share of the work that is done.
 
     Args:
-        console: Where to; lines that are printed there meanwhile go above the bar.
-        text: Before the bar.
         more: Templates of further columns.
         fields: What these begin with, as `task.fields`.
 

@@ -1,141 +1,167 @@
-"""How commands that leave a run folder begin and end."""
+"""How commands that leave a run folder begin and end, and where they write their metrics."""
 
-from collections.abc import Callable, Iterable, Mapping
+import os
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager, redirect_stdout, suppress
+from contextvars import ContextVar
+from dataclasses import dataclass, field
+from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TextIO, TypeVar
 
 import typer
 from rich.console import Console
 
-from training.commands._json_stdout import STDOUT, write_json
 from training.experiments.compilation import prepare
+from training.experiments.config import ExperimentConfig
+from training.replay.config import find_log
 
 if TYPE_CHECKING:  # what computes is imported when a command runs, so that --help answers at once
-    from training.experiments.config import PlainConfig
     from training.experiments.run_folder import RunFolder
 
-ConfigT = TypeVar("ConfigT", bound="PlainConfig")
+STDOUT = Path("-")
+ConfigT = TypeVar("ConfigT", bound=ExperimentConfig)
+
+_STREAM: ContextVar[TextIO | None] = ContextVar("stream", default=None)
 
 
-def choose(
-    kind: type[ConfigT],
-    command: str,
-    given: Mapping[str, Any],
-    *,
-    config: Path | None,
-    json: Path | None,
-    out: Path | None,
-    quick: Mapping[str, Any] | None = None,
-    log: tuple[Path, str] | None = None,
-) -> ConfigT:
-    """Return the configuration: what is given, above what --quick says, above that of an earlier run.
+@dataclass(eq=False)
+class Call(Generic[ConfigT]):
+    """A call of a command that leaves a run folder."""
 
-    Args:
-        kind: Of the configuration.
-        command: The command that runs, without the leading `vslam`.
-        given: Options by the names of the configuration; None: not given. Paths are kept absolute, so that a
-            configuration repeats from anywhere.
-        config: The option of that name.
-        json: Likewise; refused now if it cannot be written, rather than after the work.
-        out: Likewise.
-        quick: What --quick stands for, if it was given.
-        log: Where `path` is if nobody says it: below the folder of data, and what must be there, as an error says it.
+    kind: type[ConfigT]  # Class of its configuration
+    command: str  # The command, without the leading `vslam`
+    given: dict[str, Any]  # Options that were given, by the names of the configuration's fields; paths are absolute
+    out: Path | None = None  # Run folder
+    json: Path | None = None  # File that gets the metrics, too
+    file: Path | None = None  # Configuration of an earlier run
+    quick: Mapping[str, Any] = field(default_factory=dict)  # What --quick stands for, if it was given
+    # Where `path` is if it is not given: below the folder of data, and what must be there, as an error says it
+    log: tuple[Path, str] | None = None
+    continues: bool = False  # Whether `out` may be the folder of the same run, stopped half-way
+    console: Console = field(default_factory=partial(Console, highlight=False))  # Where the command prints
+    folder: "RunFolder" = field(init=False)  # Run folder; there after `begin`
+    metrics: dict[str, Any] = field(init=False)  # As they were written
 
-    Raises:
-        ValueError: If `json` cannot be written, `config` cannot be read or is of another command, there is no such
-            `log`, or a value is out of its range.
-    """
-    return kind.from_mapping(gather(command, given, config=config, json=json, out=out, quick=quick, log=log))
+    @cached_property
+    def values(self) -> dict[str, Any]:
+        """What is given, above what --quick says, above the configuration of an earlier run.
 
+        Raises:
+            ValueError: If `json` cannot be written, the file cannot be read or is of another command, or there is no
+                such log.
+        """
+        from slam_backend.core.files import check_writable
+        from training.experiments.run_folder import read_config
 
-def gather(
-    command: str,
-    given: Mapping[str, Any],
-    *,
-    config: Path | None,
-    json: Path | None,
-    out: Path | None,
-    quick: Mapping[str, Any] | None = None,
-    log: tuple[Path, str] | None = None,
-) -> dict[str, Any]:
-    """Return the plain values of which `choose` makes a configuration; arguments and errors as there."""
-    from slam_backend.core.files import check_writable
-    from training.experiments.run_folder import read_config
-    from training.replay.paths import find_log
+        if self.json not in (None, STDOUT) and self.json.parent != self.out:  # the run's own folder is made later
+            check_writable(self.json, "json")
+        values: dict[str, Any] = {}
+        if self.file is not None:
+            values, values["seed"] = read_config(self.file, self.command)
+        values |= {**self.quick, **self.given}
+        if self.log is not None:
+            values["path"] = find_log(values.get("path"), *self.log)
+        return values
 
-    if json not in (None, STDOUT) and json.parent != out:  # the run's own folder does not exist yet
-        check_writable(json, "json")
-    values: dict[str, Any] = {}
-    if config is not None:
-        values, values["seed"] = read_config(config, command)
-    values |= dict(quick or {}) | _given(given)
-    if log is not None:
-        values["path"] = find_log(values.get("path"), *log)
-    return values
+    @cached_property
+    def config(self) -> ConfigT:
+        """The configuration; a value out of its range is refused by name."""
+        return self.kind.from_mapping(self.values)
 
+    def begin(
+        self, *first_steps: Callable[[], object], config: ExperimentConfig | None = None
+    ) -> tuple[Console, "RunFolder"]:
+        """Make the run folder, and compile or load all kernels before anything is shown.
 
-def _given(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the options that were given, paths absolute."""
-    told = {name: str(value.resolve()) if isinstance(value, Path) else value for name, value in options.items()}
-    return {name: value for name, value in told.items() if value is not None}
+        Args:
+            first_steps: First steps of the work, done before there is a folder: they may show that the input is bad.
 
+        Raises:
+            ValueError: If the folder is not free or cannot be made; nothing has been compiled then.
+        """
+        from training.experiments.run_folder import CONFIG_FILE, RunFolder, check_free
+        from training.experiments.trial_store import open_folder
 
-def begin(
-    command: str,
-    chosen: "PlainConfig",
-    out: Path | None,
-    *first_steps: Callable[[], object],
-    goes_on: bool = False,
-) -> tuple[Console, "RunFolder"]:
-    """Make the run folder, and compile or load all kernels before anything is shown; return console and folder.
+        chosen, out = config or self.config, self.out
+        if out is not None and not (self.continues and (out / CONFIG_FILE).is_file()):
+            check_free(out)  # at once: the compiler may take a minute
+        make = open_folder if self.continues else RunFolder.create
+        folders: list[RunFolder] = []
+        prepare(*first_steps, lambda: folders.append(make(out, self.command, chosen.to_mapping(), chosen.seed)))
+        self.folder = folders[0]
+        return self.console, self.folder
 
-    Args:
-        command: The command that runs, without the leading `vslam`.
-        chosen: Its configuration.
-        out: The option of that name.
-        first_steps: Of the work, done before there is a folder, as they may show what is wrong with the input.
-        goes_on: Whether `out` may be the folder of the same run, stopped half-way.
+    def write(self, metrics: Mapping[str, Any]) -> None:
+        """Write `metrics.json`, before pictures for which there may be no room."""
+        self.metrics = self.folder.write_metrics(metrics)
 
-    Raises:
-        ValueError: If the folder is not free or cannot be made; nothing has been compiled then.
-    """
-    from training.experiments.run_folder import CONFIG_FILE, RunFolder, check_free
-    from training.experiments.trial_store import open_folder
+    def finish(self, check: bool = False, held: Iterable[bool] = ()) -> None:
+        """Write the metrics where --json says, say where the folder is, and check the claims if asked to.
 
-    if out is not None and not (goes_on and (out / CONFIG_FILE).is_file()):
-        check_free(out)  # at once: the compiler may take a minute
-    open_or_create = open_folder if goes_on else RunFolder.create
-    folders: list[RunFolder] = []
-    prepare(*first_steps, lambda: folders.append(open_or_create(out, command, chosen.to_mapping(), chosen.seed)))
-    return Console(), folders[0]
+        Raises:
+            typer.Exit: With status 1, if `check` and a claim does not hold or none was checked.
+        """
+        from training.experiments.run_folder import to_json
+
+        if self.json is not None:
+            write_json(self.json, to_json(self.metrics))
+        self.console.print(f"Run folder: {self.folder.path}", soft_wrap=True)
+        verdicts = list(held)
+        if check and not (verdicts and all(verdicts)):
+            raise typer.Exit(1)
 
 
-def finish(
-    console: Console,
-    folder: "RunFolder",
-    metrics: dict[str, Any],
-    json: Path | None,
-    check: bool = False,
-    held: Iterable[bool] = (),
-) -> None:
-    """Write the metrics to `json` too, say where the folder is, and check the claims if asked to.
+def claim_stdout(context: typer.Context, json: Path | None) -> Path | None:
+    """Return the option --json; if it names stdout, all other output of the command goes to stderr from now on."""
+    if json == STDOUT:
+        context.with_resource(_others_on_stderr())
+    return json
 
-    Args:
-        console: Where to say it.
-        folder: Of the run.
-        metrics: As `RunFolder.write_metrics` returned them.
-        json: The option of that name.
-        check: Likewise.
-        held: Whether each claim holds.
+
+def write_json(json: Path, text: str) -> None:
+    """Write a text to the file, or the stdout, that the option --json names.
 
     Raises:
-        typer.Exit: With status 1, if `check` and a claim does not hold or none was checked.
+        ValueError: If it cannot be written.
     """
-    from training.experiments.run_folder import to_json
+    from slam_backend.core.files import refusing, write_file
 
-    if json is not None:
-        write_json(json, to_json(metrics))
-    console.print(f"Run folder: {folder.path}", soft_wrap=True, highlight=False)
-    verdicts = list(held)
-    if check and not (verdicts and all(verdicts)):
-        raise typer.Exit(1)
+    if json != STDOUT:
+        write_file(json, text, "json")
+        return
+    stream = _STREAM.get() or sys.stdout
+    with refusing("stdout", "json"):
+        stream.write(text)
+        stream.flush()
+
+
+@contextmanager
+def _others_on_stderr() -> Iterator[None]:
+    """Send to stderr what this process and those that it starts print; only `write_json` reaches stdout."""
+    with ExitStack() as stack:
+        others = sys.stderr or stack.enter_context(open(os.devnull, "w", encoding="utf-8"))
+        stream = sys.stdout
+        sys.stdout.flush()
+        if _descriptor(sys.stdout) == 1 and (number := _descriptor(others)) is not None:
+            stream = open(os.dup(1), "w", encoding="utf-8")  # noqa: SIM115   # closed by the next line
+            stack.callback(_close, stream)
+            stack.callback(os.dup2, stream.fileno(), 1)
+            os.dup2(number, 1)
+        stack.callback(_STREAM.reset, _STREAM.set(stream))
+        stack.enter_context(redirect_stdout(others))
+        yield
+
+
+def _close(stream: TextIO) -> None:
+    with suppress(OSError):  # `write_json` has told of it
+        stream.close()
+
+
+def _descriptor(stream: TextIO) -> int | None:
+    """Return the descriptor below a stream; None: it has none."""
+    try:
+        return stream.fileno()
+    except (OSError, ValueError):
+        return None

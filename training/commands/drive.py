@@ -36,7 +36,7 @@ def drive_by_hand(
     if reason:
         raise bad_argument("drive", "a screen for a window", reason.split(".")[0], reason.split(". ", 1)[1] + ".")
     prepare()
-    console = Console()
+    console = Console(highlight=False)
     console.print(KEYS)
     window = Window("vslam drive")
     with ExitStack() as stack:
@@ -47,8 +47,7 @@ def drive_by_hand(
     for agent, info in infos.items():
         console.print(
             f"{agent}: map error {info['map_error']:.3f} m, recall {info['map_recall']:.0%}, "
-            f"pose error {info['pose_error']:.2f} m, group {info['group']}",
-            highlight=False,
+            f"pose error {info['pose_error']:.2f} m, group {info['group']}"
         )
     if record is not None:
-        console.print(f"Video: {record}", soft_wrap=True, highlight=False)
+        console.print(f"Video: {record}", soft_wrap=True)

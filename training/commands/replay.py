@@ -1,108 +1,103 @@
-"""The command `vslam replay mrclam`: options, live progress, a table, and the run folder."""
+"""The commands `vslam replay ...`: the backend on logs of real robots."""
 
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+import math
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import typer
 from rich.console import Console
 
-from training.commands._options import Config, Duration, Estimator, Json, Out, RejuvenateEvery, Seed, numbers
+from training.commands._options import options
 from training.commands._progress import share_shown
-from training.commands._run_folder import begin, choose, finish
-from training.episodes.attempt_tables import print_refusals
-from training.episodes.consistency_table import print_consistency
+from training.commands._run_folder import Call
+from training.episodes.tables import print_consistency, print_refusals, write_maps
 from training.experiments.tables import console_table, number
-from training.replay.rejuvenation_counts import sentence_of
+from training.replay.config import (
+    KITTI,
+    MRCLAM,
+    PAIRS,
+    VICTORIA,
+    ImagesConfig,
+    KittiConfig,
+    MrclamConfig,
+    PairsConfig,
+    VictoriaConfig,
+)
 
 if TYPE_CHECKING:  # what computes is imported when the command runs, so that --help answers at once
+    from slam_backend.core.validation import FloatArray
     from slam_backend.readers.mrclam import MrclamLog
-    from training.experiments.run_folder import RunFolder
-    from training.replay.mrclam import Replay, ReplayConfig
+    from slam_backend.trajectory import Trajectory
+    from training.replay.kitti import DriveScore
+    from training.replay.mrclam import Replay
+    from training.replay.single_robot import OneReplay
+    from training.replay.victoria import VictoriaScore
 
-COMMAND = "replay mrclam"
-DATASET = Path("mrclam") / "MRCLAM_Dataset7"
-LOG = (DATASET, "a folder of the MR.CLAM log, with Barcodes.dat, Landmark_Groundtruth.dat and Robot*.dat")
+replay = typer.Typer(help="Run the backend on the log of real robots.", no_args_is_help=True)
+
+NO_TRUTH = "Errors: no ground truth in this folder."
+MRCLAM_LOG = (MRCLAM, "a folder of the MR.CLAM log, with Barcodes.dat, Landmark_Groundtruth.dat and Robot*.dat")
+VICTORIA_LOG = (
+    VICTORIA, "a folder of the Victoria Park log, with aa3_dr.mat, VictoriaParkSinSincronizar.mat and aa3_gpsx.mat",
+)  # fmt: skip
+KITTI_LOG = (KITTI, "an archive (.npz) of KITTI features, a folder with one, or one of images (image_0, ...)")
+STEREO_LOG = (
+    PAIRS,
+    "a folder with two stereo pairs (left_img_0.png, right_img_0.png, left_img_1.png, ...) and their calibration",
+)
+DRIVE_ALONE = ("times", "duration", "particles")  # options of drives, which two pairs do not have
 
 
-def replay_mrclam(
-    path: Annotated[
-        Path | None, typer.Option(help="Folder of the log.", show_default=f"{DATASET} in $VSLAM_DATA")
-    ] = None,
-    robots: Annotated[str | None, typer.Option(help="Numbers with commas, e.g. 1,2,5.", show_default="all")] = None,
-    truth: Annotated[
-        Path | None, typer.Option(help="File of the true poses of the one robot named.", show_default="the folder's")
-    ] = None,
-    duration: Duration = None,
-    identities: Annotated[
-        str | None, typer.Option(help="given: barcodes are read. hidden: positions alone.", show_default="given")
-    ] = None,
-    alone: Annotated[
-        bool | None, typer.Option("--alone/--team", help="Each robot by itself, or maps merge.", show_default="team")
-    ] = None,
-    particles: Annotated[
-        int | None, typer.Option(help="Particles per filter.", show_default="100 for each robot of a team")
-    ] = None,
-    estimator: Estimator = None,
-    rejuvenate_every: RejuvenateEvery = None,
-    seed: Seed = None,
-    out: Out = None,
-    json: Json = None,
-    config: Config = None,
-) -> None:
+@replay.command("mrclam")
+@options(MrclamConfig, "replay mrclam", log=MRCLAM_LOG)
+def replay_mrclam(call: Call[MrclamConfig]) -> None:
     """Five real robots with unknown starts: a filter each, maps aligned and merged, one team in the end.
 
     The odometry noise was calibrated on data sets 7 and 4 of MR.CLAM.
     """
     from slam_backend.readers.mrclam import load_mrclam
-    from training.episodes.maps import group_name, write_maps
+    from slam_backend.trajectory import Trajectory
     from training.experiments.run_folder import plain, to_json
     from training.replay.figures import draw_joint_map, draw_replay
     from training.replay.metrics import score_path, summarise
-    from training.replay.mrclam import ReplayConfig, replay
 
-    given = {
-        "path": path,
-        "robots": numbers("robots", robots),
-        "truth": truth,
-        "duration": duration,
-        "identities": identities,
-        "alone": alone,
-        "particles": particles,
-        "estimator": estimator,
-        "rejuvenate_every": rejuvenate_every,
-        "seed": seed,
-    }
-    chosen = choose(ReplayConfig, COMMAND, given, config=config, json=json, out=out, log=LOG)
+    chosen = call.config
     log = load_mrclam(chosen.path, chosen.robots, chosen.duration, chosen.truth)
-    console, folder = begin(COMMAND, chosen, out)
+    console, folder = call.begin()
     for note in log.notes:
-        console.print(note, soft_wrap=True, highlight=False)
-    result = _replay_live(console, log, chosen, replay)
+        console.print(note, soft_wrap=True)
+    result = _replay_live(console, log, chosen)
     paths = [score_path(result, robot, own.truth) for robot, own in enumerate(log.robots)]
     scores = plain(summarise(result, log, paths))
     _print_tables(console, scores, {own.robot for own in log.robots if own.truth is not None})
     print_consistency(console, scores["consistency"])
-    if told := sentence_of(scores["rejuvenations"]):
-        console.print(told, highlight=False)
+    if counts := _rejuvenations(scores["rejuvenations"]):
+        console.print(counts)
     speed = float(result.times[-1] - result.times[0]) / result.seconds
-    console.print(f"The filters took {result.seconds:.1f} s: {speed:.0f} times real time.", highlight=False)
-    _write_paths(folder, log, result)
-    maps = {group_name([log.robots[r].robot for r in group]): result.maps[group[0]] for group in result.groups}
-    console.print(write_maps(folder, maps), soft_wrap=True, highlight=False)
+    console.print(f"The filters took {result.seconds:.1f} s: {speed:.0f} times real time.")
+    for robot, own in enumerate(log.robots):
+        for kind, poses in (("estimate", result.paths[robot]), ("dead_reckoning", result.reckoned[robot])):
+            folder.write_trajectory(f"robot{own.robot}_{kind}", Trajectory(result.times, poses))
+        if own.truth is not None:
+            folder.write_trajectory(f"robot{own.robot}_truth", own.truth)
+    names = {group: "-".join(str(log.robots[robot].robot) for robot in group) for group in result.groups}
+    maps = {names[group]: result.maps[group[0]] for group in result.groups}
+    console.print(write_maps(folder, maps), soft_wrap=True)
     folder.write_text("timing.json", to_json({"seconds": result.seconds, "times_real_time": speed}))
     draw_replay(folder.path / "replay.png", log, result, paths)
     for group in result.groups:
         if len(group) > 1:
-            names = group_name([log.robots[robot].robot for robot in group])
-            draw_joint_map(folder.path / f"joint_map_{names}.png", log, result, paths, group)
-    finish(console, folder, folder.write_metrics(scores), json)
+            draw_joint_map(folder.path / f"joint_map_{names[group]}.png", log, result, paths, group)
+    call.write(scores)
+    call.finish()
 
 
-def _replay_live(console: Console, log: "MrclamLog", config: "ReplayConfig", replay: Any) -> "Replay":
+def _replay_live(console: Console, log: "MrclamLog", config: MrclamConfig) -> "Replay":
     """Run the replay under a progress bar, and tell of each merge as it comes."""
+    from training.replay.mrclam import replay_team
+
     names = [own.robot for own in log.robots]
-    team = f"{len(names)} robots"
-    with share_shown(console, team, "{task.fields[groups]} groups", groups=len(names)) as update:
+    with share_shown(console, f"{len(names)} robots", "{task.fields[groups]} groups", groups=len(names)) as update:
 
         def on_step(done: float, report: Any) -> None:
             update(done, groups=len(report.groups))
@@ -112,29 +107,11 @@ def _replay_live(console: Console, log: "MrclamLog", config: "ReplayConfig", rep
                     seconds = report.step * config.dt
                     console.print(f"{seconds:6.1f} s  maps of {sides[0]} and {sides[1]} merged")
 
-        result: Replay = replay(log, config, on_step)
-    return result
-
-
-def _write_paths(folder: "RunFolder", log: "MrclamLog", result: "Replay") -> None:
-    """Write per robot its estimated and reckoned path, own start frame, and its true one, world frame."""
-    from slam_backend.trajectory import Trajectory
-
-    for robot, own in enumerate(log.robots):
-        for kind, poses in (("estimate", result.paths[robot]), ("dead_reckoning", result.reckoned[robot])):
-            folder.write_trajectory(f"robot{own.robot}_{kind}", Trajectory(result.times, poses))
-        if own.truth is not None:
-            folder.write_trajectory(f"robot{own.robot}_truth", own.truth)
+        return replay_team(log, config, on_step)
 
 
 def _print_tables(console: Console, metrics: dict[str, Any], with_poses: set[int]) -> None:
-    """Print scores of paths, maps and merges, as far as they are known.
-
-    Args:
-        console: Where to.
-        metrics: Content of `metrics.json`.
-        with_poses: Numbers of the robots whose log has true poses.
-    """
+    """Print scores of paths, maps and merges, as far as they are known."""
     aligned, start = "after the best rigid fit", "from the true start, no fit"
     paths = {
         f"path (m),\n{aligned}": "ate_aligned_m", "odometry,\nfitted too": "dead_reckoning_ate_aligned_m",
@@ -157,7 +134,7 @@ def _print_tables(console: Console, metrics: dict[str, Any], with_poses: set[int
             (missed, "fewer than two true poses during this replay"),
         ):
             if robots:
-                console.print(f"{title} of robots {', '.join(map(str, robots))}: {why}.", highlight=False)
+                console.print(f"{title} of robots {', '.join(map(str, robots))}: {why}.")
     errors = {"off by (m)": "error_m", "off by (°)": "error_deg"}
     errors = {name: key for name, key in errors.items() if any(row[key] is not None for row in metrics["merges"])}
     merges = []
@@ -169,3 +146,234 @@ def _print_tables(console: Console, metrics: dict[str, Any], with_poses: set[int
     console.print(console_table("Merges", headings, merges) if merges else "No merge.")
     print_refusals(console, metrics["refusals"])
     console.print("Groups at the end: " + "; ".join(", ".join(map(str, group)) for group in metrics["groups"]))
+
+
+@replay.command("victoria")
+@options(VictoriaConfig, "replay victoria", log=VICTORIA_LOG)
+def replay_victoria(call: Call[VictoriaConfig]) -> None:
+    """A car among the trees of a park: trees without names, matched by where they stand, GPS as the truth."""
+    from slam_backend.readers.victoria import load_victoria
+    from training.replay.victoria import replay, score, summarise
+
+    log = load_victoria(call.config.path, call.config.duration)
+    console, _ = call.begin()
+    with share_shown(console, "replay") as on_step:
+        result = replay(log, call.config, on_step)
+    scored = score(result, log)
+    metrics = summarise(result, scored)
+    told = [f"Trees seen ten times or more: {metrics['landmarks_seen_ten_times']}.", *log.notes]
+    unknown = NO_TRUTH
+    if scored is not None:
+        gps = metrics["gps"]
+        told.insert(
+            0,
+            f"At {gps['fixes']} GPS fixes: median {gps['median_m']:.2f} m, 95 % within {gps['percentile_95_m']:.2f} m, "
+            f"worst {gps['worst_m']:.1f} m.",
+        )
+    elif log.gps is not None:
+        fixes, times = log.gps[[0, -1], 0], result.times[[0, -1]]
+        unknown = (
+            f"Errors: fewer than two GPS fixes ({fixes[0]:.1f} to {fixes[1]:.1f} s) during this replay "
+            f"({times[0]:.1f} to {times[1]:.1f} s)."
+        )
+    known = scored.fixes if scored else None
+    metrics |= {"notes": log.notes}
+    _finish_one(call, result, metrics, told, "Victoria Park", scored, known, known_as="GPS", unknown=unknown)
+
+
+@replay.command("kitti")
+@options(KittiConfig, "replay kitti", log=KITTI_LOG)
+def replay_kitti(call: Call[KittiConfig]) -> None:
+    """A car in a town: stereo images, or stereo features whose tracks are the landmarks; motion taken to be planar."""
+    from slam_backend.readers.kitti import load_kitti
+    from slam_backend.readers.kitti_images import holds_images
+    from training.replay.kitti import replay, score, summarise
+
+    if holds_images(call.values["path"]):
+        _replay_images(call, ImagesConfig.from_mapping(call.values))
+        return
+    log = load_kitti(call.config.path, call.config.truth, call.config.duration)
+    console, _ = call.begin()
+    with share_shown(console, "replay") as on_step:
+        result = replay(log, call.config, on_step)
+    scored = score(result, log)
+    told = _drive_told(scored, "odometry")
+    if scored is not None and scored.loop is not None:
+        seconds = [float(result.times[step] - result.times[0]) for step in scored.loop]
+        told.append(
+            f"The place of {seconds[0]:.0f} s was seen again at {seconds[1]:.0f} s; the motion between is off by "
+            f"{scored.loop_error:.2f} m. Tracks that ended never come back, so nothing closes this loop."
+        )
+    title = "KITTI, tracked stereo features in the plane"
+    known = scored.truth if scored else None
+    _finish_one(call, result, summarise(result, scored), told, title, scored, known, truth=log.truth)
+
+
+@replay.command("stereo")
+@options(ImagesConfig, "replay stereo", log=STEREO_LOG)
+def replay_stereo(call: Call[ImagesConfig]) -> None:
+    """Two stereo pairs of one room: the motion between the two places. Three pairs or more: a drive in the plane.
+
+    File names are looked up in the folder, unless they are whole paths.
+    """
+    from slam_backend.core.validation import bad_argument
+    from slam_backend.readers.stereo_files import StereoFiles, find_pairs
+
+    values, usual = call.values, StereoFiles()
+    names = {key: values.get(key, getattr(usual, key)) for key in ("left", "right", "calibration")}
+    if len(find_pairs(values["path"], StereoFiles(**names))[0]) > 2:
+        _replay_images(call, ImagesConfig.from_mapping(values | names))
+        return
+    for name in DRIVE_ALONE:
+        if name in values:
+            cure = "Leave it away: two pairs are aligned in space."
+            raise bad_argument(name, "a drive of three pairs or more", "a folder with two pairs", cure)
+    _align_pairs(call, PairsConfig.from_mapping(values))
+
+
+def _align_pairs(call: Call[ImagesConfig], chosen: PairsConfig) -> None:
+    """Align two pairs by each descriptor, print how well, and write the run folder."""
+    import numpy as np
+
+    from slam_backend.frontend import DESCRIPTORS
+    from training.experiments.run_folder import plain
+    from training.replay.image_figures import draw_matches
+    from training.replay.stereo_pairs import align_pairs, load_pairs, summarise_pairs
+
+    log = load_pairs(chosen.path, chosen.files)
+    console, folder = call.begin(config=chosen)
+    order = [chosen.descriptor, *(name for name in DESCRIPTORS if name != chosen.descriptor)]
+    results = {name: align_pairs(log, chosen.replace(descriptor=name)) for name in order}
+    metrics = plain(summarise_pairs(results))
+    known = log.poses is not None
+    headings = ("descriptor", "points", "matches", "inliers", *(("error (m)", "error (degrees)") if known else ()))
+    rows = []
+    for name, row in metrics["alignments"].items():
+        kinds = (("error_m", 3), ("error_deg", 2)) if known else ()
+        errors = ["none" if row[key] is None else f"{row[key]:.{n}f}" for key, n in kinds]
+        points = " + ".join(str(count) for count in row["points"])
+        rows.append([name, points, str(row["matches"]), str(row["inliers"]), *errors])
+    console.print(console_table("Motion between the two places", headings, rows))
+    if not known:
+        console.print(NO_TRUTH)
+    main = results[chosen.descriptor]
+    if not np.isnan(main.true_m):
+        console.print(f"The places are {main.true_m:.2f} m and {main.true_deg:.1f} degrees apart.")
+    if main.motion is not None:
+        ends = [frame.pixels[rows, :2] for frame, rows in zip(main.frames, main.motion.pairs.T, strict=True)]
+        inliers = np.flatnonzero(main.motion.inliers)
+        draw_matches(folder.path / "matches.png", *main.images, ends[0], ends[1], inliers)
+    maps = {str(place): landmarks for place, landmarks in enumerate(main.maps)}
+    console.print(write_maps(folder, maps), soft_wrap=True)
+    call.write(metrics)
+    call.finish()
+
+
+def _replay_images(call: Call[Any], chosen: ImagesConfig) -> None:
+    """Replay a folder of stereo images, print how far off it ended, and write the run folder."""
+    from training.replay.image_figures import draw_frame, expected_pixels
+    from training.replay.stereo_images import load_images, replay_images, score_images, summarise_images
+
+    log = load_images(chosen)
+    console, folder = call.begin(config=chosen)
+    with share_shown(console, "replay") as on_step:
+        result = replay_images(log, chosen, on_step)
+    one, scored = result.replay, score_images(result.replay, log)
+    metrics = summarise_images(result, scored)
+    told = [
+        f"Odometry: visual, from every second of {metrics['features_per_frame']:.0f} features a frame "
+        f"({metrics['odometry_inliers_per_frame']:.0f} agreed); the filter got the others. Motion is taken to be in "
+        f"the plane. Front end and odometry took {1e3 * result.front_end_seconds / len(log.times):.0f} ms a frame.",
+        *_drive_told(scored, "visual odometry alone"),
+    ]
+    landmarks = one.landmarks
+    counts = dict(zip(landmarks.ids.tolist(), landmarks.counts.tolist(), strict=True))
+    often = landmarks.subset(landmarks.counts >= 3)
+    means = often.means.copy()
+    means[:, 2] = [result.heights[name] for name in often.ids.tolist()]
+    expected = expected_pixels(means, one.path[-1], log.pair.focal_px, log.pair.centre_px, 30.0)
+    image = log.images(len(log.times) - 1)[0]
+    draw_frame(folder.path / "frame.png", image, result.last.pixels[::2], result.last_ids, counts, expected)
+    known = scored.truth if scored else None
+    _finish_one(call, one, metrics, told, "stereo images in the plane", scored, known, truth=log.truth)
+
+
+def _drive_told(scored: "DriveScore | None", other: str) -> list[str]:
+    """Return lines about KITTI's drift and the errors at the end, of the estimate and of the `other`."""
+    if scored is None:
+        return []
+    told, drifts, ends, length = [], scored.drifts, scored.ends, scored.length
+    if all(map(math.isfinite, drifts)):  # the true path is long enough
+        told.append(
+            f"Drift (KITTI's: mean error of the motion over 100, 200, ... 800 m): {100.0 * drifts[0]:.2f} % "
+            f"(odometry {100.0 * drifts[1]:.2f} %)."
+        )
+    shares = [100.0 * error / length for error in ends]
+    told.append(
+        f"End of {length:.1f} m, from the start, no fit: off by {ends[0]:.2f} m, {shares[0]:.2f} % of the path "
+        f"({other} {ends[1]:.2f} m, {shares[1]:.2f} %)."
+    )
+    return told
+
+
+def _finish_one(
+    call: Call[Any], result: "OneReplay", metrics: Mapping[str, Any], told: Sequence[str], title: str,
+    scored: "DriveScore | VictoriaScore | None", known: "FloatArray | None", *, known_as: str = "true path",
+    truth: "Trajectory | None" = None, unknown: str = NO_TRUTH,
+) -> None:  # fmt: skip
+    """Show and keep the replay of one robot's log.
+
+    Args:
+        known: Known positions (n, 2 or 3) [m], world frame; None without truth.
+        known_as: Their label in the picture.
+        unknown: Line in place of the table where there are no scores.
+    """
+    from slam_backend.trajectory import Trajectory
+    from training.experiments.run_folder import plain, to_json
+    from training.replay.figures import draw_one
+
+    console, folder = call.console, call.folder
+    shown = plain(metrics)
+    _print_one(console, shown, result, unknown)
+    print_consistency(console, shown["consistency"])
+    lines = [*told, _rejuvenations(metrics["rejuvenations"]), write_maps(folder, {"1": result.landmarks})]
+    for line in filter(None, lines):
+        console.print(line, soft_wrap=True)
+    estimate, reckoned = scored.paths if scored else (result.path, result.reckoned)
+    draw_one(
+        folder.path / "replay.png", title, result, (estimate[:, :2], reckoned[:, :2]),
+        scored.scores if scored else None, None if known is None else known[:, :2], known_as,
+    )  # fmt: skip
+    folder.write_trajectory("estimate", Trajectory(result.times, result.path))
+    folder.write_trajectory("dead_reckoning", Trajectory(result.times, result.reckoned))
+    if truth is not None:
+        folder.write_trajectory("truth", truth)
+    folder.write_text("timing.json", to_json({"seconds": result.seconds, "times_real_time": result.speed}))
+    call.write(shown)
+    call.finish()
+
+
+def _print_one(console: Console, metrics: dict[str, Any], result: "OneReplay", unknown: str) -> None:
+    """Print how far path and dead reckoning are off or that it is `unknown`, what became of the measurements, speed."""
+    row = metrics["robots"][0]
+    if row["ate_aligned_m"] is None:
+        console.print(unknown, soft_wrap=True)
+    else:
+        headings = ("", "after the best rigid fit", "from the start, no fit")
+        names = {"estimate": "ate", "odometry": "dead_reckoning_ate"}
+        rows = [[name, *(number(row[f"{key}_{end}_m"]) for end in ("aligned", "start"))] for name, key in names.items()]
+        console.print(console_table("RMS distance to the truth [m]", headings, rows))
+    made = metrics["measurements"]
+    console.print(
+        f"{metrics['landmarks']} landmarks; of the measurements {made['matched']} matched, {made['created']} began "
+        f"landmarks, {made['rejected']} were refused. {row['path_m']:.0f} m in {metrics['duration_s']:.0f} s; "
+        f"the filter took {result.seconds:.1f} s: {result.speed:.0f} times real time."
+    )
+
+
+def _rejuvenations(counts: Mapping[str, Any]) -> str:
+    """Return a line that tells how often particles were drawn again, and why not; "" if nothing was attempted."""
+    refused = "; ".join(f"{reason} ({count})" for reason, count in counts["refused"].items())
+    if not counts["drawn"] and not refused:
+        return ""
+    return f"Particles were drawn anew {counts['drawn']} times" + (f", and not, for: {refused}." if refused else ".")

@@ -1,92 +1,61 @@
 """The command `vslam run`: robots explore a building, live progress, tables, and the run folder."""
 
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
+from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
+from rich.progress import Progress as Bar
 
-from training.commands._options import Config, EnvRejuvenateEvery, Json, Noise, Out, Particles, Seed, Sensor
-from training.commands._run_folder import begin, choose, finish
-from training.episodes.consistency_table import print_consistency
+from training.commands._options import options
+from training.commands._run_folder import Call
+from training.episodes.config import RunConfig
 
 if TYPE_CHECKING:  # what computes is imported when the command runs, so that --help answers at once
-    from training.episodes.config import RunConfig
-    from training.episodes.runner import EpisodeRecord
-    from training.experiments.run_folder import RunFolder
+    from training.episodes.runner import EpisodeRecord, MergeRecord, Progress
 
-COMMAND = "run"
 VIDEO_SIZE = (960, 720)
-EYE_WIDTH = 480  # of what one robot sees, beside the map [px]
+REFRESH_STEPS = 5
+IMAGE_WIDTH = 480  # of what one robot sees, beside the map [px]
 
 
-def run(
-    world: Annotated[
-        str | None, typer.Option(help="A family or a path; see vslam worlds list.", show_default="office")
-    ] = None,
-    robots: Annotated[int | None, typer.Option(help="How many, 1 to 8.", show_default="3")] = None,
-    policy: Annotated[
-        str | None,
-        typer.Option(
-            help="frontier, random_goals, random_walk, a trained model's path, or MODULE:NAME of your own.",
-            show_default="frontier",
-        ),
-    ] = None,
-    seed: Seed = None,
-    action_type: Annotated[
-        str | None,
-        typer.Option(help="continuous, discrete or goal.", show_default="continuous, if the policy knows it"),
-    ] = None,
-    max_cycles: Annotated[int | None, typer.Option(help="Steps of the episode.", show_default="180 s worth")] = None,
-    particles: Particles = None,
-    rejuvenate_every: EnvRejuvenateEvery = None,
-    preset: Noise = None,
-    sensor: Sensor = None,
-    out: Out = None,
-    json: Json = None,
-    video: Annotated[bool, typer.Option(help="Whether to film the run.")] = True,
-    config: Config = None,
-) -> None:
+@options(RunConfig, "run")
+def run(call: Call[RunConfig], video: Annotated[bool, typer.Option(help="Whether to film the run.")] = True) -> None:
     """Robots that do not know where they start explore a building, map it, and join their maps."""
     from agents.registry import action_types
-    from training.episodes.config import RunConfig
+    from slam_backend.trajectory import Trajectory
     from training.episodes.figures import draw_errors, draw_maps
-    from training.episodes.maps import group_name, write_maps
     from training.episodes.metrics import score_episode
-    from training.episodes.tables import print_tables
+    from training.episodes.tables import print_consistency, print_tables, write_maps
     from training.experiments.run_folder import plain
 
-    if action_type is None and policy is not None and "continuous" not in (known := action_types(policy)):
-        action_type = known[0]
-    given = {
-        "world": world,
-        "robots": robots,
-        "policy": policy,
-        "seed": seed,
-        "action_type": action_type,
-        "max_cycles": max_cycles,
-        "particles": particles,
-        "rejuvenate_every": rejuvenate_every,
-        "preset": preset,
-        "sensor": sensor,
-    }
-    chosen = choose(RunConfig, COMMAND, given, config=config, json=json, out=out)
+    policy = call.given.get("policy")
+    if "action_type" not in call.given and policy is not None and "continuous" not in (known := action_types(policy)):
+        call.given["action_type"] = known[0]
+    chosen = call.config
     env = chosen.make_env()
     policies = chosen.make_policies(env)
     # A bad world shows before there is a folder.
-    console, folder = begin(COMMAND, chosen, out, lambda: _first_steps(env, policies, chosen.seed))
+    console, folder = call.begin(lambda: _first_steps(env, policies, chosen.seed))
     folder.write_text("environment.toml", env.config.replace(world=folder.config["world"]).to_toml())
     record = _run_live(console, env, policies, chosen, folder.path / "video.mp4" if video else None)
     scores = plain(score_episode(record))
     print_tables(console, scores)
     print_consistency(console, scores["consistency"])
-    metrics = folder.write_metrics(scores)
-    _write_paths(folder, record)
-    maps = {group_name(group): record.maps[group[0]] for group in record.groups}
-    console.print(write_maps(folder, maps), soft_wrap=True, highlight=False)
+    call.write(scores)
+    for robot in range(len(record.infos)):  # paths of robots are in their own start frames, the true ones in the world
+        for kind, paths in (
+            ("estimate", record.estimated), ("dead_reckoning", record.reckoned), ("truth", record.true_poses)
+        ):  # fmt: skip
+            folder.write_trajectory(f"robot{robot}_{kind}", Trajectory(record.times, paths[robot]))
+    maps = {"-".join(map(str, group)): record.maps[group[0]] for group in record.groups}
+    console.print(write_maps(folder, maps), soft_wrap=True)
     draw_maps(record, folder.path / "map.png")
     draw_errors(record, folder.path / "error.png")
-    finish(console, folder, metrics, json)
+    call.finish()
 
 
 def _first_steps(env: Any, policies: Any, seed: int) -> None:
@@ -97,30 +66,26 @@ def _first_steps(env: Any, policies: Any, seed: int) -> None:
     run_episode(env, policies, seed, should_stop=lambda: next(steps, None) is None)
 
 
-def _run_live(console: Console, env: Any, policies: Any, config: "RunConfig", video: Path | None) -> "EpisodeRecord":
+def _run_live(console: Console, env: Any, policies: Any, config: RunConfig, video: Path | None) -> "EpisodeRecord":
     """Run the episode with live figures, filming it if there is a path for the video; Ctrl-C ends it early."""
-    from contextlib import ExitStack
-
-    from training.episodes.camera_overlay import beside_the_map
-    from training.episodes.live import LiveProgress
-    from training.episodes.runner import Progress, run_episode
-    from training.episodes.video import VideoWriter, choose_pace, with_slow_flashes
+    from training.episodes.runner import run_episode
+    from training.episodes.video import VideoWriter, beside_the_map, choose_pace, with_slow_flashes
     from training.experiments.interrupt import interrupt_flag
     from vslam_env.rendering import draw_frame
 
     pace = choose_pace(config.num_steps, config.step_s)
     eyes = config.sensor == "stereo"
-    size = (VIDEO_SIZE[0] + (EYE_WIDTH if eyes else 0), VIDEO_SIZE[1])
+    size = (VIDEO_SIZE[0] + (IMAGE_WIDTH if eyes else 0), VIDEO_SIZE[1])
     with ExitStack() as stack:
         interrupted = stack.enter_context(interrupt_flag())
-        live = stack.enter_context(LiveProgress(console, config.num_steps, env.possible_agents))
+        show = stack.enter_context(live_progress(console, config.num_steps, env.possible_agents))
         writer = None if video is None else stack.enter_context(VideoWriter(video, size, pace.fps))
 
-        def on_step(progress: Progress) -> None:
-            live.show(progress)
+        def on_step(progress: "Progress") -> None:
+            show(progress)
             if writer is not None and progress.step % pace.stride == 0:
                 picture = draw_frame(with_slow_flashes(env.scene(), env.events, pace.speedup), VIDEO_SIZE)
-                writer.add(beside_the_map(picture, env.episode.frames[0], EYE_WIDTH) if eyes else picture)
+                writer.add(beside_the_map(picture, env.episode.frames[0], IMAGE_WIDTH) if eyes else picture)
 
         record = run_episode(env, policies, config.seed, on_step, interrupted)
     if not record.complete:
@@ -128,12 +93,33 @@ def _run_live(console: Console, env: Any, policies: Any, config: "RunConfig", vi
     return record
 
 
-def _write_paths(folder: "RunFolder", record: "EpisodeRecord") -> None:
-    """Write per robot its estimated and reckoned path, own start frame, and its true one, world frame."""
-    from slam_backend.trajectory import Trajectory
+@contextmanager
+def live_progress(console: Console, num_steps: int, agents: Sequence[str]) -> Iterator[Callable[["Progress"], None]]:
+    """Show a bar with the figures of a running episode, and a line for each merge; yields what takes in a step."""
+    columns = (
+        TextColumn("{task.fields[time]:6.1f} s"), BarColumn(20), TextColumn("E {task.fields[errors]} m"),
+        TextColumn("{task.fields[coverage]:2.0f} % seen"), TextColumn("{task.fields[groups]} maps"),
+        TimeRemainingColumn(),
+    )  # fmt: skip
+    with Bar(*columns, console=console) as bar:
+        task = bar.add_task("run", total=num_steps, time=0.0, errors="-", coverage=0.0, groups=len(agents))
 
-    for robot in range(len(record.infos)):
-        for kind, paths in (
-            ("estimate", record.estimated), ("dead_reckoning", record.reckoned), ("truth", record.true_poses)
-        ):  # fmt: skip
-            folder.write_trajectory(f"robot{robot}_{kind}", Trajectory(record.times, paths[robot]))
+        def show(progress: "Progress") -> None:
+            for merge in progress.new_merges:
+                console.print(describe(merge))
+            if progress.step % REFRESH_STEPS == 0:
+                infos = [progress.infos[agent] for agent in agents]
+                bar.update(
+                    task, completed=progress.step, time=progress.time,
+                    errors=" ".join(f"{info['map_error']:.2f}" for info in infos),
+                    coverage=100.0 * infos[0]["coverage"], groups=len({info["group"] for info in infos}),
+                )  # fmt: skip
+
+        yield show
+
+
+def describe(merge: "MergeRecord") -> str:
+    """Describe a merge in one line."""
+    sides = [", ".join(map(str, side)) for side in (merge.robots_a, merge.robots_b)]
+    off = f"off by {merge.error_m:.2f} m, {merge.error_deg:.1f} deg"
+    return f"{merge.time:6.1f} s  maps of {sides[0]} and {sides[1]} merged on {merge.landmarks} landmarks, {off}"

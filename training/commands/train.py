@@ -1,45 +1,35 @@
 """The command `vslam train`: one network learns to choose goals for all robots; curves, checkpoints, a model."""
 
+import os
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
 
-from training.commands._options import Config, Json, Out, Seed
-from training.commands._run_folder import begin, choose, finish
+from training.commands._options import options
+from training.commands._run_folder import Call
 from training.experiments.compilation import prepare
+from training.rl.config import SPLIT_TRAIN, TrainConfig, require_extra
 
 if TYPE_CHECKING:  # what computes is imported when the command runs, so that --help answers at once
-    from training.experiments.run_folder import RunFolder
     from training.rl.callbacks import Row
-    from training.rl.config import TrainConfig
     from training.rl.trainer import Training
 
-COMMAND = "train"
 
-
+@options(TrainConfig, "train")
 def train(
-    preset: Annotated[str | None, typer.Option(help="quick or smoke.", show_default="quick")] = None,
-    world: Annotated[
-        str | None, typer.Option(help="A family or a path; see vslam worlds list.", show_default="office")
-    ] = None,
-    robots: Annotated[int | None, typer.Option(help="How many, 1 to 8.", show_default="3")] = None,
-    steps: Annotated[int | None, typer.Option(help="Decisions of all robots together.", show_default="64800")] = None,
-    envs: Annotated[int | None, typer.Option(help="Environments side by side.", show_default="16")] = None,
+    call: Call[TrainConfig],
     workers: Annotated[
         int | None,
         typer.Option(help="Processes that step them; 0: this one. Weights do not depend on it.", show_default="cores"),
     ] = None,
     device: Annotated[str, typer.Option(help="cpu, or cuda for the updates of the network.")] = "cpu",
-    seed: Seed = None,
-    out: Out = None,
     resume: Annotated[
         Path | None,
         typer.Option(help="Run folder of a training that stopped: go on as if it had not.", show_default=False),
     ] = None,
-    json: Json = None,
-    config: Config = None,
 ) -> None:
     """Train one network for all robots by PPO with masked goal actions; play it with vslam run --policy FOLDER.
 
@@ -52,52 +42,46 @@ def train(
     """
     from slam_backend.core.validation import bad_argument, check_int
     from training.experiments.run_folder import RunFolder, installed_versions, read_config
-    from training.rl.config import SPLIT_TRAIN, TrainConfig
-    from training.rl.require_extra import need_learner
 
-    need_learner()
+    require_extra()
     from training.rl.trainer import Training, check_device, kept_of
     from training.vec_env import load_kernels
 
-    given = {"preset": preset, "world": world, "robots": robots, "steps": steps, "envs": envs, "seed": seed}
     if workers is not None:
         check_int("workers", workers, 0, "Use 0 for none, or a number of processes.")
     check_device(device)
     if resume is None:
-        chosen = choose(TrainConfig, COMMAND, given, config=config, json=json, out=out)
+        chosen = call.config
     else:
-        others = [name for name, value in {**given, "out": out, "config": config}.items() if value is not None]
+        others = [*call.given, *(name for name, value in (("out", call.out), ("config", call.file)) if value)]
         if others:
             cure = "A training goes on with its own; --workers, --device and --json may be given."
             raise bad_argument("resume", "no other options that decide the training", others, cure)
-        values, kept_seed = read_config(resume, COMMAND, "resume")
-        chosen = TrainConfig.from_mapping(values | {"seed": kept_seed})
+        values, seed = read_config(resume, call.command, "resume")
+        chosen = TrainConfig.from_mapping(values | {"seed": seed})
         kept = kept_of(resume, chosen)  # what is wrong with it shows before anything is compiled
     crew = default_workers(chosen) if workers is None else workers
     if resume is None:
         # A bad world shows before there is a folder.
-        console, folder = begin(COMMAND, chosen, out, lambda: load_kernels(chosen.make_env_config(SPLIT_TRAIN)))
+        call.begin(lambda: load_kernels(chosen.make_env_config(SPLIT_TRAIN)))
     else:
         prepare()
-        folder = RunFolder(resume, COMMAND, chosen.to_mapping(), chosen.seed, installed_versions())
-        console = Console()
-    training = Training(chosen, folder.path, crew, device)
+        call.folder = RunFolder(resume, call.command, chosen.to_mapping(), chosen.seed, installed_versions())
+    training = Training(chosen, call.folder.path, crew, device)
     try:
         if resume is not None:
             training.restore(kept)
-        complete, seconds = _run_live(console, training)
-        _finish(console, folder, training, complete, seconds, json)
+        complete, seconds = _run_live(call.console, training)
+        _finish(call, training, complete, seconds)
     except KeyboardInterrupt:
-        _tell_how_to_go_on(console, folder.path)
+        _tell_how_to_go_on(call.console, call.folder.path)
         raise
     finally:
         training.close()
 
 
-def default_workers(config: "TrainConfig") -> int:
+def default_workers(config: TrainConfig) -> int:
     """Return how many processes step the environments if nobody says it: the cores, at most one per environment."""
-    import os
-
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return 0 if cores == 1 else min(cores, config.envs)
 
@@ -110,24 +94,19 @@ def _run_live(console: Console, training: "Training") -> tuple[bool, float]:
     """
     import time
     from contextlib import ExitStack
-    from functools import partial
 
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
     from training.experiments.interrupt import interrupt_flag
 
     columns = (
-        TextColumn("{task.completed:,.0f} of {task.total:,.0f}"),
-        BarColumn(None),
-        TextColumn("{task.fields[told]}"),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-    )
+        TextColumn("{task.completed:,.0f} of {task.total:,.0f}"), BarColumn(None), TextColumn("{task.fields[told]}"),
+        TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(),
+    )  # fmt: skip
     config, begin = training.config, time.perf_counter()
     total, done = config.updates * config.rollout, len(training.rows) * config.rollout
     if done >= total:
-        console.print("This training is complete already.", highlight=False)
+        console.print("This training is complete already.")
         return True, 0.0
     with ExitStack() as stack:
         bar = stack.enter_context(Progress(*columns, console=console, expand=True, speed_estimate_period=300.0))
@@ -143,7 +122,7 @@ def _run_live(console: Console, training: "Training") -> tuple[bool, float]:
         training.watch.listen(on_update, interrupted, lambda decisions: bar.update(task, completed=decisions))
         complete = training.run()
     if not complete:
-        console.print("Stopped; the checkpoint holds all until here.", highlight=False)
+        console.print("Stopped; the checkpoint holds all until here.")
     return complete, time.perf_counter() - begin
 
 
@@ -152,27 +131,23 @@ def _told(row: "Row") -> str:
     return f"return {row['return']:.2f}, E {row['map_error']:.2f} m, recall {row['map_recall']:.2f}"
 
 
-def _finish(
-    console: Console, folder: "RunFolder", training: "Training", complete: bool, seconds: float, json: Path | None
-) -> None:
+def _finish(call: Call[TrainConfig], training: "Training", complete: bool, seconds: float) -> None:
     """Write and show what the training led to."""
-    from training.rl.curves import ends_of, to_csv
-    from training.rl.figures import draw_learning
+    from training.rl.curves import draw_learning, ends_of, to_csv
 
-    rows = training.rows
+    rows, console, folder = training.rows, call.console, call.folder
     folder.write_text("curves.csv", to_csv(rows))
     draw_learning(folder.path / "learning.png", rows)
     ends: dict[str, Any] = ends_of(rows)
-    metrics = {"complete": complete, "decisions": int(rows[-1]["steps"]), "seconds_this_time": seconds, **ends}
     first, last = ends["first"], ends["last"]
     console.print(
         f"Return of the first tenth {first['return']:.3f}, of the last {last['return']:.3f}; "
-        f"map error {first['map_error']:.3f} m, {last['map_error']:.3f} m.",
-        highlight=False,
+        f"map error {first['map_error']:.3f} m, {last['map_error']:.3f} m."
     )
-    finish(console, folder, folder.write_metrics(metrics), json)
+    call.write({"complete": complete, "decisions": int(rows[-1]["steps"]), "seconds_this_time": seconds, **ends})
+    call.finish()
     if complete:
-        console.print(f"Next: vslam evaluate {folder.path}", soft_wrap=True, highlight=False)
+        console.print(f"Next: vslam evaluate {folder.path}", soft_wrap=True)
     else:
         _tell_how_to_go_on(console, folder.path)
 
@@ -184,4 +159,4 @@ def _tell_how_to_go_on(console: Console, folder: Path) -> None:
     text = "Stopped before the first checkpoint: nothing was saved."
     if (folder / CHECKPOINT_FILE).is_file():
         text = f"Go on: vslam train --resume {folder}"
-    console.print(text, soft_wrap=True, highlight=False)
+    console.print(text, soft_wrap=True)

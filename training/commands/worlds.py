@@ -16,9 +16,7 @@ Robots = Annotated[int, typer.Option(help="How many robots start.")]
 
 
 @worlds.command("list")
-def list_worlds(
-    seeds: Annotated[int, typer.Option(help="Worlds of each family that are measured.")] = 5,
-) -> None:
+def list_worlds(seeds: Annotated[int, typer.Option(help="Worlds of each family that are measured.")] = 5) -> None:
     """Name the families of worlds with their usual size."""
     from rich.table import Table
 
@@ -32,28 +30,22 @@ def list_worlds(
         found = [survey(name, seed) for seed in range(seeds)]
         what = (sys.modules[maker.__module__].__doc__ or "").split("\n")[0].rstrip(".")
         table.add_row(
-            name,
-            what,
-            _span([world.walls for world in found]),
-            _span([world.landmarks for world in found]),
+            name, what, _span([world.walls for world in found]), _span([world.landmarks for world in found]),
             f"{_span([round(world.floor_m2) for world in found])} m²",
             f"{_span([round(world.width_m) for world in found])} x {_span([round(w.height_m) for w in found])} m",
-        )
-    console = Console()
+        )  # fmt: skip
+    console = Console(highlight=False)
     console.print(table)
     for split, (first, end) in SPLITS.items():
-        console.print(f"{split}: world seeds {first} to {end - 1}", highlight=False)
-    console.print("Also paths: .png .jpg .pgm .yaml (ROS) .json, or a folder of these.", highlight=False)
+        console.print(f"{split}: world seeds {first} to {end - 1}")
+    console.print("Also paths: .png .jpg .pgm .yaml (ROS) .json, or a folder of these.")
 
 
 @worlds.command("preview")
 def preview(
-    world: Source,
-    out: Annotated[Path, typer.Option(help="PNG file to write.")] = Path("worlds.png"),
-    first_seed: FirstSeed = 0,
-    seeds: Seeds = 4,
-    robots: Robots = 3,
-) -> None:
+    world: Source, out: Annotated[Path, typer.Option(help="PNG file to write.")] = Path("worlds.png"),
+    first_seed: FirstSeed = 0, seeds: Seeds = 4, robots: Robots = 3,
+) -> None:  # fmt: skip
     """Draw worlds of some seeds, with landmarks and start poses, into one picture."""
     import imageio.v3 as imageio
 
@@ -68,16 +60,11 @@ def preview(
     with compilation_shown(Console(stderr=True)):
         picture = contact_sheet(world, first_seed, seeds, robots)
     write_file(out, imageio.imwrite("<bytes>", picture, extension=".png"), "out")
-    Console().print(f"Picture: {out}", soft_wrap=True, highlight=False)
+    Console(highlight=False).print(f"Picture: {out}", soft_wrap=True)
 
 
 @worlds.command("validate")
-def validate(
-    world: Source,
-    first_seed: FirstSeed = 0,
-    seeds: Seeds = 20,
-    robots: Robots = 3,
-) -> None:
+def validate(world: Source, first_seed: FirstSeed = 0, seeds: Seeds = 20, robots: Robots = 3) -> None:
     """Build worlds of some seeds and start robots in them; a world in which that fails ends with exit status 2."""
     from rich.table import Table
 
@@ -126,7 +113,7 @@ def import_world(
     save_walls_json(traced, out)
     x_min, y_min, x_max, y_max = traced.bounds
     size = f"{x_max - x_min:.1f} x {y_max - y_min:.1f} m"
-    Console().print(f"{out}: {len(traced.walls)} walls, {size}", soft_wrap=True, highlight=False)
+    Console(highlight=False).print(f"{out}: {len(traced.walls)} walls, {size}", soft_wrap=True)
 
 
 def _span(values: list[int]) -> str:

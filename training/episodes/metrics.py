@@ -7,9 +7,8 @@ import numpy as np
 
 from slam_backend.geometry import compose, transform_points
 from slam_backend.metrics import align_se2, ate, map_rmse
-from training.episodes.attempt_tables import pair_rows
-from training.episodes.consistency_table import consistency_rows
 from training.episodes.runner import EpisodeRecord, is_false_merge
+from training.episodes.tables import consistency_rows, pair_rows
 
 
 def score_episode(record: EpisodeRecord) -> dict[str, Any]:
@@ -26,57 +25,35 @@ def score_episode(record: EpisodeRecord) -> dict[str, Any]:
     """
     robots = [_score_robot(record, robot) for robot in range(len(record.infos))]
     return {
-        "robots": robots,
-        "team": {key: _mean([robot[key] for robot in robots]) for key in robots[0] if key != "robot"},
+        "robots": robots, "team": {key: _mean([robot[key] for robot in robots]) for key in robots[0] if key != "robot"},
         "merges": [
             merge_row(
-                merge.tick,
-                merge.time,
-                merge.robots_a,
-                merge.robots_b,
-                merge.landmarks,
-                merge.error_m,
-                merge.error_deg,
+                merge.tick, merge.time, merge.robots_a, merge.robots_b, merge.landmarks, merge.error_m, merge.error_deg,
                 merge.undone,
             )
             for merge in record.merges
         ],
-        "attempts": record.attempts,
-        "refusals": pair_rows(record.pairs, record.groups),
-        "groups": record.groups,
-        "coverage": float(record.coverage[-1]),
-        "duration_s": float(record.times[-1]),
-        "complete": record.complete,
+        "attempts": record.attempts, "refusals": pair_rows(record.pairs, record.groups), "groups": record.groups,
+        "coverage": float(record.coverage[-1]), "duration_s": float(record.times[-1]), "complete": record.complete,
         "consistency": consistency_rows(range(len(robots)), record.consistency),
-    }
+    }  # fmt: skip
 
 
 def merge_row(
-    step: int,
-    time: float,
-    robots_a: Sequence[int],
-    robots_b: Sequence[int],
-    landmarks: int,
-    error_m: float,
-    error_deg: float,
-    undone: float | None,
-) -> dict[str, Any]:
+    step: int, time: float, robots_a: Sequence[int], robots_b: Sequence[int], landmarks: int, error_m: float,
+    error_deg: float, undone: float | None,
+) -> dict[str, Any]:  # fmt: skip
     """Return one entry of `merges`, the same for runs and replays.
 
     `step` counts the steps of the filters, which are the ticks of a run; `landmarks` is how many were shared; `false`
     is None where the errors are NaN, `undone_s` where the merge is in force.
     """
     return {
-        "step": step,
-        "time_s": round(time, 3),
-        "robots_a": list(robots_a),
-        "robots_b": list(robots_b),
-        "landmarks": landmarks,
-        "error_m": error_m,
-        "error_deg": error_deg,
+        "step": step, "time_s": round(time, 3), "robots_a": list(robots_a), "robots_b": list(robots_b),
+        "landmarks": landmarks, "error_m": error_m, "error_deg": error_deg,
         "false": is_false_merge(error_m, error_deg) if np.isfinite(error_m) else None,
         "undone_s": None if undone is None else round(undone, 3),
-    }
+    }  # fmt: skip
 
 
 def _mean(values: list[float]) -> float:
@@ -104,17 +81,10 @@ def _score_robot(record: EpisodeRecord, robot: int) -> dict[str, float]:
     length = float(info["distance"])
     end_error = float(np.hypot(*(reckoned[-1] - truth[-1])[:2]))
     return {
-        "robot": robot,
-        "ate_aligned_m": own.aligned,
-        "ate_start_m": own.start,
-        "dead_reckoning_ate_aligned_m": odometry.aligned,
-        "dead_reckoning_ate_start_m": odometry.start,
-        "dead_reckoning_end_percent": 100.0 * end_error / length if length > 0.0 else 0.0,
-        "path_m": length,
-        "map_rmse_m": float(info["map_rmse"]),
-        "map_rmse_start_m": float(info["map_rmse"]),
-        "map_rmse_aligned_m": _aligned_rmse(record, robot),
-        "map_recall": float(info["map_recall"]),
-        "map_precision": float(info["map_precision"]),
-        "map_error": float(info["map_error"]),
-    }
+        "robot": robot, "ate_aligned_m": own.aligned, "ate_start_m": own.start,
+        "dead_reckoning_ate_aligned_m": odometry.aligned, "dead_reckoning_ate_start_m": odometry.start,
+        "dead_reckoning_end_percent": 100.0 * end_error / length if length > 0.0 else 0.0, "path_m": length,
+        "map_rmse_m": float(info["map_rmse"]), "map_rmse_start_m": float(info["map_rmse"]),
+        "map_rmse_aligned_m": _aligned_rmse(record, robot), "map_recall": float(info["map_recall"]),
+        "map_precision": float(info["map_precision"]), "map_error": float(info["map_error"]),
+    }  # fmt: skip

@@ -28,27 +28,16 @@ def is_false_merge(error_m: float, error_deg: float) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class MergeRecord:
-    """One merge, compared with the truth.
+    """One merge, compared with the truth."""
 
-    Attributes:
-        tick: Ticks since the reset.
-        time: Since the reset [s].
-        robots_a: The group whose map frame stayed.
-        robots_b: The other group.
-        landmarks: How many landmarks of either map were believed to be the same.
-        error_m: Of the translation between the two map frames [m].
-        error_deg: Of the rotation between them, >= 0 [degrees].
-        undone: When the team took it back [s]; None: it is in force.
-    """
-
-    tick: int
-    time: float
-    robots_a: tuple[int, ...]
-    robots_b: tuple[int, ...]
-    landmarks: int
-    error_m: float
-    error_deg: float
-    undone: float | None = None
+    tick: int  # Ticks since the reset
+    time: float  # Since the reset [s]
+    robots_a: tuple[int, ...]  # The group whose map frame stayed
+    robots_b: tuple[int, ...]  # The other group
+    landmarks: int  # How many landmarks of either map were believed to be the same
+    error_m: float  # Of the translation between the two map frames [m]
+    error_deg: float  # Of the rotation between them, >= 0 [degrees]
+    undone: float | None = None  # When the team took it back [s]; None: it is in force
 
     @property
     def is_false(self) -> bool:
@@ -58,85 +47,52 @@ class MergeRecord:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EpisodeRecord:
-    """What happened in an episode of K robots and T steps.
+    """What happened in an episode of K robots and T steps."""
 
-    Attributes:
-        times: (T + 1,) float64 [s]. Of the reset and of each step.
-        true_poses: (K, T + 1, 3) float64 [m, m, rad], world frame.
-        estimated: (K, T + 1, 3) float64 [m, m, rad]. What each robot believed at the time, own start frames.
-        reckoned: (K, T + 1, 3) float64 [m, m, rad]. Its odometry alone, own start frames.
-        map_errors: (K, T + 1) float64 [m].
-        coverage: (T + 1,) float64 [-].
-        merges: In order.
-        attempts: How often two maps were compared.
-        pairs: Outcome of these attempts, by pairs of groups.
-        groups: The robots that share a map at the end.
-        infos: Per robot its last info.
-        own_maps: Per robot its map just before its first merge, own start frame; the last map if it never merged.
-        alone_until: Per robot the time of that merge [s], or None.
-        map_claims: Per robot the true landmark (n,) int64 behind each one of its map, as `map_rmse` reads claims.
-        maps: Per robot its map at the end, own start frame.
-        true_landmarks: (N, 3) float64 [m], world frame.
-        consistency: Per robot whether its filter at the end errs as little as it claims.
-        scene: The last picture: truth and maps in the world frame.
-        complete: Whether the episode ran to its end.
-    """
-
-    times: FloatArray
-    true_poses: FloatArray
-    estimated: FloatArray
-    reckoned: FloatArray
-    map_errors: FloatArray
-    coverage: FloatArray
-    merges: tuple[MergeRecord, ...]
-    attempts: int
-    pairs: tuple[PairAttempts, ...]
-    groups: tuple[tuple[int, ...], ...]
-    infos: tuple[Mapping[str, Any], ...]
+    times: FloatArray  # (T + 1,) float64 [s]. Of the reset and of each step.
+    true_poses: FloatArray  # (K, T + 1, 3) float64 [m, m, rad], world frame
+    estimated: FloatArray  # (K, T + 1, 3) float64 [m, m, rad]. What each robot believed at the time, own start frames.
+    reckoned: FloatArray  # (K, T + 1, 3) float64 [m, m, rad]. Its odometry alone, own start frames.
+    map_errors: FloatArray  # (K, T + 1) float64 [m]
+    coverage: FloatArray  # (T + 1,) float64 [-]
+    merges: tuple[MergeRecord, ...]  # In order
+    attempts: int  # How often two maps were compared
+    pairs: tuple[PairAttempts, ...]  # Outcome of these attempts, by pairs of groups
+    groups: tuple[tuple[int, ...], ...]  # The robots that share a map at the end
+    infos: tuple[Mapping[str, Any], ...]  # Per robot its last info
+    # Per robot its map just before its first merge, own start frame; the last map if it never merged
     own_maps: tuple[LandmarkMap, ...]
-    alone_until: tuple[float | None, ...]
+    alone_until: tuple[float | None, ...]  # Per robot the time of that merge [s], or None
+    # Per robot the true landmark (n,) int64 behind each one of its map, as `map_rmse` reads claims
     map_claims: tuple[IntArray, ...]
-    maps: tuple[LandmarkMap, ...]
-    true_landmarks: FloatArray
-    consistency: tuple[Consistency, ...]
-    scene: Scene
-    complete: bool
+    maps: tuple[LandmarkMap, ...]  # Per robot its map at the end, own start frame
+    true_landmarks: FloatArray  # (N, 3) float64 [m], world frame
+    consistency: tuple[Consistency, ...]  # Per robot whether its filter at the end errs as little as it claims
+    scene: Scene  # The last picture: truth and maps in the world frame
+    complete: bool  # Whether the episode ran to its end
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Progress:
-    """How far an episode is.
+    """How far an episode is."""
 
-    Attributes:
-        step: Steps done; 0 after the reset.
-        time: Since the reset [s].
-        infos: Of all agents, as the environment gave them.
-        new_merges: Merges of this step.
-        rewards: Of all agents for this step; none after the reset.
-    """
-
-    step: int
-    time: float
-    infos: Mapping[str, Mapping[str, Any]]
-    new_merges: tuple[MergeRecord, ...]
-    rewards: Mapping[str, float] = field(default_factory=dict)
+    step: int  # Steps done; 0 after the reset
+    time: float  # Since the reset [s]
+    infos: Mapping[str, Mapping[str, Any]]  # Of all agents, as the environment gave them
+    new_merges: tuple[MergeRecord, ...]  # Merges of this step
+    rewards: Mapping[str, float] = field(default_factory=dict)  # Of all agents for this step; none after the reset
 
 
 def run_episode(
-    env: ExplorationEnv,
-    policies: Mapping[str, Policy],
-    seed: int,
-    on_step: Callable[[Progress], None] = lambda progress: None,
-    should_stop: Callable[[], bool] = lambda: False,
-) -> EpisodeRecord:
+    env: ExplorationEnv, policies: Mapping[str, Policy], seed: int,
+    on_step: Callable[[Progress], None] = lambda progress: None, should_stop: Callable[[], bool] = lambda: False,
+) -> EpisodeRecord:  # fmt: skip
     """Run one episode to its end, or until `should_stop`.
 
     Args:
-        env: A parallel environment, unwrapped.
         policies: One for each agent; they see observations and beliefs, never infos.
         seed: Of the environment's reset and of the policies' draws, which are independent streams.
         on_step: Called after the reset and after each step; the environment may be looked at.
-        should_stop: Asked after each step.
 
     Raises:
         ValueError: If an agent has no policy.
@@ -214,26 +170,18 @@ class _Log:
         last = {robot: self._env.belief(agent) for robot, agent in enumerate(self._agents)}
         maps = {**self._maps, **{r: belief.map for r, belief in last.items() if r not in self._alone_until}}
         return EpisodeRecord(
-            times=ticks * TICK,
-            true_poses=np.stack(self._true, axis=1),
-            estimated=np.stack(self._estimated, axis=1),
-            reckoned=np.stack(reckoned),
-            map_errors=np.array(self._errors).T,
-            coverage=np.array(self._coverage),
-            merges=tuple(self._merges),
-            attempts=sum(event.kind == "attempt" for event in self._env.events),
-            pairs=count_attempts(self._env.events),
-            groups=tuple(sorted({belief.group for belief in last.values()})),
+            times=ticks * TICK, true_poses=np.stack(self._true, axis=1), estimated=np.stack(self._estimated, axis=1),
+            reckoned=np.stack(reckoned), map_errors=np.array(self._errors).T, coverage=np.array(self._coverage),
+            merges=tuple(self._merges), attempts=sum(event.kind == "attempt" for event in self._env.events),
+            pairs=count_attempts(self._env.events), groups=tuple(sorted({belief.group for belief in last.values()})),
             infos=tuple(dict(self._infos[agent]) for agent in self._agents),
             own_maps=tuple(maps[robot] for robot in range(len(self._agents))),
             alone_until=tuple(self._alone_until.get(robot) for robot in range(len(self._agents))),
             map_claims=tuple(self._env.episode.ledger.claims(robot, own.map.ids) for robot, own in last.items()),
-            maps=tuple(own.map for own in last.values()),
-            true_landmarks=self._env.true_landmarks,
-            consistency=tuple(map(self._env.episode.belief.consistency, last)),
-            scene=self._env.scene(),
+            maps=tuple(own.map for own in last.values()), true_landmarks=self._env.true_landmarks,
+            consistency=tuple(map(self._env.episode.belief.consistency, last)), scene=self._env.scene(),
             complete=not self._env.agents,
-        )
+        )  # fmt: skip
 
     def _enter(self, infos: Mapping[str, Mapping[str, Any]], tick: int) -> None:
         self._infos = infos
@@ -254,11 +202,7 @@ class _Log:
         truth = between(self._starts[min(event.robots_a)], self._starts[min(event.robots_b)])
         error = between(truth, event.alignment.transform)
         return MergeRecord(
-            tick=event.step,
-            time=event.step * TICK,
-            robots_a=event.robots_a,
-            robots_b=event.robots_b,
-            landmarks=len(event.alignment.inliers),
-            error_m=float(np.hypot(error[0], error[1])),
+            tick=event.step, time=event.step * TICK, robots_a=event.robots_a, robots_b=event.robots_b,
+            landmarks=len(event.alignment.inliers), error_m=float(np.hypot(error[0], error[1])),
             error_deg=float(abs(np.degrees(error[2]))),
-        )
+        )  # fmt: skip

@@ -1,35 +1,43 @@
-"""The tables that a run ends with."""
+"""What runs and replays end with: rows of `metrics.json` about merges and consistency, tables, and maps as data."""
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.table import Table
 
-from training.episodes.attempt_tables import print_refusals
 from training.experiments.tables import console_table, number
+
+if TYPE_CHECKING:  # what computes is imported when the command runs, so that --help answers at once
+    from slam_backend.fastslam.consistency import Consistency
+    from slam_backend.maps.alignment_types import PairAttempts
+    from slam_backend.maps.landmark_map import LandmarkMap
+    from training.experiments.run_folder import RunFolder
 
 ROWS = (
     ("map error E [m], errors cut at 1 m", "map_error", 3, 1.0),
-    ("map RMSE of matched landmarks [m]", "map_rmse_m", 3, 1.0),
-    ("recall [%]", "map_recall", 1, 100.0),
-    ("precision [%]", "map_precision", 1, 100.0),
-    ("ATE, aligned [m]", "ate_aligned_m", 3, 1.0),
-    ("   odometry's [m]", "dead_reckoning_ate_aligned_m", 3, 1.0),
-    ("ATE, start frame [m]", "ate_start_m", 3, 1.0),
-    ("   odometry's [m]", "dead_reckoning_ate_start_m", 3, 1.0),
-    ("path [m]", "path_m", 1, 1.0),
+    ("map RMSE of matched landmarks [m]", "map_rmse_m", 3, 1.0), ("recall [%]", "map_recall", 1, 100.0),
+    ("precision [%]", "map_precision", 1, 100.0), ("ATE, aligned [m]", "ate_aligned_m", 3, 1.0),
+    ("   odometry's [m]", "dead_reckoning_ate_aligned_m", 3, 1.0), ("ATE, start frame [m]", "ate_start_m", 3, 1.0),
+    ("   odometry's [m]", "dead_reckoning_ate_start_m", 3, 1.0), ("path [m]", "path_m", 1, 1.0),
     ("odometry's last error [% of path]", "dead_reckoning_end_percent", 1, 1.0),
-)
+)  # fmt: skip
+
+MISSED = {
+    "translation": "The standard deviation of the translation was beyond its bound.",
+    "rotation": "The standard deviation of the rotation was beyond its bound.",
+    "one match": "Leaving one match out would have moved the result by more than its bound.",
+    "paths": "The robots' paths from their starts left the motion between these open by more than its bound.",
+    "repeat": "Two trials in a row found motions that differ by more than their bound.",
+}
+COLUMNS = ("robot", "mean NIS", "NIS beyond 95 %", "few particles", "mostly rejected", "verdict")
+CAUTIOUS = 1.0  # mean NIS below which covariances are at least twice as large as they need be, even in the plane
+UPPER = ("xx", "xy", "xz", "yy", "yz", "zz")
+MAP_COLUMNS = ("id", "count", "x_m", "y_m", "z_m", *(f"cov_{pair}_m2" for pair in UPPER))
 
 
 def print_tables(console: Console, metrics: Mapping[str, Any]) -> None:
-    """Print robots and team, then the merges.
-
-    Args:
-        console: Where to.
-        metrics: As `score_episode` names them; None stands for what is not known.
-    """
+    """Print robots and team, then the merges."""
     columns = {f"robot {robot}": row for robot, row in enumerate(metrics["robots"])} | {"team": metrics["team"]}
     rows = [
         [label, *(number(row[key], digits, factor) for row in columns.values())] for label, key, digits, factor in ROWS
@@ -43,8 +51,7 @@ def print_tables(console: Console, metrics: Mapping[str, Any]) -> None:
     groups = "; ".join(", ".join(map(str, group)) for group in metrics["groups"])
     console.print(
         f"Groups at the end: {groups}.  Floor seen: {metrics['coverage']:.1%} in {metrics['duration_s']:.0f} s.  "
-        f"Alignments tried: {metrics['attempts']}.",
-        highlight=False,
+        f"Alignments tried: {metrics['attempts']}."
     )
 
 
@@ -60,3 +67,142 @@ def _merges(rows: list[Mapping[str, Any]]) -> Table:
             verdict += f"{', ' if verdict else ''}undone at {row['undone_s']:.1f} s"
         cells.append([f"{row['time_s']:.1f}", *sides, str(row["landmarks"]), *errors, verdict])
     return console_table("Merges, against the true motion between the start poses", headings, cells)
+
+
+def pair_rows(
+    pairs: "Sequence[PairAttempts] | None", groups: Sequence[Sequence[int]], names: Sequence[int] | None = None
+) -> list[dict[str, Any]]:
+    """Return one row for each pair of groups that tried, and for each pair of groups at the end that never did.
+
+    `apart` says whether the two share no map at the end; `last_step` counts the steps of the filters.
+
+    Args:
+        names: Number of each robot; None: its index.
+    """
+    if pairs is None:
+        return []
+    group_of = {robot: group for group in groups for robot in group}
+
+    def named(robots: Sequence[int]) -> list[int]:
+        return [robot if names is None else names[robot] for robot in robots]
+
+    rows = [
+        {
+            "robots_a": named(pair.robots_a), "robots_b": named(pair.robots_b), "attempts": pair.attempts,
+            "refused": dict(pair.refusals), "last_reason": pair.last_reason, "last_step": pair.last_step,
+            "missed": pair.missed, "excess": pair.excess,
+            "apart": group_of[pair.robots_a[0]] != group_of[pair.robots_b[0]],
+        }
+        for pair in pairs
+    ]  # fmt: skip
+    tried = {frozenset((group_of[pair.robots_a[0]], group_of[pair.robots_b[0]])) for pair in pairs}
+    for i, one in enumerate(groups):
+        for other in groups[i + 1 :]:
+            if frozenset((one, other)) not in tried:
+                rows.append(_never_tried(named(one), named(other)))
+    return rows
+
+
+def print_refusals(console: Console, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Print how often each pair tried and why it was refused, and what helps those that are apart at the end."""
+    from slam_backend.maps.alignment_types import HINTS
+
+    told = [row for row in rows if row["refused"] or not row["attempts"]]
+    if not told:
+        return
+    cells = []
+    for row in told:
+        sides = [", ".join(map(str, row[side])) for side in ("robots_a", "robots_b")]
+        reasons = ", ".join(f"{reason} ({count})" for reason, count in row["refused"].items())
+        cells.append([*sides, str(row["attempts"]), reasons, _last(row), "apart" if row["apart"] else "one map"])
+    title = "Refused attempts to merge maps (and by what factor a bound was missed)"
+    headings = ("robots", "with", "attempts", "refused as", "last", "at the end")
+    console.print(console_table(title, headings, cells))
+    for reason in dict.fromkeys(row["last_reason"] for row in told if row["apart"] and row["last_reason"]):
+        console.print(f"{reason}: {HINTS[reason]}")
+    for missed in dict.fromkeys(row["missed"] for row in told if row["apart"] and row["missed"]):
+        console.print(f"{missed}: {MISSED[missed]}")
+    if any(not row["attempts"] for row in told):
+        console.print(f"never tried: The robots were out of contact, or: {HINTS['too few candidates']}")
+
+
+def _last(row: Mapping[str, Any]) -> str:
+    """Tell of the last refusal of a pair."""
+    if row["last_step"] is None:
+        return "never tried"
+    told = f"{row['last_reason']} at step {row['last_step']}"
+    if row["missed"]:
+        factor = "" if row["excess"] is None else f" {row['excess']:.1f}"
+        told += f" ({row['missed']}{factor})"
+    return told
+
+
+def _never_tried(robots_a: list[int], robots_b: list[int]) -> dict[str, Any]:
+    """Return the row of two groups that are apart and were never compared."""
+    return {
+        "robots_a": robots_a, "robots_b": robots_b, "attempts": 0, "refused": {}, "last_reason": "", "last_step": None,
+        "missed": "", "excess": float("nan"), "apart": True,
+    }  # fmt: skip
+
+
+def consistency_rows(robots: Iterable[int], reports: Iterable["Consistency"]) -> list[dict[str, Any]]:
+    """Return the entry `consistency` of `metrics.json`, one row for each robot, under these numbers."""
+    return [{"robot": robot} | report.to_mapping() for robot, report in zip(robots, reports, strict=True)]
+
+
+def print_consistency(console: Console, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Print what `consistency_rows` gave, NaN as None; each warning in words, once."""
+    cells = []
+    for row in rows:
+        shares = (f"{100.0 * row[key]:.1f} %" for key in ("nis_share", "ess_share", "rejected_share"))
+        cells.append([str(row["robot"]), number(row["nis_mean"]), *shares, _verdict(row)])
+    title = "Consistency: do filters err as little as they claim? (shares of frames)"
+    console.print(console_table(title, COLUMNS, cells))
+    texts: dict[str, list[str]] = {}
+    for row in rows:
+        for warning in row["warnings"]:
+            texts.setdefault(warning["text"], []).append(str(row["robot"]))
+    for text, robots in texts.items():
+        console.print(f"Warning, robot {', '.join(robots)}: {text}")
+
+
+def _verdict(row: Mapping[str, Any]) -> str:
+    """Return what the row comes to, in a word or two."""
+    if row["warnings"]:
+        return "inconsistent"
+    is_cautious = row["nis_mean"] is not None and row["nis_mean"] < CAUTIOUS
+    return "cautious" if is_cautious else "no objection"
+
+
+def group_name(robots: Sequence[int]) -> str:
+    """Return the name of a group in file names.
+
+    >>> group_name((2, 5))
+    '2-5'
+    """
+    return "-".join(map(str, robots))
+
+
+def write_maps(folder: "RunFolder", maps: "Mapping[str, LandmarkMap]") -> str:
+    """Write each map as `map_<group>.npz` and `map_<group>.csv`, and return a line that says so.
+
+    Args:
+        maps: By the name of the group, each in the start frame of the group's first robot.
+    """
+    for name, landmarks in maps.items():
+        landmarks.save(folder.path / f"map_{name}.npz")
+        folder.write_text(f"map_{name}.csv", to_csv(landmarks))
+    names = ", ".join(f"map_{name}" for name in maps)
+    return f"Maps as data: {names} (.npz for LandmarkMap.load, .csv)."
+
+
+def to_csv(landmarks: "LandmarkMap") -> str:
+    """Return a map as CSV text, every number in the shortest form that reads back bit for bit; no descriptors."""
+    import numpy as np
+
+    upper = landmarks.covariances[:, *np.triu_indices(3)]
+    rows = zip(landmarks.ids, landmarks.counts, landmarks.means, upper, strict=True)
+    lines = [
+        ",".join(map(repr, [int(name), int(count), *mean.tolist(), *own.tolist()])) for name, count, mean, own in rows
+    ]
+    return "\n".join([",".join(MAP_COLUMNS), *lines]) + "\n"

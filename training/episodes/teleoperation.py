@@ -37,23 +37,14 @@ def action_of(held: set[str]) -> FloatArray:
 
 
 def drive(
-    env: ExplorationEnv,
-    screen: Screen,
-    policies: Mapping[str, Policy],
-    seed: int,
-    on_frame: Callable[[NDArray[np.uint8]], None] = lambda frame: None,
-    should_stop: Callable[[], bool] = lambda: False,
+    env: ExplorationEnv, screen: Screen, policies: Mapping[str, Policy], seed: int,
+    on_frame: Callable[[NDArray[np.uint8]], None] = lambda frame: None, should_stop: Callable[[], bool] = lambda: False,
     pace: float = TICK,
-) -> Mapping[str, Mapping[str, Any]]:
+) -> Mapping[str, Mapping[str, Any]]:  # fmt: skip
     """Run an episode in which one robot at a time goes by the keys.
 
     Args:
-        env: With continuous actions.
-        screen: Shows frames and reads keys.
         policies: For the robots that nobody drives; agents without one stand still.
-        seed: Of the episode.
-        on_frame: Called with each frame that is shown.
-        should_stop: Asked after each step.
         pace: A step takes at least this long [s].
 
     Returns:
@@ -77,13 +68,9 @@ def drive(
 
 
 def _actions(
-    env: ExplorationEnv,
-    observations: Mapping[str, Any],
-    policies: Mapping[str, Policy],
-    rngs: Mapping[str, np.random.Generator],
-    driven: int,
-    action: FloatArray,
-) -> dict[str, Any]:
+    env: ExplorationEnv, observations: Mapping[str, Any], policies: Mapping[str, Policy],
+    rngs: Mapping[str, np.random.Generator], driven: int, action: FloatArray,
+) -> dict[str, Any]:  # fmt: skip
     """Return the actions of all robots: of the keys, of a policy, or none."""
     agents: Sequence[str] = env.agents
     still = np.zeros(2)

@@ -7,6 +7,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+import cv2
 import imageio_ffmpeg
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,7 @@ from slam_backend.core.validation import bad_argument, check_float, check_int
 from slam_backend.fastslam.reports import MergeEvent
 from vslam_env.rendering import MergeFlash, Scene
 from vslam_env.rendering.merge_effect import FLASH_TICKS
+from vslam_env.sensors import EyeFrame
 
 FPS = 25
 SLOWEST_FPS = 5
@@ -24,20 +26,17 @@ SHORTEST_S = 12.0  # few frames are shown more slowly, so that an episode lasts 
 # Constant quality; larger is smaller and worse. 23 is x264's own middle, 26 still shows single dots.
 QUALITY = 26
 
+NEAR, FAR = (213, 94, 0), (0, 114, 178)  # RGB, of points 1 m and 8 m away
+DEPTHS = (1.0, 8.0)  # [m]
+
 
 @dataclass(frozen=True, slots=True)
 class Pace:
-    """Which steps of an episode become frames, and how fast these are shown.
+    """Which steps of an episode become frames, and how fast these are shown."""
 
-    Attributes:
-        stride: Every `stride`-th step is a frame.
-        fps: Frames per second of video.
-        speedup: Simulated seconds per second of video.
-    """
-
-    stride: int
-    fps: int
-    speedup: float
+    stride: int  # Every `stride`-th step is a frame
+    fps: int  # Frames per second of video
+    speedup: float  # Simulated seconds per second of video
 
 
 def choose_pace(num_steps: int, step_s: float) -> Pace:
@@ -57,7 +56,6 @@ def with_slow_flashes(scene: Scene, events: Iterable[MergeEvent], speedup: float
     """Let merges flash for as long as a viewer, not a robot, needs: ages run in the time of the video.
 
     Args:
-        scene: The scene of a step.
         events: The team's events; their `step` counts ticks as `scene.tick` does.
         speedup: Simulated seconds per second of video.
     """
@@ -71,11 +69,6 @@ class VideoWriter:
 
     It is completed also when the block is left by an exception, with the frames until then; a video without frames
     leaves no file, and neither does one that its encoder could not write.
-
-    Args:
-        path: Of the file, ending in .mp4.
-        size: Width and height [px], both even, as 4:2:0 colour demands.
-        fps: Frames per second.
 
     Raises:
         ValueError: If the path ends otherwise, its folder is missing, it cannot be written, or a number is out of
@@ -146,3 +139,39 @@ class VideoWriter:
         """Return the error of a video that its encoder could not write."""
         text = "The encoder stopped: make room on the disk, or go without a video."
         return bad_argument("path", "a file that can be written", Path(self._path), text)
+
+
+def beside_the_map(picture: NDArray[np.uint8], frame: Any, width: int) -> NDArray[np.uint8]:
+    """Return a picture (H, W + width, 3) with a robot's two images at its right.
+
+    Args:
+        frame: An `EyeFrame`; where it is none, the room stays empty.
+    """
+    height = picture.shape[0]
+    panel = np.full((height, width, 3), 24, dtype=np.uint8)
+    if isinstance(frame, EyeFrame):
+        tall = min(height // 2, round(width * frame.left.shape[0] / frame.left.shape[1]))
+        wide = round(tall * frame.left.shape[1] / frame.left.shape[0])
+        for row, image in enumerate((draw_eye(frame, (wide, tall)), _large(frame.right, (wide, tall)))):
+            panel[row * tall : (row + 1) * tall, :wide] = image
+    return np.concatenate([picture, panel], axis=1)
+
+
+def draw_eye(frame: EyeFrame, size: tuple[int, int]) -> NDArray[np.uint8]:
+    """Return the left image (h, w, 3) with circles at measured corners, coloured by depth, and their disparities."""
+    picture = _large(frame.left, size)
+    scale = size[0] / frame.left.shape[1]
+    depths = frame.measurements.points[:, 2]
+    shares = np.clip((np.log(depths) - np.log(DEPTHS[0])) / np.log(DEPTHS[1] / DEPTHS[0]), 0.0, 1.0)
+    for (column, row, disparity), share in zip(frame.seen.pixels.tolist(), shares.tolist(), strict=True):
+        colour = tuple(round(near + share * (far - near)) for near, far in zip(NEAR, FAR, strict=True))
+        x, y = (round(16.0 * (scale * (value + 0.5) - 0.5)) for value in (column, row))
+        cv2.line(picture, (x, y), (x - round(16.0 * scale * disparity), y), colour, 1, cv2.LINE_AA, 4)
+        cv2.circle(picture, (x, y), 4 * 16, colour, 2, cv2.LINE_AA, 4)
+    return picture
+
+
+def _large(image: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
+    """Return a grey image in RGB at another size."""
+    larger = cv2.resize(image, size, interpolation=cv2.INTER_LINEAR)
+    return np.asarray(cv2.cvtColor(larger, cv2.COLOR_GRAY2RGB), dtype=np.uint8)

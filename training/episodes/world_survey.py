@@ -20,25 +20,15 @@ TILE = (640, 480)  # [px]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WorldFigures:
-    """One world.
+    """One world."""
 
-    Attributes:
-        name: Of the world.
-        walls: Its walls.
-        landmarks: Those that robots could ever see.
-        floor_m2: Floor that robots can explore [m²].
-        width_m: Extent along x [m].
-        height_m: Extent along y [m].
-        start_gap_m: Least distance between two drawn start poses [m]; infinity for a single robot.
-    """
-
-    name: str
-    walls: int
-    landmarks: int
-    floor_m2: float
-    width_m: float
-    height_m: float
-    start_gap_m: float
+    name: str  # Of the world
+    walls: int  # Its walls
+    landmarks: int  # Those that robots could ever see
+    floor_m2: float  # Floor that robots can explore [m²]
+    width_m: float  # Extent along x [m]
+    height_m: float  # Extent along y [m]
+    start_gap_m: float  # Least distance between two drawn start poses [m]; infinity for a single robot
 
 
 def survey(world: str, world_seed: int, robots: int = 3) -> WorldFigures:
@@ -55,14 +45,10 @@ def survey(world: str, world_seed: int, robots: int = 3) -> WorldFigures:
     gaps = np.linalg.norm(starts[:, None] - starts, axis=2)[~np.eye(robots, dtype=bool)]
     squares = FreeSpace(setting.world, config.robot_radius).free_area_cells
     return WorldFigures(
-        name=setting.world.name,
-        walls=len(setting.world.walls),
-        landmarks=int(np.count_nonzero(setting.countable)),
-        floor_m2=0.04 * len(squares),
-        width_m=x_max - x_min,
-        height_m=y_max - y_min,
+        name=setting.world.name, walls=len(setting.world.walls), landmarks=int(np.count_nonzero(setting.countable)),
+        floor_m2=0.04 * len(squares), width_m=x_max - x_min, height_m=y_max - y_min,
         start_gap_m=float(gaps.min(initial=np.inf)),
-    )
+    )  # fmt: skip
 
 
 def survey_all(world: str, world_seeds: Iterable[int], robots: int) -> list[WorldFigures]:

@@ -17,9 +17,6 @@ def compilation_shown(console: Console) -> Iterator[Callable[[int, int, float], 
     A terminal shows a spinner, anything else one line. Nothing is shown where all kernels come from the cache. The
     block must not print to a live display of its own.
 
-    Args:
-        console: Where to; one on stderr leaves the output of a command alone.
-
     Yields:
         The `progress` of `warm_up`.
     """

@@ -1,41 +1,131 @@
-"""`PlainConfig`: what decides a command's results, from plain values as a `config.toml` holds them, and back."""
+"""`ExperimentConfig`: everything that decides a command's results; its fields are the command's options.
 
-from collections.abc import Mapping, Sequence
-from dataclasses import Field, asdict, fields, is_dataclass
-from typing import Any, ClassVar, Self
+The modules that define configurations import no numerical library, so that `--help` answers at once.
+"""
 
-from slam_backend.core.validation import bad_argument
+from collections.abc import Mapping
+from importlib import import_module
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Self, Union, get_args, get_origin
+
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
+from pydantic.config import JsonDict
+from pydantic.fields import FieldInfo
+
+Positive = Annotated[int, Field(ge=1)]
+NonNegative = Annotated[int, Field(ge=0)]
+RobotCount = Annotated[int, Field(ge=1, le=8)]
+ActionType = Literal["continuous", "discrete", "goal"]
+NoisePreset = Literal["easy", "standard", "hard"]
+Sensor = Literal["landmark", "stereo"]
+Proposal = Literal["fastslam2", "fastslam1"]
+Descriptor = Literal["usurf", "sift", "orb"]
+ONE_PARTICLE = "Use at least one particle; 100 is a good start."
+HINTS = {int: "Choose a number in this range.", bool: "Say true or false.", str: "Write it as text."}
 
 
-class PlainConfig:
-    """Base of the frozen dataclasses that hold all that decides a command's results.
+def option(
+    default: Any, help: str, *, name: str | None = None, shown: str | None = None, hint: str = "",
+    is_path: bool = False, is_argument: bool = False, **constraints: Any,
+) -> Any:  # fmt: skip
+    """Return a field that is an option on the command line, too.
 
-    Attributes:
-        seed: Of all random draws, or the first of several. Run folders keep it beside the other values.
+    Args:
+        name: Name of the option, or two with a slash for a flag; None: that of the field.
+        shown: Default that `--help` shows; None: the value.
+        hint: Advice in the error for a bad value, a full sentence.
+        is_path: Whether it is a path, which is kept absolute.
+        constraints: Bounds as `pydantic.Field` takes them.
     """
+    about: JsonDict = {
+        "option": name or "", "shown": shown, "hint": hint, "is_path": is_path, "is_argument": is_argument,
+    }  # fmt: skip
+    return Field(default, description=help, json_schema_extra=about, **constraints)
 
-    __slots__ = ()
-    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
-    seed: int
 
-    @classmethod
-    def from_mapping(cls, values: Mapping[str, Any]) -> Self:
-        """Build a config from plain values, as `to_mapping` gives them; what is left out has its default.
+def setting(default: Any, description: str = "", **constraints: Any) -> Any:
+    """Return a field that is no option: earlier runs' `config.toml` and programs set it."""
+    return Field(default, description=description, **constraints)
 
-        Args:
-            values: By the names of the fields; a table for a field that is a dataclass itself, lists for tuples.
+
+def first_seed() -> Any:
+    """Return the field of a seed from which on several are counted."""
+    return option(0, "First seed.", name="first_seed", ge=0, hint="Use 0 or a positive number.")
+
+
+def table(path: str) -> Any:
+    """Return the type of a field that is a dataclass of another package, imported when a configuration is made."""
+
+    def build(value: Any, info: ValidationInfo) -> Any:
+        module, name = path.split(":")
+        kind: Any = getattr(import_module(module), name)
+        if isinstance(value, kind):
+            return value
+        names, field = list(kind.__dataclass_fields__), str(info.field_name)
+        if not isinstance(value, Mapping):
+            raise _error(field, f"a table of {', '.join(names)}", value, "Write it as a table.")
+        for name in value:
+            if name not in names:
+                raise _error(field, f"names among {', '.join(names)}", name, "Correct the name.")
+        return kind(**value)
+
+    return Annotated[Any, BeforeValidator(build), Field(validate_default=True)]
+
+
+class Checked(BaseModel):
+    """Values that are frozen, and checked when they are made."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+    def __init__(self, **values: Any) -> None:
+        """Check all values.
 
         Raises:
             ValueError: If a name is unknown or a value is out of its range; the message names it.
         """
-        _refuse_unknown("config", values, cls)
-        all_values = cls.completed(values)
-        chosen: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in all_values.items()}
-        for field in fields(cls):
-            if isinstance(field.type, type) and is_dataclass(field.type) and chosen.get(field.name) is not None:
-                _refuse_unknown(field.name, chosen[field.name], field.type)
-                chosen[field.name] = field.type(**chosen[field.name])
-        return cls(**chosen)
+        try:
+            super().__init__(**{name: tuple(v) if isinstance(v, list) else v for name, v in values.items()})
+        except ValidationError as error:
+            raise _in_one_line(type(self), error) from None
+
+    def replace(self, **changes: Any) -> Self:
+        """Return a copy with some values changed, all of them checked again."""
+        return type(self)(**{**dict(self), **changes})
+
+    def check(self) -> None:
+        """Refuse values that do not go together; each alone is in its range."""
+
+    @field_validator("*")
+    @classmethod
+    def _check_list(cls, value: Any) -> Any:
+        if isinstance(value, tuple) and (not value or len(set(value)) < len(value)):
+            raise ValueError  # `_in_one_line` knows the name
+        return value
+
+    @model_validator(mode="after")
+    def _check_all(self) -> Self:
+        self.check()
+        return self
+
+
+class ExperimentConfig(Checked):
+    """Base of the configurations, which are written to `config.toml`; run folders keep the seed beside the others."""
+
+    seed: int = option(0, "Seed of all random draws.", ge=0, hint="Use 0 or a positive number.")
+
+    @classmethod
+    def from_mapping(cls, values: Mapping[str, Any]) -> Self:
+        """Build a configuration from plain values, as `to_mapping` gives them; what is left out has its default."""
+        return cls(**cls.completed(values))
 
     @classmethod
     def completed(cls, values: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -44,24 +134,70 @@ class PlainConfig:
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the plain values that repeat the command, the seed apart."""
-        return {name: value for name, value in asdict(self).items() if name != "seed"}
+        return self.model_dump(exclude={"seed"})
 
 
-def check_each_once(name: str, values: Sequence[Any]) -> None:
-    """Refuse a list without values, or with one of them twice.
+def about_option(field: FieldInfo) -> dict[str, Any] | None:
+    """Return what `option` was told about a field; None: the field is no option."""
+    extra = field.json_schema_extra
+    return dict(extra) if isinstance(extra, Mapping) and "option" in extra else None
 
-    Raises:
-        ValueError: If it is such; the message names `name`.
+
+def kind_of(annotation: Any) -> tuple[Any, list[Any]]:
+    """Return the type of a value, or of the entries of a list, and its constraints; None beside it does not count.
+
+    >>> kind_of(tuple[Positive, ...] | None)
+    (<class 'int'>, [Ge(ge=1)])
     """
-    if not values or len(set(values)) < len(values):
-        raise bad_argument(name, "at least one value, each once", list(values), "Correct the list.")
+    if get_origin(annotation) is Annotated:
+        inner, *more = get_args(annotation)
+        kind, constraints = kind_of(inner)
+        return kind, [*constraints, *(c for each in more for c in getattr(each, "metadata", [each]))]
+    if get_origin(annotation) in (Union, UnionType, tuple):
+        return kind_of(next(each for each in get_args(annotation) if each is not NoneType))
+    return annotation, []
 
 
-def _refuse_unknown(name: str, values: Any, kind: type[Any]) -> None:
-    """Raise if `values` is no mapping, or names something that the dataclass `kind` lacks."""
-    names = [field.name for field in fields(kind)]
-    if not isinstance(values, Mapping):
-        raise bad_argument(name, f"a table of {', '.join(names)}", values, "Write it as a table.")
-    unknown = [key for key in values if key not in names]
-    if unknown:
-        raise bad_argument(name, f"names among {', '.join(names)}", unknown[0], "Correct the name.")
+def _in_one_line(kind: type[Checked], error: ValidationError) -> ValueError:
+    """Return the first thing that is wrong in the form that all errors of the project have."""
+    found = error.errors()
+    for each in found:
+        if each["type"] == "extra_forbidden":
+            names = ", ".join(kind.model_fields)
+            return _error("config", f"names among {names}", str(each["loc"][0]), "Correct the name.")
+    first, value = found[0], found[0]["input"]
+    told = first.get("ctx", {}).get("error")
+    if told is not None and str(told):
+        return ValueError(str(told))
+    field = kind.model_fields[str(first["loc"][0])]
+    about = about_option(field) or {"option": "", "hint": ""}
+    name = str(about["option"] or first["loc"][0]).split("/")[0].removeprefix("--")
+    if told is not None:
+        return _error(name, "at least one value, each once", list(value), "Correct the list.")
+    leaf, constraints = kind_of(field.annotation)
+    hint = str(about["hint"]) or HINTS.get(leaf, HINTS[int])
+    if first["type"] == "missing":
+        return _error(name, "a value", "none", hint)
+    if get_origin(leaf) is Literal:
+        expected, hint = f"one of {', '.join(map(repr, get_args(leaf)))}", "Choose one of these names."
+    else:
+        expected = _range(leaf, [*constraints, *field.metadata])
+    return _error(name, expected, value, hint)
+
+
+def _range(kind: Any, constraints: list[Any]) -> str:
+    """Say what a number may be."""
+    if kind not in (int, float):
+        return {bool: "a bool", str: "a text"}.get(kind, "a table")
+    bounds = {name: getattr(each, name) for each in constraints for name in ("gt", "ge", "le") if hasattr(each, name)}
+    if kind is int and "ge" in bounds and "le" in bounds:
+        return f"an int from {bounds['ge']} to {bounds['le']}"
+    signs = {"gt": ">", "ge": ">=", "le": "<="}
+    limits = " and ".join(f"{signs[name]} {bound:g}" for name, bound in bounds.items())
+    return f"{'an int' if kind is int else 'a finite number'} {limits}".rstrip()
+
+
+def _error(name: str, expected: str, got: Any, hint: str) -> ValueError:
+    from slam_backend.core.validation import bad_argument
+
+    return bad_argument(name, expected, got, hint)

@@ -2,22 +2,23 @@
 
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patches import Ellipse
 from PIL import Image
 
 from slam_backend.core.files import write_file
+from slam_backend.core.validation import FloatArray
 
+CHI_SQUARE_95 = 5.991  # two degrees of freedom
 COLOURS = 256  # lines, points and edges of letters need no more; a file is then a quarter as large
 
 
 def save_png(figure: Figure, file: Path, dpi: int) -> None:
     """Write a figure with a palette of its own.
-
-    Args:
-        figure: Its size in inches is its own.
-        file: Where to write.
-        dpi: Pixels of an inch.
 
     Raises:
         ValueError: If the file cannot be written; the message names `out`.
@@ -28,3 +29,23 @@ def save_png(figure: Figure, file: Path, dpi: int) -> None:
     packed = BytesIO()
     picture.quantize(COLOURS, dither=Image.Dither.NONE).save(packed, format="PNG", optimize=True)
     write_file(file, packed.getvalue(), "out")
+
+
+def rgb(colour: tuple[int, int, int]) -> tuple[float, float, float]:
+    """Return a colour of bytes as matplotlib wants it."""
+    r, g, b = colour
+    return r / 255.0, g / 255.0, b / 255.0
+
+
+def ellipse_95(mean: FloatArray, covariance: FloatArray, **style: Any) -> Ellipse:
+    """Return the 95 % ellipse of a planar Gaussian with mean (2 or 3,) and covariance (2, 2) [m^2]."""
+    values, vectors = np.linalg.eigh(covariance)
+    width, height = 2.0 * np.sqrt(CHI_SQUARE_95 * np.maximum(values, 0.0))
+    angle = float(np.rad2deg(np.arctan2(vectors[1, 0], vectors[0, 0])))
+    return Ellipse((float(mean[0]), float(mean[1])), float(width), float(height), angle=angle, **style)
+
+
+def add_legend(figure: Figure, axes: Axes, **style: Any) -> None:
+    """Add a legend of what is drawn in some axes above a figure, in one row."""
+    handles, labels = axes.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), frameon=False, **style)

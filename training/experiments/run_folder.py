@@ -29,21 +29,13 @@ METRICS_FILE = "metrics.json"
 
 @dataclass(frozen=True, slots=True)
 class RunFolder:
-    """A folder that belongs to one run alone.
+    """A folder that belongs to one run alone."""
 
-    Attributes:
-        path: The folder; it exists.
-        command: The command that made it, e.g. `"replay mrclam"`.
-        config: Arguments that repeat the run, as `plain` leaves them.
-        seed: Of all random draws.
-        versions: Of Python and the packages that decide the results.
-    """
-
-    path: Path
-    command: str
-    config: dict[str, Any]
-    seed: int
-    versions: dict[str, str]
+    path: Path  # The folder; it exists
+    command: str  # The command that made it, e.g. `"replay mrclam"`.
+    config: dict[str, Any]  # Arguments that repeat the run, as `plain` leaves them
+    seed: int  # Of all random draws
+    versions: dict[str, str]  # Of Python and the packages that decide the results
 
     @classmethod
     def create(cls, out: Path | None, command: str, config: Mapping[str, Any], seed: int) -> Self:
@@ -51,9 +43,7 @@ class RunFolder:
 
         Args:
             out: The folder; it may exist if it is empty. None: the next free `runs/<command>-<seed>-<n>`.
-            command: The command that runs, without the leading `vslam`.
             config: Arguments of the command; nested mappings become tables, None means "not given".
-            seed: Of all random draws.
 
         Raises:
             ValueError: If `out` is a file, holds files, or cannot be written.
@@ -83,11 +73,6 @@ class RunFolder:
 
 def read_config(path: Path, command: str, option: str = "config") -> tuple[dict[str, Any], int]:
     """Read the config and seed of an earlier run; a file without a `format` is of the present one.
-
-    Args:
-        path: Its `config.toml`, or the run folder.
-        command: The command that wants to repeat it.
-        option: By which the user named it.
 
     Raises:
         ValueError: If the file is missing or damaged, of another format, or another command wrote it.

@@ -40,7 +40,6 @@ def mean_of(name: str, values: Sequence[float | None] | FloatArray) -> dict[str,
     """Return the mean of a figure over seeds under its name, and with `_low` and `_high` the ends of its interval.
 
     Args:
-        name: Of the figure.
         values: One for each seed; None where a seed has none. Without any, all three are None; of a single value the
             interval is not known.
 
@@ -52,6 +51,19 @@ def mean_of(name: str, values: Sequence[float | None] | FloatArray) -> dict[str,
         return dict.fromkeys((name, f"{name}_low", f"{name}_high"))
     low, high = interval(known, np.mean)
     return {name: float(known.mean()), f"{name}_low": low, f"{name}_high": high}
+
+
+def summarise_means(
+    rows: Iterable[Mapping[str, Any]], by: Sequence[str], figures: Sequence[str]
+) -> list[dict[str, Any]]:
+    """Return a line for each group in the order in which these first come: `by`, `seeds`, and figures by `mean_of`."""
+    lines = []
+    for key, own in grouped(rows, by).items():
+        line: dict[str, Any] = dict(zip(by, key, strict=True)) | {"seeds": len(own)}
+        for figure in figures:
+            line |= mean_of(figure, [row[figure] for row in own])
+        lines.append(line)
+    return lines
 
 
 def ahead_by(own: Mapping[int, float], other: Mapping[int, float]) -> FloatArray:
@@ -68,9 +80,6 @@ def shown(line: Mapping[str, Any], name: str, digits: int = 3, factor: float = 1
 
     Args:
         line: With what `mean_of` returned.
-        name: Of the figure.
-        digits: After the point.
-        factor: All numbers are multiplied with it.
         stacked: The interval on a second line, for narrow columns.
 
     >>> shown({"way": 3.0, "way_low": 2.5, "way_high": 3.25}, "way", 2)

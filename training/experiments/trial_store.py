@@ -4,7 +4,7 @@ import json
 import os
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from contextlib import closing
+from contextlib import closing, contextmanager
 from multiprocessing import active_children, get_context
 from pathlib import Path
 from typing import Any, TypeVar
@@ -24,9 +24,6 @@ def open_folder(out: Path | None, command: str, config: Mapping[str, Any], seed:
 
     Args:
         out: The folder. None: the next free one.
-        command: Whose it is.
-        config: What decides the run, as its `to_mapping` gives it.
-        seed: The first one.
 
     Raises:
         ValueError: If `out` holds another run, or cannot be written.
@@ -46,8 +43,6 @@ def finished_trials(folder: RunFolder, name: str, kind: type[TrialT]) -> dict[Tr
     """Read the trials that a folder holds; a last line that was cut off is dropped, from the file too.
 
     Args:
-        folder: Where they are kept.
-        name: Of the file.
         kind: A frozen dataclass, whose fields a row holds beside the figures.
 
     Raises:
@@ -80,24 +75,14 @@ def trial_of(row: Mapping[str, Any], kind: type[TrialT]) -> TrialT:
 
 
 def run_trials(
-    folder: RunFolder,
-    name: str,
-    play: Callable[[TrialT], dict[str, Any]],
-    trials: Iterable[TrialT],
-    processes: int,
-    interrupted: Callable[[], bool],
-    on_trial: Callable[[dict[str, Any]], None],
-) -> None:
+    folder: RunFolder, name: str, play: Callable[[TrialT], dict[str, Any]], trials: Iterable[TrialT], processes: int,
+    interrupted: Callable[[], bool], on_trial: Callable[[dict[str, Any]], None],
+) -> None:  # fmt: skip
     """Run trials and append each to the folder as it ends; on an interrupt those under way are finished.
 
     Args:
-        folder: Where to keep them.
-        name: Of the file.
         play: Runs a trial and returns its row; a function of a module, so that other processes find it.
-        trials: Which.
         processes: How many run at a time; 1: in this process.
-        interrupted: Asked before each trial.
-        on_trial: Called with each row.
 
     Raises:
         ValueError: If a row cannot be written; those before it are kept.
@@ -135,24 +120,30 @@ def _spread(
     """
     context = get_context("spawn")
     others = set(active_children())
+    with one_thread_each(), ProcessPoolExecutor(processes, mp_context=context, initializer=begin_worker) as pool:
+        try:
+            running: set[Future[dict[str, Any]]] = set()
+            for trial in trials:
+                with signals_held():
+                    running.add(pool.submit(play, trial))  # starts a process, if there are too few
+                while len(running) >= processes:
+                    done, running = wait(running, return_when=FIRST_COMPLETED)
+                    yield from (future.result() for future in done)
+            for future in running:
+                yield future.result()
+        except BaseException:
+            for process in set(active_children()) - others:
+                process.kill()
+            raise
+
+
+@contextmanager
+def one_thread_each() -> Iterator[None]:
+    """Start processes whose libraries use one thread each: more would only get in the others' way."""
     before = {name: os.environ.get(name) for name in SINGLE_THREAD}
-    os.environ |= dict.fromkeys(SINGLE_THREAD, "1")  # more threads would only get in the other processes' way
+    os.environ |= dict.fromkeys(SINGLE_THREAD, "1")
     try:
-        with ProcessPoolExecutor(processes, mp_context=context, initializer=begin_worker) as pool:
-            try:
-                running: set[Future[dict[str, Any]]] = set()
-                for trial in trials:
-                    with signals_held():
-                        running.add(pool.submit(play, trial))  # starts a process, if there are too few
-                    while len(running) >= processes:
-                        done, running = wait(running, return_when=FIRST_COMPLETED)
-                        yield from (future.result() for future in done)
-                for future in running:
-                    yield future.result()
-            except BaseException:
-                for process in set(active_children()) - others:
-                    process.kill()
-                raise
+        yield
     finally:
         for name, value in before.items():
             if value is None:

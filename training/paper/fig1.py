@@ -1,61 +1,43 @@
 """The paper's Fig. 1: clouds of particles along the paths of a few robots, by odometry alone and with what they see."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
+import matplotlib as mpl
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.lines import Line2D
+from matplotlib.patches import Rectangle
 
-from slam_backend.core.validation import FloatArray, IntArray, check_float, check_int
+from slam_backend.core.validation import FloatArray, IntArray
 from training.bench.accuracy.batch_problem import BatchProblem
 from training.bench.accuracy.runs import STEP, StereoRun, simulate_run
-from training.bench.accuracy.world import start_crossings
-from training.experiments.config import PlainConfig
-from training.paper.fig6.noise_regimes import FILTER_OPTIONS, REGIMES
+from training.bench.accuracy.world import Office
+from training.experiments.plotting import rgb, save_png
+from training.paper.config import Fig1Config
+from training.paper.fig6.trials import FILTER_OPTIONS, REGIMES
+from vslam_env.rendering.palette import FAINT_INK, TRUE_LANDMARK, WALL, robot_colour
 
-COMMAND = "paper fig1"
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Fig1Config(PlainConfig):
-    """All that decides the figure.
-
-    Attributes:
-        robots: K.
-        particles: M.
-        length: Of each robot's path [m].
-        every: Distance along the path between two clouds [m].
-        seed: Of the run, and of the filters' draws.
-    """
-
-    robots: int = 3
-    particles: int = 400
-    length: float = 30.0
-    every: float = 5.0
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        check_int("particles", self.particles, 1, "Use at least one particle; 400 make a cloud.")
-        check_int("seed", self.seed, 0, "Use 0 or a positive number.")
-        check_float("every", self.every, "A cloud can be drawn after each step.", at_least=STEP)
-        REGIMES["paper"].spec(self.robots, self.length)  # refuses the rest
-        start_crossings(self.robots, np.random.default_rng(0))  # each robot starts at one of its own
+WIDTH = 3.5  # of a column of text [in]
+SMALL = 0.1  # [m]; clouds whose RMS spread is below this are shown enlarged too
+ENLARGED = 6.0
+INK = "0.25"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Clouds:
-    """Particles along the paths of K robots.
+    """Particles along the paths of K robots."""
 
-    Attributes:
-        steps: (n,) int64. When they were taken, the start first.
-        poses: (n, K, M, 3) float64 [m, m, rad], world frame. All particles, after resampling.
-        paths: (K, T, 3) float64 [m, m, rad], world frame. Without measurements: of the odometry as it was read; with
-            them: the filter's estimate of each pose at its own step.
-        landmarks: (N, 3) float64 [m], world frame. The map at the end, empty without measurements.
-    """
-
-    steps: IntArray
-    poses: FloatArray
+    steps: IntArray  # (n,) int64. When they were taken, the start first.
+    poses: FloatArray  # (n, K, M, 3) float64 [m, m, rad], world frame. All particles, after resampling.
+    # (K, T, 3) float64 [m, m, rad], world frame. Without measurements: of the odometry as it was read; with them: the
+    # filter's estimate of each pose at its own step.
     paths: FloatArray
-    landmarks: FloatArray
+    landmarks: FloatArray  # (N, 3) float64 [m], world frame. The map at the end, empty without measurements.
 
     def spreads(self) -> FloatArray:
         """Return the RMS distance (n, K) [m] of the particles of each cloud from its mean."""
@@ -72,8 +54,6 @@ def draw_clouds(run: StereoRun, config: Fig1Config, measured: bool) -> Clouds:
     """Let the particles of `fastslam1` follow the robots.
 
     Args:
-        run: What the robots do and read.
-        config: Of the figure.
         measured: Whether they weigh and learn from what the robots see; otherwise the motion model alone moves them
             (Eq. 4).
     """
@@ -89,11 +69,10 @@ def draw_clouds(run: StereoRun, config: Fig1Config, measured: bool) -> Clouds:
         paths.append([slam.pose(robot).mean for robot in robots])
     reckoned = BatchProblem.of_run(run).dead_reckoning().paths
     return Clouds(
-        steps=np.array(steps),
-        poses=np.array(poses),
+        steps=np.array(steps), poses=np.array(poses),
         paths=np.array(paths).transpose(1, 0, 2) if measured else reckoned,
         landmarks=slam.map().means if measured else np.zeros((0, 3)),
-    )
+    )  # fmt: skip
 
 
 def figures_of(run: StereoRun, clouds: Clouds) -> list[dict[str, float]]:
@@ -112,3 +91,97 @@ def figures_of(run: StereoRun, clouds: Clouds) -> list[dict[str, float]]:
         }
         for own, spread in zip(errors, spreads, strict=True)
     ]
+
+
+def draw_fig1(file: Path, run: StereoRun, panels: Sequence[tuple[str, str, Clouds]]) -> None:
+    """Draw the panels below each other, to be read at the width of a column, into a PNG file.
+
+    Args:
+        panels: Title, name of the dashed line, and clouds of each.
+    """
+    ratio = run.office.size[1] / run.office.size[0]
+    with mpl.rc_context({"font.size": 7, "axes.titlesize": 7.5, "axes.linewidth": 0.6}):
+        layout = ConstrainedLayoutEngine(h_pad=0.02, hspace=0.0)
+        figure = Figure(figsize=(WIDTH, len(panels) * (0.95 * WIDTH * ratio + 0.17) + 0.65), layout=layout)
+        axes = figure.subplots(len(panels), 1, squeeze=False, sharex=True).ravel()
+        for letter, ax, (title, dashed, clouds) in zip("abcd", axes, panels, strict=False):
+            _draw_office(ax, run.office)
+            _draw_clouds(ax, run, clouds)
+            if clouds.spreads()[-1].max() < SMALL:
+                _enlarge_ends(ax, run, clouds)
+            ax.set_title(f"({letter}) {title}; dashed: {dashed}", loc="left", pad=3)
+            ax.set_ylabel("y [m]", labelpad=1)
+        axes[-1].set_xlabel("x [m]", labelpad=1)
+        figure.legend(
+            handles=_legend(len(run.true_paths)), loc="outside lower center", ncols=3, frameon=False, columnspacing=1.2,
+            handlelength=1.6, borderpad=0.0,
+        )  # fmt: skip
+        save_png(figure, file, 270)
+
+
+def _draw_office(ax: Axes, office: Office) -> None:
+    """Draw the blocks of rooms, the outer walls and the true landmarks; metres are equally long along both axes."""
+    for x1, y1, x2, y2 in office.blocks:
+        ax.add_patch(Rectangle((x1, y1), x2 - x1, y2 - y1, fc="0.96", ec=rgb(WALL), lw=0.8))
+    ax.add_patch(Rectangle((0.0, 0.0), *office.size, fc="none", ec=rgb(WALL), lw=0.8))
+    ax.scatter(office.landmarks[:, 0], office.landmarks[:, 1], s=2.5, color=rgb(TRUE_LANDMARK), lw=0)
+    margin = 0.4
+    ax.set(
+        aspect="equal", xlim=(-margin, office.size[0] + margin), ylim=(-margin, office.size[1] + margin),
+        xticks=np.arange(0.0, office.size[0] + 0.1, 3.0), yticks=np.arange(0.0, office.size[1] + 0.1, 3.0),
+    )  # fmt: skip
+    ax.tick_params(length=2, pad=1.5, width=0.6)
+
+
+def _draw_clouds(ax: Axes, run: StereoRun, clouds: Clouds) -> None:
+    """Draw the map, and each robot's true path, dashed path and clouds; a particle is a dash along its heading."""
+    ax.plot(*clouds.landmarks[:, :2].T, ls="", marker="+", ms=2.2, mew=0.45, color=INK, zorder=2)
+    for robot, true in enumerate(run.true_paths):
+        colour = rgb(robot_colour(robot))
+        ax.plot(*true[:, :2].T, color=colour, lw=0.9, alpha=0.55, zorder=3)
+        ax.plot(*clouds.paths[robot, :, :2].T, color=colour, lw=0.8, ls=(0, (3.0, 1.6)), zorder=4)
+        _draw_particles(ax, clouds.poses[:, robot].reshape(-1, 3), 0.12, colour)
+        taken = true[clouds.steps]
+        ax.plot(*taken[1:, :2].T, ls="", marker="o", ms=1.8, mfc="white", mec=INK, mew=0.45, zorder=6)
+        ax.plot(*true[0, :2], marker="o", ms=6.5, mfc="white", mec=colour, mew=0.9, zorder=7)
+        ax.text(
+            true[0, 0], true[0, 1], str(robot + 1), ha="center", va="center_baseline", fontsize=5.5, color=colour,
+            weight="bold", zorder=8,
+        )  # fmt: skip
+
+
+def _draw_particles(ax: Axes, poses: FloatArray, length: float, colour: tuple[float, float, float]) -> None:
+    """Draw poses (n, 3) as dashes of this length [m] along their headings."""
+    half = 0.5 * length * np.column_stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])])
+    dashes = np.stack([poses[:, :2] - half, poses[:, :2] + half], axis=1)
+    ax.add_collection(LineCollection(list(dashes), colors=[colour], linewidths=0.35, alpha=0.4, zorder=5))
+
+
+def _enlarge_ends(ax: Axes, run: StereoRun, clouds: Clouds) -> None:
+    """Show the last clouds enlarged inside the blocks of rooms, as far as there are blocks."""
+    for robot, (x1, y1, x2, y2) in zip(range(len(run.true_paths)), run.office.blocks, strict=False):
+        colour, width, height = rgb(robot_colour(robot)), 0.9 * (x2 - x1), 0.9 * (y2 - y1)
+        box = (x1 + 0.05 * (x2 - x1), y1 + 0.05 * (y2 - y1), width, height)
+        inset = ax.inset_axes(box, transform=ax.transData)
+        true, poses = run.true_paths[robot, clouds.steps[-1]], clouds.poses[-1, robot]
+        centre = 0.5 * (true[:2] + poses[:, :2].mean(axis=0))
+        reach = 0.5 * np.array([width, height]) / ENLARGED
+        inset.set(xlim=centre[0] + reach[0] * np.array([-1, 1]), ylim=centre[1] + reach[1] * np.array([-1, 1]))
+        inset.set(xticks=[], yticks=[])
+        inset.spines[:].set(color=colour, linewidth=0.6)
+        _draw_particles(inset, poses, 0.05, colour)
+        inset.plot(*true[:2], marker="o", ms=2.6, mfc="white", mec=INK, mew=0.5, zorder=6)
+        text = f"{robot + 1} at the end, {ENLARGED:g} : 1"
+        inset.text(0.03, 0.95, text, transform=inset.transAxes, fontsize=5, va="top", color=colour)
+
+
+def _legend(robots: int) -> list[Line2D]:
+    """Return what the strokes mean."""
+    colours = [Line2D([], [], color=rgb(robot_colour(k)), lw=1.6, label=f"robot {k + 1}") for k in range(robots)]
+    return [
+        *colours, Line2D([], [], color=rgb(FAINT_INK), lw=0.9, label="true path"),
+        Line2D([], [], ls="", marker="o", ms=2.5, mfc="white", mec=INK, mew=0.5, label="true pose at a cloud"),
+        Line2D([], [], ls="", marker="$\\cdots$", ms=6, color=rgb(FAINT_INK), mew=0.2, label="particles"),
+        Line2D([], [], ls="", marker="o", ms=2, color=rgb(TRUE_LANDMARK), mew=0, label="true landmark"),
+        Line2D([], [], ls="", marker="+", ms=3.5, color=INK, mew=0.6, label="landmark of the map"),
+    ]  # fmt: skip

@@ -2,19 +2,20 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
+import matplotlib as mpl
 import numpy as np
+from matplotlib.figure import Figure
 
-from slam_backend.core.validation import FloatArray, check_float, check_int
+from slam_backend.core.validation import FloatArray
 from slam_backend.geometry import wrap_angle
 from slam_backend.maps.alignment import RIVAL_ANGLE, RIVAL_DISTANCE, align_maps, propose_motion
-from training.bench.accuracy.runs import STEP
-from training.experiments.config import PlainConfig
+from training.experiments.plotting import add_legend, save_png
 from training.experiments.tables import csv_text
 from training.paper.map_pairs import map_alone, simulate_pair, true_motion
 
-COMMAND = "paper fig2"
 TRIALS_FILE = "runs.jsonl"
 PAPER_METHODS = ("svd", "icp", "impicp", "ransac")
 OURS = "ours"  # ransac with refinement and refusals
@@ -25,47 +26,12 @@ BIN = 50  # landmarks
 PRACTICALLY_ZERO = {"translation_m": 0.2, "rotation_deg": 1.0}
 LABELS = {"translation_m": "translation [m]", "rotation_deg": "rotation [°]"}
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Fig2Config(PlainConfig):
-    """All that decides the figure.
-
-    Attributes:
-        length: That each of the two robots drives [m].
-        every: Between two alignments [m].
-        landmarks: N of the office.
-        particles: M of each robot's filter.
-        seeds: How many runs.
-        seed: The first one.
-    """
-
-    length: float = 80.0
-    every: float = 5.0
-    landmarks: int = 300
-    particles: int = 100
-    seeds: int = 20
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        check_float("every", self.every, "Maps can be aligned after each step.", at_least=STEP)
-        check_float("length", self.length, "Give metres, at least one stage of them.", at_least=self.every)
-        check_int("landmarks", self.landmarks, 1, "An office without landmarks shows nothing.")
-        check_int("particles", self.particles, 1, "Use at least one particle.")
-        check_int("seeds", self.seeds, 1, "Run at least one seed.")
-        check_int("seed", self.seed, 0, "Use 0 or a positive number.")
-
-    def trials(self) -> list["Fig2Trial"]:
-        """Return one trial for each seed."""
-        return [
-            Fig2Trial(
-                length=float(self.length), every=float(self.every), landmarks=self.landmarks, particles=self.particles,
-                seed=seed,
-            )
-            for seed in range(self.seed, self.seed + self.seeds)
-        ]  # fmt: skip
+COLOURS = {"svd": "#7f7f7f", "icp": "#D55E00", "impicp": "#E69F00", "ransac": "#0072B2", OURS: "#009E73"}
+MARKERS = {"svd": "x", "icp": "v", "impicp": "D", "ransac": "o", OURS: "s"}
+NAMES = {"svd": "SVD", "icp": "ICP", "impicp": "ImpICP", "ransac": "RANSAC", OURS: "ours, refined, where accepted"}
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Fig2Trial:
     """One run of two robots; fields as in `Fig2Config`."""
 
@@ -178,3 +144,29 @@ def to_csv(rows: Iterable[Mapping[str, Any]]) -> str:
                 error = stage[method] or dict.fromkeys(PRACTICALLY_ZERO)
                 lines.append([row["seed"], stage["length"], stage["size"], stage["shared"], method, *error.values()])
     return csv_text(headings, lines)
+
+
+def draw_fig2(file: Path, lines: Sequence[Mapping[str, Any]]) -> None:
+    """Draw medians as lines and the middle 10 to 90 % up to its upper end as bars, on a log scale, into a PNG file."""
+    with mpl.rc_context({"font.size": 9}):
+        figure = Figure(figsize=(10.0, 4.0), layout="constrained")
+        panels = figure.subplots(1, 2)
+        for letter, axes, (name, label) in zip("ab", panels, LABELS.items(), strict=True):
+            for place, method in enumerate(METHODS):
+                own = [line for line in lines if line["method"] == method and line[f"{name}_median"] is not None]
+                if not own:
+                    continue
+                middle = [line[f"{name}_median"] for line in own]
+                above = [max(line[f"{name}_p90"] - line[f"{name}_median"], 0.0) for line in own]
+                axes.errorbar(
+                    [line["size"] + 3.0 * (place - 2) for line in own], middle, yerr=[[0.0] * len(own), above],
+                    marker=MARKERS[method], ms=4.5, mfc="none", lw=1.2, elinewidth=0.7, capsize=2,
+                    color=COLOURS[method], label=NAMES[method],
+                )  # fmt: skip
+            axes.set_yscale("log")
+            axes.set_xlabel("landmarks in a map")
+            axes.set_ylabel(f"error in {label}")
+            axes.set_title(f"({letter})", loc="left")
+            axes.grid(alpha=0.2, which="both")
+        add_legend(figure, panels[0])
+        save_png(figure, file, 120)

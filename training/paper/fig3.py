@@ -1,63 +1,40 @@
 """The paper's Figs. 3 and 4: two maps, what matches, the motion found; and what fusing does to the ellipses."""
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+import matplotlib as mpl
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
 
-from slam_backend.core.validation import FloatArray, IntArray, bad_argument, check_float, check_int
+from slam_backend.core.validation import FloatArray, IntArray, bad_argument
 from slam_backend.geometry import transform_points, wrap_angle
 from slam_backend.maps.alignment import Alignment, align_maps, candidate_matches
 from slam_backend.maps.alignment_types import AlignmentOptions
 from slam_backend.maps.fusion import fuse_maps, move_covariances
 from slam_backend.maps.landmark_map import LandmarkMap
-from training.bench.accuracy.runs import STEP
-from training.experiments.config import PlainConfig
+from training.experiments.plotting import CHI_SQUARE_95, ellipse_95, save_png
 from training.experiments.tables import csv_text
+from training.paper.config import PairConfig
 from training.paper.map_pairs import Stage, map_alone, simulate_pair, true_motion
 
-FIG3, FIG4 = "paper fig3", "paper fig4"
 SHOWN = 3  # landmarks of Fig. 4
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PairConfig(PlainConfig):
-    """All that decides either figure.
-
-    Attributes:
-        length: That each of the two robots drives [m].
-        landmarks: N of the office.
-        particles: M of each robot's filter.
-        seed: Of run and filters.
-    """
-
-    length: float = 30.0
-    landmarks: int = 300
-    particles: int = 100
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        check_float("length", self.length, "Give metres.", at_least=STEP)
-        check_int("landmarks", self.landmarks, 1, "An office without landmarks shows nothing.")
-        check_int("particles", self.particles, 1, "Use at least one particle.")
-        check_int("seed", self.seed, 0, "Use 0 or a positive number.")
+COLOURS = {"map 1": "#0072B2", "map 2": "#D55E00", "fused": "#009E73"}
+APART = 3.0  # between the two maps in the left panel [m]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AlignedPair:
-    """Two robots' own maps and the motion found between them.
+    """Two robots' own maps and the motion found between them."""
 
-    Attributes:
-        stage: What they hold.
-        candidates: (k, 2) rows (a, b) of landmarks that look alike.
-        alignment: Successful.
-        truth: (3,) True motion between the start frames [m, m, rad].
-    """
-
-    stage: Stage
-    candidates: IntArray
-    alignment: Alignment
-    truth: FloatArray
+    stage: Stage  # What they hold
+    candidates: IntArray  # (k, 2) rows (a, b) of landmarks that look alike
+    alignment: Alignment  # Successful
+    truth: FloatArray  # (3,) True motion between the start frames [m, m, rad]
 
     @property
     def maps(self) -> tuple[LandmarkMap, LandmarkMap]:
@@ -69,16 +46,14 @@ class AlignedPair:
         names_a, names_b = (own[rows] for own, rows in zip(self.stage.names, self.alignment.inliers.T, strict=True))
         error = self.alignment.transform - self.truth
         return {
-            "landmarks": [len(own) for own in self.maps],
-            "shared": self.stage.shared,
-            "candidates": len(self.candidates),
-            "inliers": len(self.alignment.inliers),
+            "landmarks": [len(own) for own in self.maps], "shared": self.stage.shared,
+            "candidates": len(self.candidates), "inliers": len(self.alignment.inliers),
             "true_inliers": int(np.count_nonzero((names_a == names_b) & (names_a >= 0))),
             "transform": self.alignment.transform.tolist(),
             "sigmas": np.sqrt(np.diag(self.alignment.covariance)).tolist(),
             "translation_error_m": float(np.hypot(error[0], error[1])),
             "rotation_error_deg": abs(float(np.rad2deg(wrap_angle(error[2])))),
-        }
+        }  # fmt: skip
 
 
 def align_pair(config: PairConfig) -> AlignedPair:
@@ -98,17 +73,11 @@ def align_pair(config: PairConfig) -> AlignedPair:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FusedLandmarks:
-    """A few landmarks before and after fusion, frame of the first map.
+    """A few landmarks before and after fusion, frame of the first map."""
 
-    Attributes:
-        names: (n,) true landmarks.
-        means: (3, n, 3) float64 [m]. Of the first map, of the second one moved, and fused.
-        covariances: (3, n, 3, 3) float64 [m^2]. Likewise; those moved hold the alignment's uncertainty, too.
-    """
-
-    names: IntArray
-    means: FloatArray
-    covariances: FloatArray
+    names: IntArray  # (n,) true landmarks
+    means: FloatArray  # (3, n, 3) float64 [m]. Of the first map, of the second one moved, and fused.
+    covariances: FloatArray  # (3, n, 3, 3) float64 [m^2]. Likewise; those moved hold the alignment's uncertainty, too.
 
 
 def fuse_pair(pair: AlignedPair, shown: int = SHOWN) -> FusedLandmarks:
@@ -149,3 +118,80 @@ def ellipses_csv(fused: FusedLandmarks) -> str:
         for kind, means, covariances in zip(("map 1", "map 2", "fused"), fused.means, fused.covariances, strict=True):
             rows.append([name, kind, *(f"{v:.3e}" for v in (*means[i], *covariances[i][upper]))])
     return csv_text(headings, rows)
+
+
+def draw_fig3(file: Path, pair: AlignedPair) -> None:
+    """Draw both maps in their own frames with lines between what matches, and one over the other, into a PNG file."""
+    map_a, map_b = pair.maps
+    offset = np.array([0.0, map_a.means[:, 1].min() - map_b.means[:, 1].max() - APART])
+    rows_a, rows_b = pair.alignment.inliers.T
+    with mpl.rc_context({"font.size": 9}):
+        figure = Figure(figsize=(12.0, 6.0), layout="constrained")
+        left, right = figure.subplots(1, 2)
+        ends = np.stack([map_a.means[rows_a, :2], map_b.means[rows_b, :2] + offset], axis=1)
+        left.add_collection(LineCollection(list(ends), colors="0.65", lw=0.5, zorder=1))
+        _dots(left, map_a.means[:, :2], "map 1")
+        _dots(left, map_b.means[:, :2] + offset, "map 2")
+        left.plot(*np.zeros(2), marker="+", ms=10, color=COLOURS["map 1"])
+        left.plot(*offset, marker="+", ms=10, color=COLOURS["map 2"])
+        left.set_title(f"(a) own frames; {len(rows_a)} matches\nof {len(pair.candidates)} look-alikes", loc="left")
+        moved = transform_points(pair.alignment.transform, map_b.means)
+        right.scatter(
+            *map_a.means[rows_a, :2].T, s=60, marker="o", facecolor="none", edgecolor="0.6", lw=0.7, label="matched"
+        )
+        _dots(right, map_a.means[:, :2], "map 1")
+        _dots(right, moved[:, :2], "map 2")
+        figures = pair.figures()
+        right.set_title(
+            f"(b) map 2 moved into the frame of map 1,\noff by {100 * figures['translation_error_m']:.0f} cm and "
+            f"{figures['rotation_error_deg']:.1f}°",
+            loc="left",
+        )
+        for axes in (left, right):
+            axes.set_aspect("equal")
+            axes.set_xlabel("x [m]")
+            axes.set_ylabel("y [m]")
+            axes.grid(alpha=0.2)
+        right.legend(loc="best", fontsize=8)
+        save_png(figure, file, 120)
+
+
+def draw_fig4(file: Path, fused: FusedLandmarks) -> None:
+    """Draw the 95 % ellipses of a few landmarks before and after fusion, a column for each, into a PNG file."""
+    count = len(fused.names)
+    with mpl.rc_context({"font.size": 9}):
+        figure = Figure(figsize=(3.6 * count, 7.2), layout="constrained")
+        panels = figure.subplots(2, count, squeeze=False)
+        for row, names, title in zip(
+            panels, (("map 1", "map 2"), ("map 1", "map 2", "fused")), ("(a) aligned", "(b) fused"), strict=True
+        ):
+            for column, axes in enumerate(row):
+                spread = np.sqrt(CHI_SQUARE_95 * fused.covariances[:2, column, :2, :2].diagonal(axis1=1, axis2=2))
+                means = fused.means[:2, column, :2]
+                low, high = (means - spread).min(axis=0), (means + spread).max(axis=0)
+                middle, reach = 0.5 * (low + high), 0.55 * float((high - low).max())
+                for place, name in enumerate(names):
+                    faint = len(names) == 3 and name != "fused"
+                    mean, covariance = fused.means[place, column, :2], fused.covariances[place, column, :2, :2]
+                    alpha = 0.35 if faint else 1.0
+                    style = {"facecolor": "none", "edgecolor": COLOURS[name], "lw": 1.4, "alpha": alpha}
+                    axes.add_patch(ellipse_95(mean, covariance, **style))
+                    axes.plot(*mean, ls="", marker="+", ms=7, color=COLOURS[name], alpha=alpha, label=name)
+                axes.set_xlim(middle[0] - reach, middle[0] + reach)
+                axes.set_ylim(middle[1] - reach, middle[1] + reach)
+                axes.set_aspect("equal")
+                axes.set_title(f"{title}: landmark {fused.names[column]}", loc="left")
+                axes.set_xlabel("x [m]")
+                axes.grid(alpha=0.2)
+            row[0].set_ylabel("y [m]")
+        handles, labels = panels[1][0].get_legend_handles_labels()
+        legend = figure.legend(handles, labels, loc="outside upper center", ncols=3, frameon=False)
+        for handle in legend.legend_handles:
+            if handle is not None:
+                handle.set_alpha(1.0)
+        save_png(figure, file, 120)
+
+
+def _dots(axes: Axes, points: FloatArray, name: str) -> None:
+    """Draw landmarks as dots."""
+    axes.plot(*points.T, ls="", marker="o", ms=2.4, mew=0.0, color=COLOURS[name], label=name)

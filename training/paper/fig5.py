@@ -1,85 +1,57 @@
 """Fig. 5 of the paper: three robots in a room, the landmarks that they see, and those that walls hide from them."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Wedge
 
 from agents.registry import make_policy
-from slam_backend.core.validation import BoolArray, FloatArray, bad_argument, check_int
-from training.experiments.config import PlainConfig
+from slam_backend.core.validation import BoolArray, FloatArray
+from training.experiments.plotting import save_png
 from training.experiments.tables import csv_text
+from training.paper.config import Fig5Config
 from vslam_env import EnvConfig, vslam_v0
-from vslam_env.config import MAX_ROBOTS
 from vslam_env.environment import ExplorationEnv
+from vslam_env.rendering.palette import robot_colour
 from vslam_env.sensors import LandmarkSensor
 from vslam_env.world.visibility import view_limits, visible_landmarks
 
-COMMAND = "paper fig5"
 STATES = ("hidden", "seen", "measured")
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Fig5Config(PlainConfig):
-    """All that decides the figure.
-
-    Attributes:
-        robots: How many.
-        decisions: Seconds that they have explored for.
-        measurements: Number B that each integrates in a tick, at most.
-        seed: Of the room and of all draws.
-    """
-
-    robots: int = 3
-    decisions: int = 30
-    measurements: int = 5
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        if check_int("robots", self.robots, 1, "Use 1 to 8 robots.") > MAX_ROBOTS:
-            raise bad_argument("robots", f"an int from 1 to {MAX_ROBOTS}", self.robots, "Use 1 to 8 robots.")
-        check_int("decisions", self.decisions, 1, "Let them move for a second or more.")
-        check_int("measurements", self.measurements, 1, "Let each measure a landmark or more.")
-        check_int("seed", self.seed, 0, "Use 0 or a positive number.")
+WIDTH = 7.0  # [in]
+BODY = 0.35  # [m] drawn larger than it is
+INK = "0.15"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fig5:
-    """What the figure shows, world frame.
+    """What the figure shows, world frame."""
 
-    Attributes:
-        walls: (S, 4) float64 [m].
-        landmarks: (N, 3) float64 [m].
-        poses: (K, 3) float64 [m, m, rad]. True poses.
-        paths: (K, T, 2) float64 [m]. True paths.
-        half_fov: Of the cameras [rad].
-        max_range: [m].
-        in_view: (K, N) bool. In range and in the image, looked at from their wall's face: what a robot would see in a
-            room whose walls were glass.
-        seen: (K, N) bool. What it does see.
-        measured: (K, N) bool. What it integrates in this tick.
-    """
-
-    walls: FloatArray
-    landmarks: FloatArray
-    poses: FloatArray
-    paths: FloatArray
-    half_fov: float
-    max_range: float
+    walls: FloatArray  # (S, 4) float64 [m]
+    landmarks: FloatArray  # (N, 3) float64 [m]
+    poses: FloatArray  # (K, 3) float64 [m, m, rad]. True poses.
+    paths: FloatArray  # (K, T, 2) float64 [m]. True paths.
+    half_fov: float  # Of the cameras [rad]
+    max_range: float  # [m]
+    # (K, N) bool. In range and in the image, looked at from their wall's face: what a robot would see in a room whose
+    # walls were glass.
     in_view: BoolArray
-    seen: BoolArray
-    measured: BoolArray
+    seen: BoolArray  # (K, N) bool. What it does see.
+    measured: BoolArray  # (K, N) bool. What it integrates in this tick.
 
     def figures(self) -> list[dict[str, int]]:
         """Return per robot how many landmarks are in view, hidden, seen and measured."""
         return [
             {
-                "in_view": int(view.sum()),
-                "hidden": int((view & ~seen).sum()),
-                "seen": int(seen.sum()),
+                "in_view": int(view.sum()), "hidden": int((view & ~seen).sum()), "seen": int(seen.sum()),
                 "measured": int(used.sum()),
             }
             for view, seen, used in zip(self.in_view, self.seen, self.measured, strict=True)
-        ]
+        ]  # fmt: skip
 
     def to_csv(self) -> str:
         """Return a row for each robot and landmark in its view: where both are, and what became of the landmark."""
@@ -126,13 +98,47 @@ def _as_seen(env: ExplorationEnv) -> Fig5:
     for robot, frame in enumerate(episode.frames):
         measured[robot, frame.true_ids[frame.true_ids >= 0]] = True
     return Fig5(
-        walls=env.world.walls,
-        landmarks=marks.positions,
-        poses=poses,
-        paths=np.array(episode.true_path)[:, :, :2].transpose(1, 0, 2),
-        half_fov=sight.camera.half_fov,
-        max_range=sight.camera.max_range,
-        in_view=in_view,
-        seen=episode.setting.sensor.visible(poses),
+        walls=env.world.walls, landmarks=marks.positions, poses=poses,
+        paths=np.array(episode.true_path)[:, :, :2].transpose(1, 0, 2), half_fov=sight.camera.half_fov,
+        max_range=sight.camera.max_range, in_view=in_view, seen=episode.setting.sensor.visible(poses),
         measured=measured,
-    )
+    )  # fmt: skip
+
+
+def draw_fig5(file: Path, found: Fig5) -> None:
+    """Draw the figure into a PNG file."""
+    low, high = found.walls.reshape(-1, 2).min(axis=0), found.walls.reshape(-1, 2).max(axis=0)
+    ratio = (high[1] - low[1]) / (high[0] - low[0])
+    figure = Figure(figsize=(WIDTH, WIDTH * ratio + 0.6), layout="constrained")
+    axes = figure.subplots()
+    axes.add_collection(LineCollection(found.walls.reshape(-1, 2, 2).tolist(), colors=INK, linewidths=1.6))
+    axes.plot(*found.landmarks[:, :2].T, "o", color="0.62", markersize=2.2, zorder=3)
+    for robot, pose in enumerate(found.poses):
+        colour = [channel / 255 for channel in robot_colour(robot)]
+        axes.plot(*found.paths[robot].T, color=colour, linewidth=0.9, alpha=0.6)
+        fan = np.degrees([pose[2] - found.half_fov, pose[2] + found.half_fov])
+        axes.add_patch(Wedge(tuple(pose[:2]), found.max_range, *fan, facecolor=colour, alpha=0.07, linewidth=0))
+        for mark in np.flatnonzero(found.seen[robot]):
+            width = 0.9 if found.measured[robot, mark] else 0.35
+            ends = np.vstack([pose[:2], found.landmarks[mark, :2]])
+            axes.plot(*ends.T, "--", color=colour, linewidth=width, dashes=(4, 3), zorder=2)
+        hidden = found.landmarks[found.in_view[robot] & ~found.seen[robot]]
+        axes.plot(*hidden[:, :2].T, "x", color=colour, markersize=4.5, markeredgewidth=0.9, zorder=4)
+        angles = pose[2] + np.array([0.0, 2.5, -2.5])
+        body = pose[:2] + BODY * np.column_stack([np.cos(angles), np.sin(angles)])
+        axes.fill(*body.T, facecolor=colour, edgecolor=INK, linewidth=0.8, zorder=5)
+    handles = [
+        Line2D([], [], color=INK, linewidth=1.6, label="wall"),
+        Line2D([], [], color="0.62", marker="o", linestyle="", markersize=3, label="landmark"),
+        Line2D([], [], color=INK, linestyle="--", linewidth=0.9, label="measured now"),
+        Line2D([], [], color=INK, linestyle="--", linewidth=0.35, label="seen"),
+        Line2D([], [], color=INK, marker="x", linestyle="", markersize=4.5, label="in view, but hidden"),
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=5, fontsize=7, frameon=False)
+    axes.set_aspect("equal")
+    axes.set_xlim(low[0] - 0.4, high[0] + 0.4)
+    axes.set_ylim(low[1] - 0.4, high[1] + 0.4)
+    axes.set_xlabel("x [m]", fontsize=7)
+    axes.set_ylabel("y [m]", fontsize=7)
+    axes.tick_params(labelsize=7)
+    save_png(figure, file, 150)

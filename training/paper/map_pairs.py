@@ -19,16 +19,12 @@ LOOK_ALIKES = 3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stage:
-    """What both robots hold after some way.
+    """What both robots hold after some way."""
 
-    Attributes:
-        length: That each has driven [m].
-        maps: Of either robot, own start frame; covariances of the mixture, the path's uncertainty included.
-        names: Per robot (N,) int64. The true landmark behind each of its map; `FALSE_POINT`: none.
-    """
-
-    length: float
+    length: float  # That each has driven [m]
+    # Of either robot, own start frame; covariances of the mixture, the path's uncertainty included
     maps: tuple[LandmarkMap, LandmarkMap]
+    # Per robot (N,) int64. The true landmark behind each of its map; `FALSE_POINT`: none.
     names: tuple[IntArray, IntArray]
 
     @property
@@ -39,13 +35,7 @@ class Stage:
 
 
 def simulate_pair(seed: int, length: float, landmarks: int) -> StereoRun:
-    """Draw an office and two robots' ways through it, from crossings of their own.
-
-    Args:
-        seed: An int >= 0.
-        length: Of each robot's way [m].
-        landmarks: N of the office.
-    """
+    """Draw an office and two robots' ways through it, from crossings of their own."""
     return simulate_run(
         RunSpec(
             robots=ROBOTS, length=length, measurements=MEASUREMENTS, landmarks=landmarks, association="unknown",
@@ -62,12 +52,6 @@ def true_motion(run: StereoRun) -> FloatArray:
 
 def map_alone(run: StereoRun, particles: int, seed: int, every: float) -> Iterator[Stage]:
     """Let each robot map by itself, from a start that it takes for the origin.
-
-    Args:
-        run: What the robots do and read.
-        particles: Of each filter.
-        seed: Of the filters' draws.
-        every: Metres between two stages.
 
     Yields:
         Stages, the last at the end of the run.

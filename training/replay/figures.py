@@ -1,4 +1,4 @@
-"""The pictures of a replay: paths and maps against the truth, a panel per robot and joint map, and joint maps alone."""
+"""Pictures of replays: paths and maps against the truth, a panel per robot and joint map, and one filter's replay."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -7,29 +7,30 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Ellipse
 
-from slam_backend.core.validation import FloatArray
+from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.geometry import compose, inverse, transform_points
 from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.readers.mrclam import MrclamLog
-from training.experiments.plotting import save_png
+from training.experiments.plotting import ellipse_95, save_png
 from training.replay.metrics import AlignedMap, PathScore, align_to_truth
 from training.replay.mrclam import Replay
+from training.replay.single_robot import OneReplay, PositionScore
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#B8860B")  # told apart by colour-blind eyes too
 TRUTH = "#9a9a9a"
-CHI_95 = 2.448  # radius of the 95 % ellipse of a planar Gaussian, in standard deviations
 COLUMNS = 3
+
+MARGIN = 0.06  # of the larger extent, around what the picture must show
+STRAY = 0.001  # share of the known positions at each edge that it need not show: a fix may jump by 100 m
+WIDTH = 8.0  # [in]
+OFTEN = 10  # measurements that make a landmark a sure one
 
 
 def draw_replay(file: Path, log: MrclamLog, replay: Replay, paths: Sequence[PathScore | None]) -> None:
     """Draw the replay into a PNG file.
 
     Args:
-        file: Where to write.
-        log: With the truth.
-        replay: What was estimated.
         paths: Scores of `score_path`, per robot; None where the truth is not known.
     """
     joint = [group for group in replay.groups if len(group) > 1]
@@ -53,11 +54,7 @@ def draw_joint_map(
     """Draw the map that a group of robots shares at the end, with their paths, alone into a PNG file.
 
     Args:
-        file: Where to write.
-        log: With the truth.
-        replay: What was estimated.
         paths: Scores of `score_path`, per robot; None where the truth is not known.
-        group: Its robots, counted from 0, as in `Replay.groups`.
     """
     with mpl.rc_context({"font.size": 9, "axes.titlesize": 10}):
         figure = Figure(figsize=(5.2, 7.4), layout="constrained")
@@ -120,16 +117,8 @@ def _own_frame(fitted: AlignedMap | None, path: PathScore | None) -> FloatArray:
 def _draw_landmarks(ax: Axes, landmarks: LandmarkMap, colour: str) -> None:
     """Draw estimated landmarks as dots with 95 % ellipses."""
     for mean, covariance in zip(landmarks.means, landmarks.covariances, strict=True):
-        width, height, angle = _ellipse(covariance[:2, :2])
-        ax.add_patch(Ellipse((mean[0], mean[1]), width, height, angle=angle, fc=colour, ec=colour, alpha=0.3, zorder=4))
+        ax.add_patch(ellipse_95(mean, covariance[:2, :2], fc=colour, ec=colour, alpha=0.3, zorder=4))
     ax.plot(*landmarks.means[:, :2].T, ls="", marker=".", ms=4, color=colour, zorder=5, label="landmarks, 95 %")
-
-
-def _ellipse(covariance: FloatArray) -> tuple[float, float, float]:
-    """Return both diameters [m] and the direction of the first [degrees] of the 95 % ellipse."""
-    values, vectors = np.linalg.eigh(covariance)
-    width, height = 2.0 * CHI_95 * np.sqrt(np.maximum(values, 0.0))
-    return float(width), float(height), float(np.rad2deg(np.arctan2(vectors[1, 0], vectors[0, 0])))
 
 
 def _finish(ax: Axes, log: MrclamLog, title: str) -> None:
@@ -142,3 +131,64 @@ def _finish(ax: Axes, log: MrclamLog, title: str) -> None:
     ax.set_ylabel("y [m]")
     ax.grid(alpha=0.15)
     ax.legend(fontsize=7, loc="best", framealpha=0.8)
+
+
+def draw_one(
+    file: Path, title: str, result: OneReplay, paths: tuple[FloatArray, FloatArray],
+    scores: tuple[PositionScore, PositionScore] | None = None, truth: FloatArray | None = None,
+    truth_label: str = "true path",
+) -> None:  # fmt: skip
+    """Draw a replay into a PNG file, all fitted to the truth, each path by its own SE(2) alignment.
+
+    Dead reckoning may leave the picture, which shows estimate and truth, stray known positions apart; the legend says
+    how many of these lie outside.
+
+    Args:
+        paths: Positions (T, 2) [m], start frame, of the estimate and of dead reckoning.
+        scores: Of both; None without truth: all is then drawn in the start frame.
+    """
+    origin = np.zeros(3)
+    fits = (origin, origin) if scores is None else (scores[0].world_from_path, scores[1].world_from_path)
+    estimate, reckoned = (transform_points(fit, path) for fit, path in zip(fits, paths, strict=True))
+    landmarks = transform_points(fits[0], result.landmarks.means[:, :2])
+    tails = ("", "") if scores is None else tuple(f", {score.aligned:.2f} m RMS" for score in scores)
+    low, high = _window(estimate, truth)
+    with mpl.rc_context({"font.size": 9, "axes.titlesize": 10}):
+        ratio = float(np.clip((high - low)[1] / (high - low)[0], 0.4, 1.6))
+        figure = Figure(figsize=(WIDTH, 0.93 * WIDTH * ratio + 0.6), layout="constrained")
+        ax = figure.subplots()
+        if truth is not None:
+            outside = np.count_nonzero(((truth < low) | (truth > high)).any(axis=1))
+            label = f"{truth_label} ({outside} of {len(truth)} outside)" if outside else truth_label
+            ax.plot(*truth.T, ls="", marker=".", ms=5.0, mew=0.0, color=TRUTH, label=label)
+        _draw_counted(ax, landmarks, result.landmarks.counts)
+        ax.plot(*reckoned.T, color=COLOURS[1], lw=0.8, ls=":", label=f"odometry{tails[1]}")
+        ax.plot(*estimate.T, color=COLOURS[0], lw=0.9, label=f"estimate{tails[0]}")
+        ax.set_aspect("equal", adjustable="box")
+        ax.set_xlim(low[0], high[0])
+        ax.set_ylim(low[1], high[1])
+        ax.set_title(title)
+        ax.set_xlabel("x [m]")
+        ax.set_ylabel("y [m]")
+        ax.grid(alpha=0.15)
+        ax.legend(fontsize=8, loc="best", framealpha=0.85)
+        save_png(figure, file, 100)
+
+
+def _window(estimate: FloatArray, truth: FloatArray | None) -> tuple[FloatArray, FloatArray]:
+    """Return the lower and upper corner (2,) [m] of what the picture shows."""
+    low, high = estimate.min(axis=0), estimate.max(axis=0)
+    if truth is not None:
+        few, most = np.quantile(truth, [STRAY, 1.0 - STRAY], axis=0)
+        low, high = np.minimum(low, few), np.maximum(high, most)
+    room = MARGIN * float((high - low).max()) + 1e-3
+    return low - room, high + room
+
+
+def _draw_counted(ax: Axes, landmarks: FloatArray, counts: IntArray) -> None:
+    """Draw landmarks (N, 2): those measured often full, the others pale."""
+    often = counts >= OFTEN
+    for chosen, alpha, label in ((~often, 0.35, f"seen less than {OFTEN} times"), (often, 1.0, "landmarks")):
+        if chosen.any():
+            label = f"{np.count_nonzero(chosen)} {label}"
+            ax.plot(*landmarks[chosen].T, ls="", marker="o", ms=2.2, color=COLOURS[2], alpha=alpha, label=label)

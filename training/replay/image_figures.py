@@ -14,21 +14,13 @@ KNOWN, NEW, REFUSED, EXPECTED = (90, 200, 90), (60, 170, 250), (70, 70, 230), (2
 
 
 def draw_frame(
-    file: Path,
-    image: Image,
-    pixels: FloatArray,
-    ids: IntArray,
-    counts: dict[int, int],
-    expected: FloatArray,
+    file: Path, image: Image, pixels: FloatArray, ids: IntArray, counts: dict[int, int], expected: FloatArray
 ) -> None:
     """Draw what a filter made of a frame into a PNG file.
 
     Args:
-        file: Where to write.
-        image: (H, W) uint8, the left one.
         pixels: (n, 3) float64 [px]. Column, row and disparity of the points that the filter got.
         ids: (n,) int64. Their landmarks, -1 = refused.
-        counts: How often each landmark was measured.
         expected: (m, 2) float64 [px]. Where landmarks that stand in view are expected.
     """
     canvas = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
@@ -45,11 +37,6 @@ def draw_matches(file: Path, left: Image, right: Image, a: FloatArray, b: FloatA
     """Draw two images one above the other with lines between points (n, 2) [px] that were matched.
 
     Args:
-        file: Where to write.
-        left: (H, W) uint8, drawn above.
-        right: (H', W') uint8, drawn below.
-        a: Points of the first image.
-        b: Their partners in the second one.
         right_ones: Rows of the matches that are right; the others are drawn in red.
     """
     width = max(left.shape[1], right.shape[1])
@@ -68,14 +55,11 @@ def draw_matches(file: Path, left: Image, right: Image, a: FloatArray, b: FloatA
 def expected_pixels(
     landmarks: FloatArray, pose: FloatArray, focal_px: float, centre_px: FloatArray, reach: float
 ) -> FloatArray:
-    """Return where landmarks appear to a level camera, (m, 2) [px]; those behind it or beyond `reach` are left out.
+    """Return where landmarks appear to a level camera, (m, 2) [px]; those behind it or beyond `reach` [m] are not.
 
     Args:
         landmarks: (N, 3) [m], start frame: x ahead, y left, z above the camera.
         pose: (3,) [m, m, rad], start frame. Of the camera.
-        focal_px: Focal length [px].
-        centre_px: (2,) [px]. Column and row of the optical axis.
-        reach: Greatest depth [m].
     """
     local = transform_points(inverse(pose), landmarks)
     local = local[(local[:, 0] > 1.0) & (local[:, 0] < reach)]

@@ -2,17 +2,17 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
-from slam_backend.core.validation import FloatArray, check_float
+from slam_backend.core.validation import FloatArray
 from slam_backend.fastslam.filter import FastSlam
 from slam_backend.fastslam.options import FilterOptions
 from slam_backend.geometry import between, compose
 from slam_backend.readers.kitti import KittiLog, make_camera, motion_noise, steps
-from training.experiments.config import PlainConfig
-from training.replay.config import REJUVENATE_EVERY, check_common
+from slam_backend.trajectory import Trajectory
+from training.replay.config import KittiConfig
 from training.replay.single_robot import (
     PLANAR_GATE,
     OneReplay,
@@ -36,108 +36,68 @@ SEGMENTS = range(100, 801, 100)  # [m] over which KITTI compares motions, from e
 SEGMENT_EVERY = 10
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class KittiConfig(PlainConfig):
-    """All that decides a replay of such a drive; the noise of its velocities is read off the log itself.
-
-    Attributes:
-        path: The archive, or the folder with it.
-        truth: File of the true poses, or None for that beside the archive.
-        duration: Seconds to replay [s], or None for all.
-        particles: Of the filter.
-        estimator: Its proposal.
-        rejuvenate_every: Steps of the log after which particles are drawn anew from smoothed paths, as `FilterOptions`
-            has it; 0: never.
-        seed: Of all random draws.
-        sigma_px: Assumed standard deviation of a feature's column [px]: features creep along while they are tracked.
-        sigma_disparity_px: Assumed standard deviation of its disparity [px]. The rows of both images, which should
-            agree, differ by 0.38 px in `0027.npz`.
-    """
-
-    path: str
-    truth: str | None = None
-    duration: float | None = None
-    particles: int = 100
-    estimator: Literal["fastslam2", "fastslam1"] = "fastslam2"
-    rejuvenate_every: int = REJUVENATE_EVERY
-    seed: int = 0
-    sigma_px: float = 1.0
-    sigma_disparity_px: float = 0.5
-
-    def __post_init__(self) -> None:
-        check_common(self.particles, self.estimator, self.seed, self.duration, self.rejuvenate_every)
-        for name in ("sigma_px", "sigma_disparity_px"):
-            check_float(name, getattr(self, name), "Give pixels.", above=0.0)
-
-
 @dataclass(frozen=True, slots=True, eq=False)
-class KittiScore:
-    """Paths of the left camera against the true one, in the plane.
+class DriveScore:
+    """Paths of the left camera against the true one, in the plane; pairs are of the estimate and of odometry alone."""
 
-    Attributes:
-        truth: (n, 3) float64 [m, m, rad]. At the first n steps.
-        path: (T, 3) float64 [m, m, rad], start frame. Where the estimate puts the camera at each step.
-        reckoned: (T, 3) float64 [m, m, rad], start frame. Likewise dead reckoning.
-        estimate: Score of the estimate.
-        odometry: Score of dead reckoning.
-        loop: Steps (earlier, later) at which the car was at one place again, nearest of all; None if it never was.
-        loop_error: Error [m] of the estimated motion between these two steps; NaN if there are none.
-        drifts: Mean errors of the motions over segments, of the estimate and of dead reckoning; see `mean_drift`.
-        ends: Errors at the last true pose, from the true start, no fit [m], of the estimate and of dead reckoning.
-    """
-
-    truth: FloatArray
-    path: FloatArray
-    reckoned: FloatArray
-    estimate: PositionScore
-    odometry: PositionScore
+    truth: FloatArray  # (n, 3) float64 [m, m, rad]. At the first n steps.
+    # Twice (T, 3) float64 [m, m, rad], start frame. Where the camera is at each step.
+    paths: tuple[FloatArray, FloatArray]
+    scores: tuple[PositionScore, PositionScore]  # Scores of both
+    # Steps (earlier, later) at which the car was at one place again, nearest of all; None if it never was
     loop: tuple[int, int] | None
-    loop_error: float
-    drifts: tuple[float, float]
-    ends: tuple[float, float]
+    loop_error: float  # Error [m] of the estimated motion between these two steps; NaN if there are none
+    drifts: tuple[float, float]  # Mean errors of the motions over segments; see `mean_drift`
+    ends: tuple[float, float]  # Errors at the last true pose, from the true start, no fit [m]
+
+    @property
+    def length(self) -> float:
+        """Length of the true path [m]."""
+        return path_length(self.truth)
 
 
 def replay(log: KittiLog, config: KittiConfig, on_step: Callable[[float], None] = lambda done: None) -> OneReplay:
-    """Let a filter live through a drive; poses are those of the inertial unit.
-
-    Args:
-        log: What `load_kitti` returned.
-        config: Assumptions and sizes.
-        on_step: Called after each step with the share of the drive that is done, in (0, 1].
-    """
+    """Let a filter live through a drive; poses are those of the inertial unit."""
     camera = make_camera(log, config.sigma_px, config.sigma_disparity_px)
     readings = steps(log, camera)
     options = FilterOptions(
-        num_particles=config.particles,
-        camera=camera,
-        motion=motion_noise(log),
-        proposal=config.estimator,
-        rejuvenate_every=config.rejuvenate_every or None,
-        position_gate=PLANAR_GATE,
-        dead_zone=DEAD_ZONE,
-        recovery_position=RECOVERY_POSITION,
-        descriptor_gate=OWN_TRACK,
-    )
+        num_particles=config.particles, camera=camera, motion=motion_noise(log), proposal=config.estimator,
+        rejuvenate_every=config.rejuvenate_every or None, position_gate=PLANAR_GATE, dead_zone=DEAD_ZONE,
+        recovery_position=RECOVERY_POSITION, descriptor_gate=OWN_TRACK,
+    )  # fmt: skip
     slam = FastSlam.from_options(1, options, config.seed)
     read = zip(readings.odometry, readings.measurements, strict=True)
     return replay_one(slam, readings.times, read, on_step)
 
 
-def score(result: OneReplay, log: KittiLog) -> KittiScore | None:
+def score(result: OneReplay, log: KittiLog) -> DriveScore | None:
     """Score a replay against the true path of the camera; None if that is not known."""
-    if log.truth is None:
-        return None
-    truth = log.truth.poses[: len(result.times)]
-    paths = [compose(poses, np.array([*log.mount[:2], 0.0])) for poses in (result.path, result.reckoned)]
-    scores = score_paths(paths, truth)
-    loop = find_loop(truth)
-    error = float("nan")
+    mount = np.array([*log.mount[:2], 0.0])
+    paths = compose(result.path, mount), compose(result.reckoned, mount)
+    return None if log.truth is None else score_drive(paths, log.truth)
+
+
+def score_drive(paths: tuple[FloatArray, FloatArray], trajectory: Trajectory) -> DriveScore:
+    """Score the camera's paths (T, 3) [m, m, rad], start frame, by estimate and odometry, against the true one."""
+    truth = trajectory.poses[: len(paths[0])]
+    one, other = score_paths(paths, truth)
+    loop, error = find_loop(truth), float("nan")
     if loop is not None:
         motions = [between(path[loop[0]], path[loop[1]]) for path in (paths[0], truth)]
         error = float(np.hypot(*(motions[0] - motions[1])[:2]))
-    drifts = (mean_drift(paths[0], truth), mean_drift(paths[1], truth))
-    ends = end_errors(paths, truth)
-    return KittiScore(truth, paths[0], paths[1], scores[0], scores[1], loop, error, drifts, (ends[0], ends[1]))
+    drifts, ends = (mean_drift(paths[0], truth), mean_drift(paths[1], truth)), end_errors(paths, truth)
+    return DriveScore(truth, paths, (one, other), loop, error, drifts, (ends[0], ends[1]))
+
+
+def drive_metrics(scored: DriveScore | None, odometry: str) -> dict[str, float]:
+    """Return the metrics of a drive under the names of `metrics.json`, NaN where the truth is not known."""
+    length, ends, drifts = (
+        (scored.length, scored.ends, scored.drifts) if scored else (np.nan, (np.nan,) * 2, (np.nan,) * 2)
+    )
+    return {
+        "true_path_m": length, "end_error_m": ends[0], "end_error_percent": 100.0 * ends[0] / length,
+        f"{odometry}_end_error_m": ends[1], "mean_drift": drifts[0], f"{odometry}_mean_drift": drifts[1],
+    }  # fmt: skip
 
 
 def mean_drift(path: FloatArray, truth: FloatArray) -> float:
@@ -146,7 +106,6 @@ def mean_drift(path: FloatArray, truth: FloatArray) -> float:
     Segments are of 100, 200, ..., 800 m, and weigh alike (Geiger, Lenz, Urtasun, CVPR 2012).
 
     Args:
-        path: (T, 3) float64 [m, m, rad]. Estimate, any frame.
         truth: (n, 3) float64 [m, m, rad]. At the first n <= T steps, any frame.
 
     Returns:
@@ -173,16 +132,7 @@ def find_loop(truth: FloatArray) -> tuple[int, int] | None:
     return (int(earlier), int(later)) if apart[earlier, later] <= LOOP_WITHIN else None
 
 
-def summarise(result: OneReplay, scored: KittiScore | None) -> dict[str, Any]:
+def summarise(result: OneReplay, scored: DriveScore | None) -> dict[str, Any]:
     """Return the content of `metrics.json`; what cannot be known is NaN, as are errors of the map."""
-    length = path_length(scored.truth) if scored else float("nan")
-    own = {
-        "true_path_m": length,
-        "end_error_m": scored.ends[0] if scored else float("nan"),
-        "end_error_percent": 100.0 * scored.ends[0] / length if scored else float("nan"),
-        "dead_reckoning_end_error_m": scored.ends[1] if scored else float("nan"),
-        "loop_error_m": scored.loop_error if scored else float("nan"),
-        "mean_drift": scored.drifts[0] if scored else float("nan"),
-        "dead_reckoning_mean_drift": scored.drifts[1] if scored else float("nan"),
-    }
-    return metrics_of(result, (scored.estimate, scored.odometry) if scored else None, own)
+    own = drive_metrics(scored, "dead_reckoning") | {"loop_error_m": scored.loop_error if scored else float("nan")}
+    return metrics_of(result, scored.scores if scored else None, own)

@@ -12,54 +12,34 @@ from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.metrics import MapScore, align_se2, ate, map_error, map_rmse
 from slam_backend.readers.mrclam import MrclamLog
 from slam_backend.trajectory import Trajectory
-from training.episodes.attempt_tables import pair_rows
-from training.episodes.consistency_table import consistency_rows
 from training.episodes.metrics import merge_row
-from training.replay.mrclam import Merge, Replay
+from training.episodes.tables import consistency_rows, pair_rows
+from training.replay.mrclam import Replay
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PathScore:
-    """One robot's path against the truth, where there is one.
+    """One robot's path against the truth, where there is one."""
 
-    Attributes:
-        known: (T,) bool. Steps at which the true pose is known.
-        truth: (known steps, 3) float64 [m, m, rad], world frame.
-        world_from_start: (3,) The start frame put at the true start pose.
-        ate_start: [m] With that pose, without fitting.
-        ate_aligned: [m] After SE(2) alignment of the whole path.
-        world_from_path: (3,) That alignment.
-        reckoned_start: [m] As `ate_start`, of dead reckoning.
-        reckoned_aligned: [m] As `ate_aligned`, of dead reckoning.
-        world_from_reckoned: (3,) Its alignment.
-    """
-
-    known: BoolArray
-    truth: FloatArray
-    world_from_start: FloatArray
-    ate_start: float
-    ate_aligned: float
-    world_from_path: FloatArray
-    reckoned_start: float
-    reckoned_aligned: float
-    world_from_reckoned: FloatArray
+    known: BoolArray  # (T,) bool. Steps at which the true pose is known.
+    truth: FloatArray  # (known steps, 3) float64 [m, m, rad], world frame
+    world_from_start: FloatArray  # (3,) The start frame put at the true start pose
+    ate_start: float  # [m] With that pose, without fitting
+    ate_aligned: float  # [m] After SE(2) alignment of the whole path
+    world_from_path: FloatArray  # (3,) That alignment
+    reckoned_start: float  # [m] As `ate_start`, of dead reckoning
+    reckoned_aligned: float  # [m] As `ate_aligned`, of dead reckoning
+    world_from_reckoned: FloatArray  # (3,) Its alignment
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AlignedMap:
-    """A map fitted to the true landmarks that its own claim to be.
+    """A map fitted to the true landmarks that its own claim to be."""
 
-    Attributes:
-        world_from_map: (3,) float64 [m, m, rad]. The fit, over one landmark per true one: the one seen most.
-        landmarks: The map in the world frame.
-        claims: (N,) int64. Row in `MrclamLog.positions` of each landmark.
-        score: RMS error, recall and precision after the fit, in the plane.
-    """
-
-    world_from_map: FloatArray
-    landmarks: LandmarkMap
-    claims: IntArray
-    score: MapScore
+    world_from_map: FloatArray  # (3,) float64 [m, m, rad]. The fit, over one landmark per true one: the one seen most.
+    landmarks: LandmarkMap  # The map in the world frame
+    claims: IntArray  # (N,) int64. Row in `MrclamLog.positions` of each landmark.
+    score: MapScore  # RMS error, recall and precision after the fit, in the plane
 
 
 def score_path(replay: Replay, robot: int, truth: Trajectory | None) -> PathScore | None:
@@ -75,16 +55,10 @@ def score_path(replay: Replay, robot: int, truth: Trajectory | None) -> PathScor
     errors = [ate(compose(start, path), true) for start, path in zip(starts, paths, strict=True)]
     fits = [align_se2(true[:, :2], path[:, :2]) for path in paths]
     return PathScore(
-        known=known,
-        truth=true,
-        world_from_start=starts[0],
-        ate_start=errors[0].start,
-        ate_aligned=errors[0].aligned,
-        world_from_path=fits[0],
-        reckoned_start=errors[1].start,
-        reckoned_aligned=errors[1].aligned,
+        known=known, truth=true, world_from_start=starts[0], ate_start=errors[0].start, ate_aligned=errors[0].aligned,
+        world_from_path=fits[0], reckoned_start=errors[1].start, reckoned_aligned=errors[1].aligned,
         world_from_reckoned=fits[1],
-    )
+    )  # fmt: skip
 
 
 def align_to_truth(landmarks: LandmarkMap, claims: IntArray, log: MrclamLog) -> AlignedMap | None:
@@ -105,21 +79,21 @@ def align_to_truth(landmarks: LandmarkMap, claims: IntArray, log: MrclamLog) -> 
     return AlignedMap(fit, moved, claims, map_rmse(_flat(moved.means), _flat(log.positions), claims))
 
 
-def merge_error(merge: Merge, log: MrclamLog) -> tuple[float, float] | None:
-    """Return how far a merge's motion is off [m, rad]; None if one of the maps cannot be fitted to the truth.
+def motion_error(
+    motion: FloatArray, maps: Sequence[LandmarkMap], claims: Sequence[IntArray], log: MrclamLog
+) -> tuple[float, float] | None:
+    """Return how far the motion between two maps is off [m, rad]; None if one of them cannot be fitted to the truth.
 
     The true motion between two maps is that between their fits to the true landmarks. The true start poses do not
     give it, because each map is turned about its start by what its first steps got wrong.
     """
-    fit_a = align_to_truth(merge.map_a, merge.claims_a, log)
-    fit_b = align_to_truth(merge.map_b, merge.claims_b, log)
-    if fit_a is None or fit_b is None:
+    fits = [align_to_truth(own, named, log) for own, named in zip(maps, claims, strict=True)]
+    if fits[0] is None or fits[1] is None:
         return None
-    true = between(fit_a.world_from_map, fit_b.world_from_map)
-    found = merge.event.alignment.transform
-    middle = merge.map_b.means[:, :2].mean(axis=0)  # where the landmarks lie matters, not a far origin
-    offset = transform_points(found, middle) - transform_points(true, middle)
-    return float(np.hypot(*offset)), abs(float(wrap_angle(found[2] - true[2])))
+    true = between(fits[0].world_from_map, fits[1].world_from_map)
+    middle = maps[1].means[:, :2].mean(axis=0)  # where the landmarks lie matters, not a far origin
+    offset = transform_points(motion, middle) - transform_points(true, middle)
+    return float(np.hypot(*offset)), abs(float(wrap_angle(motion[2] - true[2])))
 
 
 def summarise(replay: Replay, log: MrclamLog, paths: Sequence[PathScore | None]) -> dict[str, Any]:
@@ -138,36 +112,25 @@ def summarise(replay: Replay, log: MrclamLog, paths: Sequence[PathScore | None])
         own_map, claims = replay.maps[robot], replay.claims[robot]
         aligned = align_to_truth(own_map, claims, log)
         start_error, start_rmse = _start_frame_errors(own_map, claims, path, log) if path else (nan, nan)
-        robots.append(
-            {
-                "robot": numbers[robot],
-                "ate_aligned_m": path.ate_aligned if path else nan,
-                "ate_start_m": path.ate_start if path else nan,
-                "dead_reckoning_ate_aligned_m": path.reckoned_aligned if path else nan,
-                "dead_reckoning_ate_start_m": path.reckoned_start if path else nan,
-                "map_rmse_m": aligned.score.rmse if aligned else nan,
-                "map_rmse_aligned_m": aligned.score.rmse if aligned else nan,
-                "map_rmse_start_m": start_rmse,
-                "map_recall": aligned.score.recall if aligned else none,
-                "map_precision": aligned.score.precision if aligned else none,
-                "map_error": start_error,
-            }
-        )
+        rmse, recall, precision = nan, none, none
+        if aligned:
+            rmse, recall, precision = aligned.score.rmse, aligned.score.recall, aligned.score.precision
+        robots.append({
+            "robot": numbers[robot], "ate_aligned_m": path.ate_aligned if path else nan,
+            "ate_start_m": path.ate_start if path else nan,
+            "dead_reckoning_ate_aligned_m": path.reckoned_aligned if path else nan,
+            "dead_reckoning_ate_start_m": path.reckoned_start if path else nan, "map_rmse_m": rmse,
+            "map_rmse_aligned_m": rmse, "map_rmse_start_m": start_rmse, "map_recall": recall,
+            "map_precision": precision, "map_error": start_error,
+        })  # fmt: skip
     merges = []
     for merge in replay.merges:
-        error = merge_error(merge, log)
-        merges.append(
-            merge_row(
-                merge.event.step,
-                merge.time,
-                [numbers[robot] for robot in merge.event.robots_a],
-                [numbers[robot] for robot in merge.event.robots_b],
-                len(merge.event.alignment.inliers),
-                error[0] if error else nan,
-                float(np.rad2deg(error[1])) if error else nan,
-                merge.undone,
-            )
-        )
+        maps, named_by = (merge.map_a, merge.map_b), (merge.claims_a, merge.claims_b)
+        error = motion_error(merge.event.alignment.transform, maps, named_by, log)
+        one, other = ([numbers[robot] for robot in side] for side in (merge.event.robots_a, merge.event.robots_b))
+        off = (error[0], float(np.rad2deg(error[1]))) if error else (nan, nan)
+        shared = len(merge.event.alignment.inliers)
+        merges.append(merge_row(merge.event.step, merge.time, one, other, shared, *off, merge.undone))
     duration = float(replay.times[-1] - replay.times[0])
     return {
         "robots": robots, "merges": merges, "groups": named, "coverage": nan,

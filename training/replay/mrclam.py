@@ -5,12 +5,12 @@ The default odometry noise was calibrated on data sets 7 and 4: their figures ar
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from slam_backend.core.validation import FloatArray, IntArray, bad_argument, check_choice, check_float
+from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.fastslam.consistency import Consistency
 from slam_backend.fastslam.reports import MergeEvent, TeamReport
 from slam_backend.maps.alignment import AlignmentOptions
@@ -18,33 +18,18 @@ from slam_backend.maps.alignment_types import PairAttempts
 from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.models.measurements import Measurements
 from slam_backend.models.odometry import OdometryModel
-from slam_backend.readers.mrclam import Drive, MrclamLog, SightingNoise, steps
+from slam_backend.readers.mrclam import MrclamLog, steps
 from slam_backend.team.merge_scheduler import AttemptOptions
 from slam_backend.team.team import TeamSlam
-from training.experiments.config import PlainConfig
-from training.replay.config import REJUVENATE_EVERY, check_common
-from training.replay.rejuvenation_counts import RejuvenationCount
-from training.replay.single_robot import PLANAR_GATE
+from training.replay.config import MRCLAM_MOTION, MrclamConfig
+from training.replay.single_robot import PLANAR_GATE, RejuvenationCount
 from vslam_env.evaluation.map_scores import ClaimLedger
 
-IDENTITIES = ("given", "hidden")
 # A joint filter's particles are weighed by what all its robots see, and die out so much faster: with the starts known,
 # five robots in 100 particles were 13 % farther from their paths than in 500.
 PARTICLES_PER_ROBOT = 100
 
-# Calibrated on data sets 7 and 4. The odometry is the command. Against the truth of six robots (five of data set 7, one
-# of 4) it is followed 0.2 s late, over four seconds at 0.91 to 0.94 of its speed and at 0.94 to 0.98 of its turn. What
-# remains between two steps of 0.25 s is 23 to 27 % of the distance, 5 to 7 % of it sideways, and in heading up to 0.9
-# rad/m and 17 % of the turn.
-DRIVE = Drive(delay=0.2, speed=0.93, turn=0.95)
-MOTION = OdometryModel(
-    sigma_along=0.25,
-    sigma_across=0.07,
-    sigma_heading=0.7,
-    sigma_turn=0.15,
-    floor_position=0.001,
-    floor_heading=0.004,
-)
+MOTION = OdometryModel(**MRCLAM_MOTION)
 # Identities given: a barcode cannot be taken for another, so position need not tell landmarks apart and the gate only
 # stops nonsense; nor does a barcode ever start a second landmark. Identities hidden: all landmarks look alike, and the
 # gate is that of two degrees of freedom, as all is seen in one plane; one landmark is new only far beyond it. With one
@@ -60,122 +45,48 @@ LANDMARKS_NOT_SHARED = 1
 MAX_SIGMA_HEADING = 0.05
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ReplayConfig(PlainConfig):
-    """All that decides a replay.
-
-    Attributes:
-        path: Folder of the log.
-        robots: Numbers of the robots, or None for all.
-        duration: Seconds to replay [s], or None for all.
-        truth: File of the true poses, for one robot whose folder lacks them; None: the folder's own.
-        identities: "given": filters see the barcodes. "hidden": they see positions alone.
-        alone: Whether each robot stays by itself; else those whose maps can be aligned become one team.
-        particles: Per filter; None: 100 for each robot that may come to share it.
-        estimator: Proposal of the filters.
-        rejuvenate_every: Steps of the log after which particles are drawn anew from smoothed paths, as `FilterOptions`
-            has it; 0: never.
-        dt: Time between steps [s].
-        seed: Of all random draws.
-        drive: How robots are taken to follow their commands, the same for all. The default was calibrated on data sets
-            7 and 4.
-        motion: Assumed noise of the odometry that results, the same for all robots. The default was calibrated on data
-            sets 7 and 4.
-        sensor: Assumed noise of the sightings, the same for all robots. The default was calibrated on these, too.
-    """
-
-    path: str
-    robots: tuple[int, ...] | None = None
-    duration: float | None = None
-    truth: str | None = None
-    identities: Literal["given", "hidden"] = "given"
-    alone: bool = False
-    particles: int | None = None
-    estimator: Literal["fastslam2", "fastslam1"] = "fastslam2"
-    rejuvenate_every: int = REJUVENATE_EVERY
-    dt: float = 0.25
-    seed: int = 0
-    drive: Drive = DRIVE
-    motion: OdometryModel = MOTION
-    sensor: SightingNoise = field(default_factory=SightingNoise)
-
-    def __post_init__(self) -> None:
-        particles = 1 if self.particles is None else self.particles
-        check_common(particles, self.estimator, self.seed, self.duration, self.rejuvenate_every)
-        check_choice("identities", self.identities, IDENTITIES)
-        if not isinstance(self.alone, bool):
-            raise bad_argument("alone", "a bool", self.alone, "Say true or false.")
-        check_float("dt", self.dt, "Give seconds between steps.", above=0.0)
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Merge:
-    """One merge, with the maps as they were just before it, straightened, without landmarks first seen in that step.
+    """One merge, with the maps as they were just before it, straightened, without landmarks first seen in that step."""
 
-    Attributes:
-        time: Seconds since the first step [s].
-        event: The merge; its robots count from 0.
-        map_a: Of the group whose frame stays.
-        map_b: Of the other group.
-        claims_a: (N,) int64. Row in `MrclamLog.positions` of the landmark whose sighting began each one of `map_a`.
-        claims_b: Likewise of `map_b`.
-        undone: When the team took it back, seconds since the first step [s]; None: it is in force.
-    """
-
-    time: float
-    event: MergeEvent
-    map_a: LandmarkMap
-    map_b: LandmarkMap
+    time: float  # Seconds since the first step [s]
+    event: MergeEvent  # The merge; its robots count from 0
+    map_a: LandmarkMap  # Of the group whose frame stays
+    map_b: LandmarkMap  # Of the other group
+    # (N,) int64. Row in `MrclamLog.positions` of the landmark whose sighting began each one of `map_a`.
     claims_a: IntArray
-    claims_b: IntArray
-    undone: float | None = None
+    claims_b: IntArray  # Likewise of `map_b`
+    undone: float | None = None  # When the team took it back, seconds since the first step [s]; None: it is in force
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Replay:
-    """What the team estimated. K robots, T steps.
+    """What the team estimated. K robots, T steps."""
 
-    Attributes:
-        times: (T,) float64 [s]. Of the log's clock.
-        paths: (K, T, 3) float64 [m, m, rad]. Estimated at each step from what was known then, own start frames.
-        reckoned: (K, T, 3) float64 [m, m, rad]. Dead reckoning of the commands, own start frames.
-        maps: Of each robot's group at the end, moved to the robot's own start frame.
-        claims: Per robot (N,) int64. Row in `MrclamLog.positions` of the landmark whose sighting began each one of its
-            map; kept beside the filters, which need not know it.
-        start_from_group: (K, 3) float64 [m, m, rad]. From its group's map frame to each robot's start frame.
-        groups: Robots, counted from 0, that share a map at the end.
-        merges: In order.
-        attempts: How often two maps were compared.
-        pairs: Outcome of these attempts, by pairs of groups; None: each robot stays by itself.
-        rejuvenations: What came of drawing particles anew, all filters together, see `RejuvenationCount.to_mapping`.
-        consistency: Per robot whether its filter at the end errs as little as it claims.
-        seconds: What the filters took to live through the log [s].
-    """
-
-    times: FloatArray
+    times: FloatArray  # (T,) float64 [s]. Of the log's clock.
+    # (K, T, 3) float64 [m, m, rad]. Estimated at each step from what was known then, own start frames.
     paths: FloatArray
-    reckoned: FloatArray
-    maps: tuple[LandmarkMap, ...]
+    reckoned: FloatArray  # (K, T, 3) float64 [m, m, rad]. Dead reckoning of the commands, own start frames.
+    maps: tuple[LandmarkMap, ...]  # Of each robot's group at the end, moved to the robot's own start frame
+    # Per robot (N,) int64. Row in `MrclamLog.positions` of the landmark whose sighting began each one of its map; kept
+    # beside the filters, which need not know it.
     claims: tuple[IntArray, ...]
-    start_from_group: FloatArray
-    groups: tuple[tuple[int, ...], ...]
-    merges: tuple[Merge, ...]
-    attempts: int
+    start_from_group: FloatArray  # (K, 3) float64 [m, m, rad]. From its group's map frame to each robot's start frame.
+    groups: tuple[tuple[int, ...], ...]  # Robots, counted from 0, that share a map at the end
+    merges: tuple[Merge, ...]  # In order
+    attempts: int  # How often two maps were compared
+    # Outcome of these attempts, by pairs of groups; None: each robot stays by itself
     pairs: tuple[PairAttempts, ...] | None
+    # What came of drawing particles anew, all filters together, see `RejuvenationCount.to_mapping`
     rejuvenations: dict[str, Any]
-    consistency: tuple[Consistency, ...]
-    seconds: float
+    consistency: tuple[Consistency, ...]  # Per robot whether its filter at the end errs as little as it claims
+    seconds: float  # What the filters took to live through the log [s]
 
 
-def replay(
-    log: MrclamLog, config: ReplayConfig, on_step: Callable[[float, TeamReport], None] = lambda progress, report: None
+def replay_team(
+    log: MrclamLog, config: MrclamConfig, on_step: Callable[[float, TeamReport], None] = lambda progress, report: None
 ) -> Replay:
     """Let a team of filters live through a log.
-
-    Args:
-        log: Of the robots that the config names.
-        config: Assumptions and sizes.
-        on_step: Called after each step with the share of the log that is done, in (0, 1], and the team's report.
 
     Returns:
         Paths as they were known at each step, maps and merges as they came.
@@ -221,23 +132,15 @@ def replay(
     frames = np.array([team.start_from_group(robot) for robot in robots])
     maps_of = [team.map(robot) for robot in robots]
     return Replay(
-        times=readings.times,
-        paths=paths,
-        reckoned=np.array([own.reckoned for own in readings.robots]),
+        times=readings.times, paths=paths, reckoned=np.array([own.reckoned for own in readings.robots]),
         maps=tuple(own.moved(frame) for own, frame in zip(maps_of, frames, strict=True)),
-        claims=tuple(ledger.claims(robot, maps_of[robot].ids) for robot in robots),
-        start_from_group=frames,
-        groups=team.groups,
-        merges=tuple(merges),
-        attempts=attempts,
-        pairs=None if config.alone else team.pair_attempts,
-        rejuvenations=rejuvenations.to_mapping(),
-        consistency=tuple(map(team.consistency, robots)),
-        seconds=seconds,
-    )
+        claims=tuple(ledger.claims(robot, maps_of[robot].ids) for robot in robots), start_from_group=frames,
+        groups=team.groups, merges=tuple(merges), attempts=attempts, pairs=None if config.alone else team.pair_attempts,
+        rejuvenations=rejuvenations.to_mapping(), consistency=tuple(map(team.consistency, robots)), seconds=seconds,
+    )  # fmt: skip
 
 
-def _make_team(log: MrclamLog, config: ReplayConfig) -> TeamSlam:
+def _make_team(log: MrclamLog, config: MrclamConfig) -> TeamSlam:
     """Return the team before the first step."""
     sharing = 1 if config.alone else len(log.robots)
     particles = PARTICLES_PER_ROBOT * sharing if config.particles is None else config.particles
@@ -248,14 +151,9 @@ def _make_team(log: MrclamLog, config: ReplayConfig) -> TeamSlam:
             min_inliers=max(3, len(log.subjects) - LANDMARKS_NOT_SHARED),
             max_sigma_heading=MAX_SIGMA_HEADING,
         ),
-        attempts=AttemptOptions(new_candidates=1),
-        seed=config.seed,
-        num_particles=particles,
-        motion=config.motion,
-        proposal=config.estimator,
-        rejuvenate_every=config.rejuvenate_every or None,
-        **GATES[config.identities],
-    )
+        attempts=AttemptOptions(new_candidates=1), seed=config.seed, num_particles=particles, motion=config.motion,
+        proposal=config.estimator, rejuvenate_every=config.rejuvenate_every or None, **GATES[config.identities],
+    )  # fmt: skip
 
 
 def _those_of(landmarks: LandmarkMap, known: LandmarkMap) -> LandmarkMap:

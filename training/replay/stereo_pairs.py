@@ -3,13 +3,13 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from slam_backend.core.validation import FloatArray, bad_argument, check_choice, check_float, check_int
-from slam_backend.frontend import DESCRIPTORS, KINDS, CornerOptions, FrontEndOptions, StereoFrame, StereoFrontEnd
+from slam_backend.core.validation import FloatArray, bad_argument
+from slam_backend.frontend import KINDS, CornerOptions, FrontEndOptions, StereoFrame, StereoFrontEnd
 from slam_backend.frontend.images import Image
 from slam_backend.frontend.odometry import CameraMotion, camera_motion
 from slam_backend.geometry3d import rotation_angle
@@ -18,7 +18,7 @@ from slam_backend.models.camera import ROBOT_FROM_CAMERA, StereoCamera
 from slam_backend.readers.calibration import Rectified, Rectifier
 from slam_backend.readers.kitti_images import read_grey
 from slam_backend.readers.stereo_files import StereoFiles, find_pairs, load_rig, truth_file
-from training.experiments.config import PlainConfig
+from training.replay.config import PairsConfig
 
 FILES = StereoFiles()
 POSES_FILE = "poses_dev.txt"
@@ -28,78 +28,28 @@ SIGMA_PX, SIGMA_DISPARITY_PX = 0.5, 0.3
 ITERATIONS = 2000
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PairsConfig(PlainConfig):
-    """All that decides the alignment of two pairs.
-
-    Attributes:
-        path: Folder of the images.
-        left: Images of the left eye, as `StereoFiles` has it; so are the next three.
-        right: Images of the right eye.
-        calibration: Calibration of the rig.
-        truth: File of the two true poses; None: `poses_dev.txt`, if it is there.
-        seed: Of RANSAC's samples.
-        descriptor: "usurf", "sift" or "orb".
-        max_range: Points farther than this are dropped [m].
-    """
-
-    path: str
-    left: str = FILES.left
-    right: str = FILES.right
-    calibration: str = FILES.calibration
-    truth: str | None = None
-    seed: int = 0
-    descriptor: Literal["usurf", "sift", "orb"] = "usurf"
-    max_range: float = 12.0
-
-    def __post_init__(self) -> None:
-        check_int("seed", self.seed, 0, "Use 0 or a positive number.")
-        check_choice("descriptor", self.descriptor, DESCRIPTORS)
-        check_float("max_range", self.max_range, "Give metres.", above=0.0)
-
-    @property
-    def files(self) -> StereoFiles:
-        """The names of the files."""
-        return StereoFiles(left=self.left, right=self.right, calibration=self.calibration, truth=self.truth)
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class RoomPairs:
-    """Two stereo pairs of one room.
+    """Two stereo pairs of one room."""
 
-    Attributes:
-        images: Per place the left and right image, as they were taken.
-        rectifier: Of the rig.
-        poses: Per place (4, 4) float64 [m], the body in the world; None where not known.
-    """
-
-    images: tuple[tuple[Image, Image], tuple[Image, Image]]
-    rectifier: Rectifier | Rectified
+    images: tuple[tuple[Image, Image], tuple[Image, Image]]  # Per place the left and right image, as they were taken
+    rectifier: Rectifier | Rectified  # Of the rig
+    # Per place (4, 4) float64 [m], the body in the world; None where not known
     poses: tuple[FloatArray, FloatArray] | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PairsResult:
-    """How two local maps fit together.
+    """How two local maps fit together."""
 
-    Attributes:
-        images: Per place the rectified left image.
-        frames: Per place its points.
-        motion: From the second camera to the first; None if no motion was found.
-        error_m: Of the translation [m]; NaN where not known.
-        error_deg: Of the rotation [degrees]; likewise.
-        true_m: Distance between the places [m]; likewise.
-        true_deg: Angle between them [degrees]; likewise.
-        maps: Per place the map of its points: x ahead of the left camera, y to the left, z up.
-    """
-
-    images: tuple[Image, Image]
-    frames: tuple[StereoFrame, StereoFrame]
-    motion: CameraMotion | None
-    error_m: float
-    error_deg: float
-    true_m: float
-    true_deg: float
+    images: tuple[Image, Image]  # Per place the rectified left image
+    frames: tuple[StereoFrame, StereoFrame]  # Per place its points
+    motion: CameraMotion | None  # From the second camera to the first; None if no motion was found
+    error_m: float  # Of the translation [m]; NaN where not known
+    error_deg: float  # Of the rotation [degrees]; likewise
+    true_m: float  # Distance between the places [m]; likewise
+    true_deg: float  # Angle between them [degrees]; likewise
+    # Per place the map of its points: x ahead of the left camera, y to the left, z up
     maps: tuple[LandmarkMap, LandmarkMap]
 
 
@@ -107,7 +57,6 @@ def load_pairs(path: str | Path, files: StereoFiles = FILES) -> RoomPairs:
     """Read two pairs, their calibration and, if they are there, their poses.
 
     Args:
-        path: Folder of the images.
         files: Names within it. `truth` has two rows of an image, a quaternion w x y z and a position, or of a 3 x 4
             matrix; None: `poses_dev.txt`, if it is there.
 
@@ -123,10 +72,9 @@ def load_pairs(path: str | Path, files: StereoFiles = FILES) -> RoomPairs:
     file, usual = truth_file(path, files), Path(path) / POSES_FILE
     file = usual if file is None and usual.is_file() else file
     return RoomPairs(
-        images=(images[0], images[1]),
-        rectifier=load_rig(path, files.calibration, (width, height)),
+        images=(images[0], images[1]), rectifier=load_rig(path, files.calibration, (width, height)),
         poses=None if file is None else _read_poses(file),
-    )
+    )  # fmt: skip
 
 
 def align_pairs(log: RoomPairs, config: PairsConfig) -> PairsResult:
@@ -134,11 +82,7 @@ def align_pairs(log: RoomPairs, config: PairsConfig) -> PairsResult:
     rectifier = log.rectifier
     size = rectifier.camera
     camera = rectifier.pair.camera(
-        size.width,
-        size.height,
-        max_range=config.max_range,
-        sigma_px=SIGMA_PX,
-        sigma_disparity_px=SIGMA_DISPARITY_PX,
+        size.width, size.height, max_range=config.max_range, sigma_px=SIGMA_PX, sigma_disparity_px=SIGMA_DISPARITY_PX
     )
     seen = FrontEndOptions(descriptor=config.descriptor, corners=CornerOptions(most=CORNERS))
     eye = StereoFrontEnd(camera, seen, rectifier.pair.centre_px)
@@ -175,12 +119,9 @@ def summarise_pairs(results: Mapping[str, PairsResult]) -> dict[str, Any]:
         rows[name] = {
             "points": [len(frame.measurements) for frame in result.frames],
             "matches": 0 if motion is None else len(motion.pairs),
-            "inliers": 0 if motion is None else int(motion.inliers.sum()),
-            "error_m": result.error_m,
-            "error_deg": result.error_deg,
-            "true_m": result.true_m,
-            "true_deg": result.true_deg,
-        }
+            "inliers": 0 if motion is None else int(motion.inliers.sum()), "error_m": result.error_m,
+            "error_deg": result.error_deg, "true_m": result.true_m, "true_deg": result.true_deg,
+        }  # fmt: skip
     return {"alignments": rows, "robots": [], "merges": [], "groups": [], "coverage": float("nan")}
 
 

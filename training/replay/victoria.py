@@ -1,8 +1,8 @@
 """The replay of a log of Victoria Park: trees without names, matched by where they stand, and GPS as the truth."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Any, Literal
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -13,24 +13,11 @@ from slam_backend.geometry import compose, transform_points
 from slam_backend.metrics import align_se2
 from slam_backend.models.camera import ROBOT_FROM_CAMERA, StereoCamera
 from slam_backend.models.measurements import Measurements
-from slam_backend.models.odometry import OdometryModel
-from slam_backend.readers.victoria import SENSOR, TreeNoise, VictoriaLog, steps
+from slam_backend.readers.victoria import SENSOR, VictoriaLog, steps
 from slam_backend.trajectory import Trajectory
-from training.experiments.config import PlainConfig
-from training.replay.config import REJUVENATE_EVERY, check_common
+from training.replay.config import VictoriaConfig
 from training.replay.single_robot import PLANAR_GATE, OneReplay, PositionScore, metrics_of, replay_one, score_positions
 
-# Against the motion that fits the trees of two scans best, a second apart, the odometry turns 4 % and 0.0014 rad/m too
-# little, drifts 2 % sideways, and scatters by 1.5 % of the distance, 0.002 rad/m and the noise of the trees. What it
-# gets wrong persists, while a filter draws anew at each step: hence more than that.
-MOTION = OdometryModel(
-    sigma_along=0.03,
-    sigma_across=0.03,
-    sigma_heading=0.01,
-    sigma_turn=0.1,
-    floor_position=0.005,
-    floor_heading=0.001,
-)
 # Trees stand metres apart: what lies within 1.5 m of a known one, or is not far beyond its gate, is no new one.
 DEAD_ZONE = 40.0
 DEAD_RADIUS = 1.5
@@ -45,77 +32,25 @@ NO_WEIGHT = 1e6  # [m]; as the deviation of what tells trees apart
 KNOWN_START = 30.0  # [m] of the path that show where it starts: a GPS fix has no heading
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class VictoriaConfig(PlainConfig):
-    """All that decides a replay of such a log.
-
-    Attributes:
-        path: Folder of the log.
-        duration: Seconds to replay [s], or None for all.
-        particles: Of the filter.
-        estimator: Its proposal.
-        rejuvenate_every: Steps of the log after which particles are drawn anew from smoothed paths, as `FilterOptions`
-            has it; 0: never.
-        seed: Of all random draws.
-        motion: Assumed noise of the odometry.
-        sensor: Assumed noise of the trees' readings.
-    """
-
-    path: str
-    duration: float | None = None
-    particles: int = 100
-    estimator: Literal["fastslam2", "fastslam1"] = "fastslam2"
-    rejuvenate_every: int = REJUVENATE_EVERY
-    seed: int = 0
-    motion: OdometryModel = MOTION
-    sensor: TreeNoise = field(default_factory=TreeNoise)
-
-    def __post_init__(self) -> None:
-        check_common(self.particles, self.estimator, self.seed, self.duration, self.rejuvenate_every)
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class VictoriaScore:
-    """Paths of the antenna against the GPS fixes during the replay.
+    """Paths of the antenna against the GPS fixes during the replay."""
 
-    Attributes:
-        fixes: (g, 2) float64 [m]. East and north.
-        path: (T, 2) float64 [m], start frame. Where the estimate puts the antenna at each step.
-        reckoned: (T, 2) float64 [m], start frame. Likewise dead reckoning.
-        estimate: Score of the estimate at the fixes.
-        odometry: Score of dead reckoning there.
-    """
-
-    fixes: FloatArray
-    path: FloatArray
-    reckoned: FloatArray
-    estimate: PositionScore
-    odometry: PositionScore
+    fixes: FloatArray  # (g, 2) float64 [m]. East and north.
+    # Twice (T, 2) float64 [m], start frame. Where estimate and dead reckoning put the antenna at each step.
+    paths: tuple[FloatArray, FloatArray]
+    scores: tuple[PositionScore, PositionScore]  # Scores of both at the fixes
 
 
 def replay(log: VictoriaLog, config: VictoriaConfig, on_step: Callable[[float], None] = lambda done: None) -> OneReplay:
-    """Let a filter live through a log; poses are those of the rear axle.
-
-    Args:
-        log: What `load_victoria` returned.
-        config: Assumptions and sizes.
-        on_step: Called after each step with the share of the log that is done, in (0, 1].
-    """
+    """Let a filter live through a log; poses are those of the rear axle."""
     readings = steps(log, config.sensor)
     options = FilterOptions(
-        num_particles=config.particles,
-        camera=StereoCamera(mount=SENSOR),
-        motion=config.motion,
-        proposal=config.estimator,
-        rejuvenate_every=config.rejuvenate_every or None,
-        position_gate=PLANAR_GATE,
-        dead_zone=DEAD_ZONE,
-        dead_radius=DEAD_RADIUS,
-        new_landmark_density=NEW_LANDMARK_DENSITY,
-        recovery_position=RECOVERY_POSITION,
-        descriptor_gate=SEARCH_RADIUS,
-        descriptor_sigma=NO_WEIGHT,
-    )
+        num_particles=config.particles, camera=StereoCamera(mount=SENSOR), motion=config.motion,
+        proposal=config.estimator, rejuvenate_every=config.rejuvenate_every or None, position_gate=PLANAR_GATE,
+        dead_zone=DEAD_ZONE, dead_radius=DEAD_RADIUS, new_landmark_density=NEW_LANDMARK_DENSITY,
+        recovery_position=RECOVERY_POSITION, descriptor_gate=SEARCH_RADIUS, descriptor_sigma=NO_WEIGHT,
+    )  # fmt: skip
     slam = FastSlam.from_options(1, options, config.seed)
     read = zip(readings.odometry, readings.measurements, strict=True)
     return replay_one(slam, readings.times, read, on_step, describe_by_place)
@@ -147,7 +82,7 @@ def score(result: OneReplay, log: VictoriaLog) -> VictoriaScore | None:
         travelled = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
         first = np.flatnonzero(travelled <= KNOWN_START)
         scores.append(score_positions(points, fixes, align_se2(fixes[first], points[first])))
-    return VictoriaScore(fixes, paths[0][:, :2], paths[1][:, :2], scores[0], scores[1])
+    return VictoriaScore(fixes, (paths[0][:, :2], paths[1][:, :2]), (scores[0], scores[1]))
 
 
 def summarise(result: OneReplay, scored: VictoriaScore | None) -> dict[str, Any]:
@@ -160,12 +95,9 @@ def summarise(result: OneReplay, scored: VictoriaScore | None) -> dict[str, Any]
     often = int(np.count_nonzero(result.landmarks.counts >= 10))
     if scored is None:
         return metrics_of(result, None, {}, gps=None, landmarks_seen_ten_times=often)
-    errors = scored.estimate.errors
+    errors = scored.scores[0].errors
     gps = {
-        "fixes": len(scored.fixes),
-        "rms_m": scored.estimate.aligned,
-        "median_m": float(np.median(errors)),
-        "percentile_95_m": float(np.quantile(errors, 0.95)),
-        "worst_m": float(errors.max()),
-    }
-    return metrics_of(result, (scored.estimate, scored.odometry), {}, gps=gps, landmarks_seen_ten_times=often)
+        "fixes": len(scored.fixes), "rms_m": scored.scores[0].aligned, "median_m": float(np.median(errors)),
+        "percentile_95_m": float(np.quantile(errors, 0.95)), "worst_m": float(errors.max()),
+    }  # fmt: skip
+    return metrics_of(result, scored.scores, {}, gps=gps, landmarks_seen_ten_times=often)

@@ -16,11 +16,6 @@ Row = dict[str, float]
 class TrainingWatch(BaseCallback):  # type: ignore[misc]   # its types are not looked at
     """Sums up the episodes of each rollout, and saves and stops between rollouts only.
 
-    Args:
-        env: What is trained on.
-        save: Called between two rollouts when a checkpoint is due.
-        every: A checkpoint is due after so many rollouts.
-
     Attributes:
         rows: Of all rollouts so far: `steps`, means over the episodes that ended of `return`, of `LAST` at their end,
             of `invalid_actions` and of each reward term's sum.
@@ -48,9 +43,7 @@ class TrainingWatch(BaseCallback):  # type: ignore[misc]   # its types are not l
         """Be told of rollouts, and be asked whether to stop.
 
         Args:
-            on_update: Called with the row of each rollout.
             should_stop: Asked between two rollouts; then a checkpoint is saved and the training ends.
-            on_step: Called with the number of decisions so far, after each step of all environments.
         """
         self._tell, self._should_stop, self._count = on_update, should_stop, on_step
 

@@ -23,20 +23,13 @@ def write_checkpoint(file: Path, content: Mapping[str, Any]) -> None:
 
     The file holds data alone: to read it runs no code of the file's.
 
-    Args:
-        file: Where to.
-        content: Plain values, arrays, and states of environments.
-
     Raises:
         ValueError: If it cannot be written.
     """
     packed = encoded(dict(content), ENV_KINDS)
     mark = {
-        "format": FORMAT,
-        "versions": _versions(),
-        "bytes": len(packed),
-        "sha256": hashlib.sha256(packed).hexdigest(),
-    }
+        "format": FORMAT, "versions": _versions(), "bytes": len(packed), "sha256": hashlib.sha256(packed).hexdigest(),
+    }  # fmt: skip
     write_file(file, MAGIC + json.dumps(mark).encode() + b"\n" + packed, "out")
 
 

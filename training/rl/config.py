@@ -1,98 +1,81 @@
-"""`TrainConfig`: all that decides a training, its presets, and the environments that it stands for."""
+"""`TrainConfig` and `EvaluateConfig`: everything that decides a training and its evaluation, and their environments."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from slam_backend.core.validation import bad_argument, check_choice, check_float, check_int
-from training.experiments.config import PlainConfig
-from vslam_env.config import MAX_ROBOTS, EnvConfig
-from vslam_env.presets import PRESETS, preset_config
-from vslam_env.world import WORLD_FAMILIES, check_source, is_one_building
+from pydantic import Field
+
+from training.experiments.config import ExperimentConfig, NoisePreset, Positive, first_seed, option, setting
+
+if TYPE_CHECKING:  # what computes is imported when a command runs, so that --help answers at once
+    from vslam_env.config import EnvConfig
 
 SPLIT_TRAIN, SPLIT_TRY = "train", "validation"
+NEEDED = ("torch", "stable_baselines3", "sb3_contrib", "tensorboard")
+MODEL = "model"
+ONE = "Give a number of at least one."
+Share = Annotated[float, Field(gt=0.0, le=1.0)]
+TRAIN_PRESETS: dict[str, dict[str, Any]] = {
+    "quick": {},
+    # Seconds only: to see that everything works.
+    "smoke": {"world": "fig5", "robots": 2, "particles": 5, "max_cycles": 4, "envs": 2, "steps": 48, "batch": 16,
+              "epochs": 2, "checkpoint_updates": 1},
+}  # fmt: skip
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TrainConfig(PlainConfig):
+class TrainConfig(ExperimentConfig):
     """MaskablePPO with one network for all robots and `goal` actions.
 
     A rollout is one episode of every robot. What is left out has the value of the preset `quick`.
-
-    Attributes:
-        preset: The name that it began with.
-        world: A family name, or the path of a floor plan, a JSON file or a folder.
-        robots: K.
-        noise: `"easy"`, `"standard"` or `"hard"`: the preset of the environment.
-        particles: Of each filter.
-        straighten: Whether filters are rejuvenated, and maps straightened before they are merged, as in the environment
-            by default: it makes maps truer and keeps wrong merges out, and here takes most of the time.
-        decision_ticks: Ticks of 0.1 s from a decision to the next.
-        max_cycles: Decisions of an episode.
-        reward: Weights of the named reward terms.
-        envs: Environments side by side.
-        steps: Decisions of all robots together, rounded up to whole rollouts.
-        batch: Decisions per step of the optimiser.
-        epochs: Times that each rollout is gone through.
-        learning_rate: At the start; it falls linearly to zero.
-        gamma: Discount per decision: one per tick, to the power of `decision_ticks`. 0.999 per tick would be 0.98.
-        gae_lambda: Of the generalised advantage estimate.
-        clip: Of PPO's ratio.
-        entropy: Weight of the entropy bonus.
-        checkpoint_updates: A checkpoint is written every so many rollouts.
-        seed: Of all random draws.
     """
 
-    preset: str = "quick"
-    world: str = "office"
-    robots: int = 3
-    noise: str = "standard"
-    particles: int = 30
-    straighten: bool = False
-    decision_ticks: int = 20
-    max_cycles: int = 45
-    reward: Mapping[str, float] = field(default_factory=lambda: {"map_error": 3.0, "own_coverage": 10.0})
-    envs: int = 16
-    steps: int = 64_800
-    batch: int = 360
-    epochs: int = 10
-    learning_rate: float = 1.5e-3
-    gamma: float = 0.95
-    gae_lambda: float = 0.5
-    clip: float = 0.2
-    entropy: float = 0.002
-    checkpoint_updates: int = 5
-    seed: int = 0
+    preset: Literal["quick", "smoke"] = option("quick", "quick or smoke.")
+    world: str = option("office", "A family or a path; see vslam worlds list.")
+    robots: int = option(3, "Number of robots, 1 to 8.", ge=1, le=8, hint="Use 1 to 8 robots.")
+    noise: NoisePreset = setting("standard", "Preset of the environment.")
+    particles: Positive = setting(30, "Particles of each filter.")
+    straighten: bool = setting(
+        False,
+        "Rejuvenate filters, and straighten maps before they are merged, as in the environment by default: "
+        "it makes maps truer and keeps wrong merges out, and here takes most of the time.",
+    )
+    decision_ticks: Positive = setting(20, "Ticks of 0.1 s from a decision to the next.")
+    max_cycles: Positive = setting(45, "Decisions of an episode.")
+    reward: Mapping[str, float] = setting({"map_error": 3.0, "own_coverage": 10.0}, "Weights of the terms.")
+    envs: int = option(16, "Environments side by side.", ge=1, hint=ONE)
+    steps: int = option(64_800, "Decisions of all robots together, rounded up to whole rollouts.", ge=1, hint=ONE)
+    batch: int = setting(360, "Decisions per step of the optimiser, whose advantages are compared.", ge=2)
+    epochs: Positive = setting(10, "Passes over each rollout.")
+    learning_rate: float = setting(1.5e-3, "At the start; it falls linearly to zero.", gt=0.0)
+    gamma: Share = setting(
+        0.95, "Discount per decision: one per tick, to the power of `decision_ticks`. 0.999 per tick: 0.98."
+    )
+    gae_lambda: Share = setting(0.5, "Of the generalised advantage estimate.")
+    clip: float = setting(0.2, "Clip range of PPO's ratio.", gt=0.0)
+    entropy: float = setting(0.002, "Weight of the entropy bonus.", ge=0.0)
+    checkpoint_updates: Positive = setting(5, "Rollouts between checkpoints.")
 
-    def __post_init__(self) -> None:
-        check_choice("preset", self.preset, tuple(TRAIN_PRESETS))
-        check_choice("noise", self.noise, PRESETS)
-        if check_int("robots", self.robots, 1, "Use 1 to 8 robots.") > MAX_ROBOTS:
-            raise bad_argument("robots", f"an int from 1 to {MAX_ROBOTS}", self.robots, "Use 1 to 8 robots.")
-        for name in ("particles", "decision_ticks", "max_cycles", "envs", "steps", "epochs", "checkpoint_updates"):
-            check_int(name, getattr(self, name), 1, "Give a number of at least one.")
-        check_int("batch", self.batch, 2, "The advantages of a batch are compared: give two or more.")
-        check_int("seed", self.seed, 0, "Use 0 or a positive number.")
-        check_float("learning_rate", self.learning_rate, "1e-3 is a good start.", above=0.0)
-        for name in ("gamma", "gae_lambda"):
-            check_float(name, getattr(self, name), "Use a share, e.g. 0.98.", above=0.0, at_most=1.0)
-        check_float("clip", self.clip, "0.2 is usual.", above=0.0)
-        check_float("entropy", self.entropy, "Use 0 for no bonus.", at_least=0.0)
+    def check(self) -> None:
+        """Refuse what the environment refuses."""
+        from vslam_env.world import check_source
+
         check_source(self.world)
-        self.make_env_config(SPLIT_TRAIN)  # what the environment refuses shows here
+        self.make_env_config(SPLIT_TRAIN)
 
     @classmethod
     def completed(cls, values: Mapping[str, Any]) -> Mapping[str, Any]:
         """Take what is left out from the preset."""
-        preset = check_choice("preset", values.get("preset", "quick"), tuple(TRAIN_PRESETS))
-        return {**TRAIN_PRESETS[preset], "preset": preset, **values}
+        return {**TRAIN_PRESETS.get(str(values.get("preset", "quick")), {}), **values}
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the plain values that repeat this training from any folder, the seed apart."""
-        is_path = self.world not in WORLD_FAMILIES
-        told = {"world": str(Path(self.world).resolve()) if is_path else self.world}
-        return PlainConfig.to_mapping(self) | told
+        from vslam_env.world import WORLD_FAMILIES
+
+        world = self.world if self.world in WORLD_FAMILIES else str(Path(self.world).resolve())
+        return super().to_mapping() | {"world": world}
 
     @property
     def rollout(self) -> int:
@@ -104,31 +87,94 @@ class TrainConfig(PlainConfig):
         """Rollouts, each followed by an update of the network."""
         return -(-self.steps // self.rollout)
 
-    def make_env_config(self, split: str | None) -> EnvConfig:
+    def make_env_config(self, split: str | None) -> "EnvConfig":
         """Return the environment for worlds of a split; files of one building have none."""
+        from vslam_env.presets import preset_config
+        from vslam_env.world import is_one_building
+
         return preset_config(self.noise).replace(
-            world=self.world,
-            world_split=split if self.has_splits else None,
-            num_robots=self.robots,
-            action_type="goal",
-            decision_ticks=self.decision_ticks,
-            max_cycles=self.max_cycles,
+            world=self.world, world_split=None if is_one_building(self.world) else split, num_robots=self.robots,
+            action_type="goal", decision_ticks=self.decision_ticks, max_cycles=self.max_cycles,
             reward=dict(self.reward),
             belief={
                 "filter": {"num_particles": self.particles} | ({} if self.straighten else {"rejuvenate_every": None}),
                 "merging": {"straighten": self.straighten},
             },
-        )
-
-    @property
-    def has_splits(self) -> bool:
-        """Whether its worlds are many, so that some can be kept for validation."""
-        return not is_one_building(self.world)
+        )  # fmt: skip
 
 
-TRAIN_PRESETS: dict[str, dict[str, Any]] = {
-    "quick": {},
-    # Seconds only: to see that everything works.
-    "smoke": {"world": "fig5", "robots": 2, "particles": 5, "max_cycles": 4, "envs": 2, "steps": 48, "batch": 16,
-              "epochs": 2, "checkpoint_updates": 1},
-}  # fmt: skip
+@dataclass(frozen=True, slots=True)
+class EvaluateTrial:
+    """One policy in one episode."""
+
+    policy: str
+    seed: int
+
+
+class EvaluateConfig(ExperimentConfig):
+    """A trained model beside scripted policies; all decide as often as the model was trained to."""
+
+    model: str = option(..., "A model that vslam train wrote, or its run folder.", is_path=True, is_argument=True)
+    policies: tuple[str, ...] = option(("random_goals", "frontier"), "Policies to compare with, with commas between.")
+    split: Literal["validation", "test"] = option("validation", "validation or test worlds.")
+    world: str | None = option(None, "A family or a path.", shown="that of the training")
+    robots: int | None = option(None, "Number of robots, 1 to 8.", shown="those of the training")
+    max_cycles: int | None = option(None, "Decisions of an episode.", shown="as in the training")
+    greedy: bool = option(False, "Take the model's best action, rather than one drawn from its distribution.")
+    seeds: int = option(20, "Episodes of each policy.", ge=2, hint="An interval needs two or more.")
+    seed: int = first_seed()
+
+    def check(self) -> None:
+        """Refuse policies that are not there, or cannot choose goals."""
+        from agents.registry import make_policy
+
+        for name in self.policies:
+            make_policy(name, "goal")
+
+    @classmethod
+    def completed(cls, values: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Refuse an evaluation of no model."""
+        from slam_backend.core.validation import bad_argument
+
+        if "model" not in values:
+            raise bad_argument("model", "a model that vslam train wrote", "no model", "Name it, or its run folder.")
+        return values
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return the plain values that repeat this evaluation from any folder, the seed apart."""
+        return super().to_mapping() | {"model": str(Path(self.model).resolve())}
+
+    def environment(self) -> "EnvConfig":
+        """Return the environment; its return is the fall of the map error, whatever the model was paid for.
+
+        Raises:
+            ValueError: If the model cannot be read, or knows another kind of environment.
+        """
+        from agents.trained import load_model
+        from vslam_env.config import EnvConfig
+        from vslam_env.world import is_one_building
+
+        config = EnvConfig.from_toml_text(load_model(self.model)[1]["environment"])
+        given = {"world": self.world, "num_robots": self.robots, "max_cycles": self.max_cycles}
+        changes: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
+        changes["world_split"] = None if is_one_building(changes.get("world", config.world)) else self.split
+        return config.replace(**changes, reward={"map_error": 1.0}, shared_reward=False)
+
+    def trials(self) -> list[EvaluateTrial]:
+        """Return all trials, seed by seed."""
+        names = (MODEL, *self.policies)
+        return [EvaluateTrial(name, seed) for seed in range(self.seed, self.seed + self.seeds) for name in names]
+
+
+def require_extra() -> None:
+    """Refuse to go on without the packages of the extra `train`.
+
+    Raises:
+        ValueError: If one is missing.
+    """
+    from slam_backend.core.validation import bad_argument
+
+    missing = [name for name in NEEDED if find_spec(name) is None]
+    if missing:
+        cure = "Install them: pip install torch==2.13.0, which is small, then pip install '.[train]' in a checkout."
+        raise bad_argument("train", "the packages of the extra 'train'", f"no {', '.join(missing)}", cure)

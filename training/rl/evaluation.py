@@ -1,102 +1,32 @@
-"""`EvaluateConfig`: a trained model beside scripted policies, each on the same worlds it has never seen; one trial."""
+"""A trained model beside scripted policies, each on the same worlds it has never seen: one trial, and all summed up."""
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rich.console import Console
 
 from agents.policy import Policy
 from agents.registry import make_policy
 from agents.trained import TrainedGoals, load_model
-from slam_backend.core.validation import bad_argument, check_choice, check_int
 from training.episodes.runner import run_episode
-from training.experiments.config import PlainConfig
+from training.experiments.statistics import ahead_by, mean_of, shown, summarise_means
+from training.experiments.tables import console_table
+from training.rl.config import MODEL, EvaluateConfig, EvaluateTrial
 from vslam_env import vslam_v0
-from vslam_env.config import EnvConfig
 from vslam_env.environment import ExplorationEnv
-from vslam_env.world import is_one_building
 
-COMMAND = "evaluate"
-MODEL = "model"
-BASELINES = ("random_goals", "frontier")
-SPLITS = ("validation", "test")
 LAST = ("map_error", "map_recall", "map_precision", "coverage", "merges", "collisions", "distance")
 FIGURES = ("return", *LAST)
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class EvaluateConfig(PlainConfig):
-    """All that decides an evaluation. All policies decide as often as the model was trained to.
-
-    Attributes:
-        model: Path of the model, or of its run folder.
-        policies: Beside the model.
-        split: Worlds of `"validation"` or `"test"`.
-        world: None: that of the training.
-        robots: None: as many as in the training.
-        max_cycles: Decisions of an episode; None: as in the training.
-        greedy: Whether the model takes what it holds for best; else it draws from its distribution.
-        seeds: How many episodes of each policy.
-        seed: Of the first; the others follow.
-    """
-
-    model: str
-    policies: tuple[str, ...] = BASELINES
-    split: str = "validation"
-    world: str | None = None
-    robots: int | None = None
-    max_cycles: int | None = None
-    greedy: bool = False
-    seeds: int = 20
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        check_int("seeds", self.seeds, 2, "An interval needs two or more.")
-        check_int("seed", self.seed, 0, "Use 0 or a positive number.")
-        check_choice("split", self.split, SPLITS)
-        for name in self.policies:
-            make_policy(name, "goal")  # refuses what is not there, or cannot choose goals
-
-    @classmethod
-    def completed(cls, values: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Refuse an evaluation of no model."""
-        if "model" not in values:
-            raise bad_argument("model", "a model that vslam train wrote", "no model", "Name it, or its run folder.")
-        return values
-
-    def to_mapping(self) -> dict[str, Any]:
-        """Return the plain values that repeat this evaluation from any folder, the seed apart."""
-        return PlainConfig.to_mapping(self) | {"model": str(Path(self.model).resolve())}
-
-    def environment(self) -> EnvConfig:
-        """Return the environment; its return is the fall of the map error, whatever the model was paid for.
-
-        Raises:
-            ValueError: If the model cannot be read, or knows another kind of environment.
-        """
-        _, about = load_model(self.model)
-        config = EnvConfig.from_toml_text(about["environment"])
-        given = {"world": self.world, "num_robots": self.robots, "max_cycles": self.max_cycles}
-        changes: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
-        world = changes.get("world", config.world)
-        changes["world_split"] = None if is_one_building(world) else self.split
-        return config.replace(**changes, reward={"map_error": 1.0}, shared_reward=False)
-
-    def trials(self) -> list["EvaluateTrial"]:
-        """Return all trials, seed by seed."""
-        names = (MODEL, *self.policies)
-        return [EvaluateTrial(name, seed) for seed in range(self.seed, self.seed + self.seeds) for name in names]
-
-
-@dataclass(frozen=True, slots=True)
-class EvaluateTrial:
-    """One policy in one episode."""
-
-    policy: str
-    seed: int
+Rows = Sequence[Mapping[str, Any]]
+SHOWN = {
+    "return": "return [m]", "map_error": "map error [m]", "map_recall": "recall", "coverage": "floor",
+    "merges": "merges", "distance": "way [m]",
+}  # fmt: skip
+WITH_INTERVAL = ("return", "map_error")  # the others have theirs in metrics.json
 
 
 def play(config: EvaluateConfig, trial: EvaluateTrial) -> dict[str, Any]:
@@ -116,3 +46,53 @@ def _environment(config: EvaluateConfig) -> ExplorationEnv:
 
 def _policy(config: EvaluateConfig, name: str) -> Policy:
     return TrainedGoals(load_model(config.model)[0], config.greedy) if name == MODEL else make_policy(name, "goal")
+
+
+def summarise(rows: Rows) -> list[dict[str, Any]]:
+    """Return a line per policy: its seeds, and of each figure the mean and its interval."""
+    return summarise_means(rows, ("policy",), FIGURES)
+
+
+def leads(rows: Rows) -> list[dict[str, Any]]:
+    """Return per other policy by how much the model's return is higher on the same seeds.
+
+    Fields: `over`, `seeds` (those that both have played), `lead` with `lead_low` and `lead_high` (95 %, bootstrap),
+    `won`: the share of seeds in which the model's is higher.
+    """
+    returns: dict[str, dict[int, float]] = {}
+    for row in rows:
+        returns.setdefault(row["policy"], {})[row["seed"]] = row["return"]
+    own = returns.pop(MODEL, {})
+    found = []
+    for name, theirs in returns.items():
+        ahead = ahead_by(own, theirs)
+        if len(ahead):
+            told = {"over": name, "seeds": len(ahead), "won": float((ahead > 0.0).mean())}
+            found.append(told | mean_of("lead", ahead))
+    return found
+
+
+def print_evaluation(console: Console, lines: Rows, ahead: Rows, split: str | None) -> None:
+    """Print a table, which 80 columns hold, and a line for each lead.
+
+    Args:
+        split: Of the worlds; None where all episodes are in the same building.
+    """
+    played = sorted({line["seeds"] for line in lines})
+    episodes = "-".join(str(n) for n in (played if len(played) < 2 else (played[0], played[-1])))
+    rows = [
+        [
+            line["policy"],
+            *(shown(line, name, stacked=True) if name in WITH_INTERVAL else f"{line[name]:.2f}" for name in SHOWN),
+        ]
+        for line in lines
+    ]
+    worlds = "One building" if split is None else f"Worlds of the {split} split"
+    title = f"{worlds}, {episodes} episodes of each policy"
+    console.print(console_table(title, ["policy", *SHOWN.values()], rows))
+    for lead in ahead:
+        console.print(
+            f"model - {lead['over']}: {shown(lead, 'lead')} m of return, ahead in {100.0 * lead['won']:.0f} % "
+            f"of {lead['seeds']} seeds",
+            soft_wrap=True,
+        )

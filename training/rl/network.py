@@ -21,11 +21,9 @@ class GoalFeatures(BaseFeaturesExtractor):  # type: ignore[misc]   # its types a
         super().__init__(observation_space, CONTEXT + 6 * NUM_SLOTS)
         first, second = PATCHES
         self.picture = nn.Sequential(
-            nn.Conv2d(3, CHANNELS[0], first, first),
+            nn.Conv2d(3, CHANNELS[0], first, first), nn.ReLU(), nn.Conv2d(CHANNELS[0], CHANNELS[1], second, second),
             nn.ReLU(),
-            nn.Conv2d(CHANNELS[0], CHANNELS[1], second, second),
-            nn.ReLU(),
-        )
+        )  # fmt: skip
         self.picture_out = nn.Linear(PICTURE_SIZE, CONTEXT)
         self.context = nn.Linear(CONTEXT + VECTOR_SIZE, CONTEXT)
         for name, scale in {**VECTORS, "candidates": CANDIDATE_SCALE}.items():

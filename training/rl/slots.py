@@ -16,25 +16,19 @@ MakeEnv = Callable[[], ParallelEnv[str, Any, Any]]
 Infos = list[dict[str, Any]]
 WHOLE = ""  # names the one array of observations that are not dicts
 MASK = "action_mask"
+NOTHING_SENT = "step_wait: expected actions that were sent, got none. Call step_async() first."
 Layout = tuple[tuple[str, tuple[int, ...], np.dtype[Any]], ...]  # names, shapes and types of observations
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stepped:
-    """What all slots saw in a step.
+    """What all slots saw in a step."""
 
-    Attributes:
-        observations: Arrays (S, ...) by name, as `stacked` makes them; nobody else holds them.
-        rewards: (S,) float32.
-        dones: (S,) bool. The slot's episode has ended and its observation is the first of the next one.
-        infos: One dict per slot.
-        spent: (P, 2) float64 [s]. What the environments of each process took: on the clock, and of its processor.
-    """
-
-    observations: dict[str, NDArray[Any]]
-    rewards: Float32Array
-    dones: BoolArray
-    infos: Infos
+    observations: dict[str, NDArray[Any]]  # Arrays (S, ...) by name, as `stacked` makes them; nobody else holds them
+    rewards: Float32Array  # (S,) float32
+    dones: BoolArray  # (S,) bool. The slot's episode has ended and its observation is the first of the next one.
+    infos: Infos  # One dict per slot
+    # (P, 2) float64 [s]. What the environments of each process took: on the clock, and of its processor.
     spent: FloatArray
 
 
@@ -132,10 +126,6 @@ class SlotBatch:
     ) -> tuple[dict[str, NDArray[Any]], Infos]:
         """Reset all environments.
 
-        Args:
-            seeds: Per environment; None: go on with its stream.
-            options: Per environment.
-
         Returns:
             Observations (S, ...) by name, and infos.
         """
@@ -146,8 +136,8 @@ class SlotBatch:
         observations, infos = map(self._by_slot, zip(*told, strict=True))
         return stacked(self.layout, observations), infos
 
-    def send(self, actions: NDArray[Any]) -> None:
-        """Step all environments with actions (S, ...); `receive` hands out what came of it."""
+    def step(self, actions: NDArray[Any]) -> Stepped:
+        """Step all environments with actions (S, ...)."""
         chosen = iter(actions)  # each environment takes as many as it has agents
         wanted = [dict(zip(agents, chosen, strict=False)) for agents in self._agents]
         begin = time.perf_counter(), time.process_time()
@@ -156,13 +146,16 @@ class SlotBatch:
         begun = [each[0] if env.agents else env.reset()[0] for env, each in zip(self.envs, told, strict=True)]
         spent = np.array([[time.perf_counter() - begin[0], time.process_time() - begin[1]]])
         last, rewards, over, cut, infos = map(self._by_slot, zip(*told, strict=True))
-        dones = np.logical_or(over, cut)
         for info, terminated, truncated, observation in zip(infos, over, cut, last, strict=True):
             info["TimeLimit.truncated"] = truncated and not terminated
             if terminated or truncated:
                 info["terminal_observation"] = observation
         observations = stacked(self.layout, self._by_slot(begun))
-        self._results = Stepped(observations, np.array(rewards, np.float32), dones, infos, spent)
+        return Stepped(observations, np.array(rewards, np.float32), np.logical_or(over, cut), infos, spent)
+
+    def send(self, actions: NDArray[Any]) -> None:
+        """Step with actions (S, ...); `receive` hands out what came of it."""
+        self._results = self.step(actions)
 
     def receive(self) -> Stepped:
         """Return what the last `send` led to.
@@ -171,30 +164,27 @@ class SlotBatch:
             RuntimeError: If nothing was sent.
         """
         if self._results is None:
-            raise RuntimeError("step_wait: expected actions that were sent, got none. Call step_async() first.")
+            raise RuntimeError(NOTHING_SENT)
         results, self._results = self._results, None
         return results
 
-    def get(self, name: str, slots: Sequence[int]) -> list[Any]:
-        """Return an attribute of the environments of some slots."""
-        return [getattr(self.slots[slot], name) for slot in slots]
+    def ask(self, command: str, slots: Sequence[int], name: str, *rest: Any) -> list[Any]:
+        """Get, set, look for or call an attribute of some slots, once per slot.
 
-    def has(self, name: str) -> bool:
-        """Tell whether all slots have an attribute."""
-        return all(hasattr(slot, name) for slot in self.slots)
-
-    def set(self, name: str, slots: Sequence[int], value: Any) -> None:
-        """Set an attribute of the environments of some slots."""
-        for slot in slots:
-            setattr(self.slots[slot].env, name, value)
-
-    def call(self, name: str, slots: Sequence[int], args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> list[Any]:
-        """Call a method of the environments of some slots, once per slot."""
-        return [getattr(self.slots[slot], name)(*args, **kwargs) for slot in slots]
-
-    def images(self) -> list[NDArray[np.uint8] | None]:
-        """Return a picture of each environment."""
-        return [env.render() for env in self.envs]
+        Args:
+            command: `"get"`, `"set"`, `"has"` or `"call"`.
+            name: The attribute; one that a slot lacks is its environment's.
+            rest: Value to set, or arguments and keyword arguments of the call.
+        """
+        chosen = [self.slots[slot] for slot in slots]
+        if command == "has":
+            return [hasattr(slot, name) for slot in chosen]
+        if command == "set":
+            for slot in chosen:
+                setattr(slot.env, name, *rest)
+            return [None] * len(chosen)
+        found = [getattr(slot, name) for slot in chosen]
+        return found if command == "get" else [method(*rest[0], **rest[1]) for method in found]
 
     def close(self) -> None:
         """Close all environments."""

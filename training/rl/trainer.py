@@ -30,7 +30,6 @@ class Training:
     in one process or several, as long as machine and packages are the same.
 
     Args:
-        config: What is trained, and how.
         folder: Where checkpoint, model and TensorBoard curves go.
         workers: Processes that step the environments; 0: this one.
         device: `"cpu"`, `"cuda"` or one of several, as torch names them.
@@ -49,19 +48,10 @@ class Training:
         self.config, self._folder = config, folder
         self.env = make_vec_env(config.make_env_config(SPLIT_TRAIN), config.envs, workers)
         self.model = MaskablePPO(
-            GoalPolicy,
-            self.env,
-            learning_rate=lambda left: left * config.learning_rate,
-            n_steps=config.max_cycles,
-            batch_size=config.batch,
-            n_epochs=config.epochs,
-            gamma=config.gamma,
-            gae_lambda=config.gae_lambda,
-            clip_range=config.clip,
-            ent_coef=config.entropy,
-            seed=config.seed,
-            device=device,
-        )
+            GoalPolicy, self.env, learning_rate=lambda left: left * config.learning_rate, n_steps=config.max_cycles,
+            batch_size=config.batch, n_epochs=config.epochs, gamma=config.gamma, gae_lambda=config.gae_lambda,
+            clip_range=config.clip, ent_coef=config.entropy, seed=config.seed, device=device,
+        )  # fmt: skip
         self.watch = TrainingWatch(self.env, self.save, config.checkpoint_updates)
 
     @property
@@ -110,11 +100,9 @@ class Training:
         """Write the model that `agents.trained` plays."""
         about = {
             "version": installed_versions()["vslam-env"],
-            "environment": self.config.make_env_config(SPLIT_TRY).to_toml(),
-            "steps": int(self.model.num_timesteps),
-            "seed": self.config.seed,
-            "config": self.config.to_mapping(),
-        }
+            "environment": self.config.make_env_config(SPLIT_TRY).to_toml(), "steps": int(self.model.num_timesteps),
+            "seed": self.config.seed, "config": self.config.to_mapping(),
+        }  # fmt: skip
         save_model(file, self.model.policy.actor_weights(), about)
 
     def restore(self, kept: Mapping[str, Any]) -> None:

@@ -1,11 +1,10 @@
 """`SlotWorkers`: the environments of a `SlotBatch` divided among processes; observations come by shared memory."""
 
 import atexit
-import os
 import time
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from functools import partial
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
@@ -18,8 +17,8 @@ from numpy.typing import NDArray
 
 from slam_backend.core.validation import bad_argument
 from training.experiments.interrupt import begin_worker, signals_held
-from training.experiments.trial_store import SINGLE_THREAD
-from training.rl.slots import Infos, Layout, MakeEnv, SlotBatch, Stepped, buffers
+from training.experiments.trial_store import one_thread_each
+from training.rl.slots import NOTHING_SENT, Infos, Layout, MakeEnv, SlotBatch, Stepped, buffers
 
 CLOSE_S = 5.0  # workers that have not ended by then are killed
 
@@ -71,7 +70,7 @@ class SlotWorkers:
         ends = [0, *np.cumsum(self.counts).tolist()]
         self._kill = partial(_kill, self._processes)
         atexit.register(self._kill)  # comes before multiprocessing's own, which sends SIGTERM and waits
-        with _single_threaded(), signals_held():
+        with one_thread_each(), signals_held():
             for share in np.array_split(np.arange(len(makers)), workers):
                 envs = slice(int(share[0]), int(share[-1]) + 1)
                 slots = slice(ends[envs.start], ends[envs.stop])
@@ -112,33 +111,26 @@ class SlotWorkers:
             RuntimeError: If nothing was sent.
         """
         if not self._sent:
-            raise RuntimeError("step_wait: expected actions that were sent, got none. Call step_async() first.")
+            raise RuntimeError(NOTHING_SENT)
         self._sent = False
         told = self._answers()
         rewards, dones, spent = (np.concatenate([each[part] for each in told]) for part in (0, 1, 2))
         return Stepped(self._copied(), rewards, dones, [info for each in told for info in each[3]], spent)
 
-    def get(self, name: str, slots: Sequence[int]) -> list[Any]:
-        """Return an attribute of the environments of some slots."""
-        return self._by_slot("get", slots, name)
-
-    def has(self, name: str) -> bool:
-        """Tell whether all slots have an attribute."""
+    def ask(self, command: str, slots: Sequence[int], name: str, *rest: Any) -> list[Any]:
+        """Get, set, look for or call an attribute of some slots, as `SlotBatch` does; what comes back is pickled."""
         self._settle()
-        return all(self._ask_all([("has", name)] * len(self._pipes)))
-
-    def set(self, name: str, slots: Sequence[int], value: Any) -> None:
-        """Set an attribute of the environments of some slots."""
-        self._by_slot("set", slots, name, value)
-
-    def call(self, name: str, slots: Sequence[int], args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> list[Any]:
-        """Call a method of the environments of some slots, once per slot; what it returns is pickled."""
-        return self._by_slot("call", slots, name, args, dict(kwargs))
-
-    def images(self) -> list[NDArray[np.uint8] | None]:
-        """Return a picture of each environment."""
-        self._settle()
-        return [image for images in self._ask_all([("images",)] * len(self._pipes)) for image in images]
+        asked: dict[int, list[int]] = {}
+        for slot in slots:
+            worker = next(w for w, part in enumerate(self._slots) if part.start <= slot < part.stop)
+            asked.setdefault(worker, []).append(slot)
+        for worker, theirs in asked.items():
+            local = [slot - self._slots[worker].start for slot in theirs]
+            self._send(self._pipes[worker], ("ask", command, local, name, *rest))
+        found: dict[int, Any] = {}
+        for worker, theirs in asked.items():
+            found |= dict(zip(theirs, self._answer(worker), strict=True))
+        return [found[slot] for slot in slots]
 
     def close(self) -> None:
         """End all processes."""
@@ -164,22 +156,6 @@ class SlotWorkers:
             raise RuntimeError("environments: expected running workers, got closed ones. Make new ones.")
         if self._sent:
             self.receive()
-
-    def _by_slot(self, command: str, slots: Sequence[int], name: str, *rest: Any) -> list[Any]:
-        """Ask the workers of some slots, and return the answers in the order of the slots."""
-        self._settle()
-        asked: dict[int, list[int]] = {}
-        for slot in slots:
-            worker = next(w for w, part in enumerate(self._slots) if part.start <= slot < part.stop)
-            asked.setdefault(worker, []).append(slot)
-        for worker, theirs in asked.items():
-            local = [slot - self._slots[worker].start for slot in theirs]
-            self._send(self._pipes[worker], (command, name, local, *rest))
-        found: dict[int, Any] = {}
-        for worker, theirs in asked.items():
-            answer = self._answer(worker)
-            found |= dict(zip(theirs, answer if answer is not None else [None] * len(theirs), strict=True))
-        return [found[slot] for slot in slots]
 
     def _ask_all(self, messages: Sequence[tuple[Any, ...]]) -> list[Any]:
         for pipe, message in zip(self._pipes, messages, strict=True):
@@ -276,8 +252,7 @@ def _noted(error: Exception) -> Exception:
 def _obey(batch: SlotBatch, rows: Mapping[str, NDArray[Any]], command: str, rest: Sequence[Any]) -> Any:
     """Carry out a command; observations go to the shared rows, the answer is what else there is to tell."""
     if command == "step":
-        batch.send(rest[0])
-        stepped = batch.receive()
+        stepped = batch.step(rest[0])
         _show(rows, stepped.observations)
         return stepped.rewards, stepped.dones, stepped.spent, stepped.infos
     if command == "reset":
@@ -290,18 +265,3 @@ def _obey(batch: SlotBatch, rows: Mapping[str, NDArray[Any]], command: str, rest
 def _show(rows: Mapping[str, NDArray[Any]], observations: Mapping[str, NDArray[Any]]) -> None:
     for name, array in observations.items():
         rows[name][...] = array
-
-
-@contextmanager
-def _single_threaded() -> Iterator[None]:
-    """Start processes whose libraries use one thread each: more would only get in the others' way."""
-    before = {name: os.environ.get(name) for name in SINGLE_THREAD}
-    os.environ |= dict.fromkeys(SINGLE_THREAD, "1")
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value

@@ -28,30 +28,19 @@ LEAST_DECREASE = 1e-12  # of the cost, relative: converged
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BatchEstimate:
-    """The estimate of maximum likelihood, and its covariance to first order.
+    """The estimate of maximum likelihood, and its covariance to first order."""
 
-    Attributes:
-        paths: (K, T, 3) float64 [m, m, rad], world frame; the first poses are given.
-        landmarks: (L, 3) float64 [m], world frame.
-        names: (L,) int64. The run's own indices of the landmarks.
-        path_covariances: (K, T, 3, 3) float64; 0 at the first poses.
-        landmark_covariances: (L, 3, 3) float64 [m^2].
-        cost: Sum of squared whitened residuals (of their robust loss, with a kernel); chi-square without.
-        freedom: Its degrees of freedom, residuals less unknowns.
-        gradient: Largest slope of the cost that is left, in units of the unknown's own curvature: how many standard
-            deviations a single unknown would still move.
-        iterations: Steps of the descent.
-    """
-
-    paths: FloatArray
-    landmarks: FloatArray
-    names: IntArray
-    path_covariances: FloatArray
-    landmark_covariances: FloatArray
-    cost: float
-    freedom: int
+    paths: FloatArray  # (K, T, 3) float64 [m, m, rad], world frame; the first poses are given
+    landmarks: FloatArray  # (L, 3) float64 [m], world frame
+    names: IntArray  # (L,) int64. The run's own indices of the landmarks.
+    path_covariances: FloatArray  # (K, T, 3, 3) float64; 0 at the first poses
+    landmark_covariances: FloatArray  # (L, 3, 3) float64 [m^2]
+    cost: float  # Sum of squared whitened residuals (of their robust loss, with a kernel); chi-square without
+    freedom: int  # Its degrees of freedom, residuals less unknowns
+    # Largest slope of the cost that is left, in units of the unknown's own curvature: how many standard deviations a
+    # single unknown would still move
     gradient: float
-    iterations: int
+    iterations: int  # Steps of the descent
 
 
 def batch_ml(problem: BatchProblem, start: Estimate | None = None, robust: float | None = None) -> BatchEstimate:
@@ -78,16 +67,11 @@ def batch_ml(problem: BatchProblem, start: Estimate | None = None, robust: float
     path_covariances, landmark_covariances = system.covariances()
     residuals = 3 * len(problem.points) + problem.odometry.size
     return BatchEstimate(
-        paths=best.paths,
-        landmarks=best.landmarks,
-        names=problem.names,
-        path_covariances=path_covariances,
-        landmark_covariances=landmark_covariances,
-        cost=system.cost,
-        freedom=residuals - problem.odometry.size - best.landmarks.size,
-        gradient=system.largest_slope(),
+        paths=best.paths, landmarks=best.landmarks, names=problem.names, path_covariances=path_covariances,
+        landmark_covariances=landmark_covariances, cost=system.cost,
+        freedom=residuals - problem.odometry.size - best.landmarks.size, gradient=system.largest_slope(),
         iterations=iterations + more,
-    )
+    )  # fmt: skip
 
 
 def _descend(problem: BatchProblem, at: Estimate, robust: float | None, metric: bool) -> tuple[Estimate, int]:

@@ -13,74 +13,45 @@ from training.bench.accuracy.runs import FALSE_POINT, StereoRun
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Estimate:
-    """Paths and landmarks at which residuals are evaluated.
+    """Paths and landmarks at which residuals are evaluated."""
 
-    Attributes:
-        paths: (K, T, 3) float64 [m, m, rad], world frame.
-        landmarks: (L, 3) float64 [m], world frame, in the order of `BatchProblem.names`.
-    """
-
-    paths: FloatArray
-    landmarks: FloatArray
+    paths: FloatArray  # (K, T, 3) float64 [m, m, rad], world frame
+    landmarks: FloatArray  # (L, 3) float64 [m], world frame, in the order of `BatchProblem.names`
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sights:
-    """Whitened residuals of n measurements, standard normal at the truth.
+    """Whitened residuals of n measurements, standard normal at the truth."""
 
-    Attributes:
-        residuals: (n, 3) float64 [-].
-        by_pose: (n, 3, 3) float64. Derivative with respect to the pose (x, y, theta) of the robot that measured.
-        by_landmark: (n, 3, 3) float64. With respect to the landmark.
-        in_front: Whether all landmarks lie ahead of the cameras that measured them, as they must.
-    """
-
-    residuals: FloatArray
+    residuals: FloatArray  # (n, 3) float64 [-]
+    # (n, 3, 3) float64. Derivative with respect to the pose (x, y, theta) of the robot that measured.
     by_pose: FloatArray
-    by_landmark: FloatArray
-    in_front: bool
+    by_landmark: FloatArray  # (n, 3, 3) float64. With respect to the landmark.
+    in_front: bool  # Whether all landmarks lie ahead of the cameras that measured them, as they must
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Moves:
-    """Whitened residuals of the odometry from each pose to the next.
+    """Whitened residuals of the odometry from each pose to the next."""
 
-    Attributes:
-        residuals: (K, T - 1, 3) float64 [-].
-        by_first: (K, T - 1, 3, 3) float64. Derivative with respect to the earlier pose.
-        by_second: (K, T - 1, 3, 3) float64. With respect to the later one.
-    """
-
-    residuals: FloatArray
-    by_first: FloatArray
-    by_second: FloatArray
+    residuals: FloatArray  # (K, T - 1, 3) float64 [-]
+    by_first: FloatArray  # (K, T - 1, 3, 3) float64. Derivative with respect to the earlier pose.
+    by_second: FloatArray  # (K, T - 1, 3, 3) float64. With respect to the later one.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BatchProblem:
-    """All readings of a run in flat arrays, each measurement with the name of its landmark.
+    """All readings of a run in flat arrays, each measurement with the name of its landmark."""
 
-    Attributes:
-        starts: (K, 3) float64 [m, m, rad], world frame, known exactly.
-        odometry: (K, T - 1, 3) float64 [m, m, rad], each in the frame of the earlier pose.
-        odometry_sigmas: (K, T - 1, 3) float64 [m, m, rad].
-        camera: With its noise.
-        points: (n, 3) float64 [m], camera frame. The measurements, by rising step, then robot.
-        robots: (n,) int64, who measured.
-        steps: (n,) int64, when.
-        landmarks: (n,) int64, which: a row of `names`.
-        names: (L,) int64. The run's own indices of the landmarks, in the order of their first sighting.
-    """
-
-    starts: FloatArray
-    odometry: FloatArray
-    odometry_sigmas: FloatArray
-    camera: StereoCamera
-    points: FloatArray
-    robots: IntArray
-    steps: IntArray
-    landmarks: IntArray
-    names: IntArray
+    starts: FloatArray  # (K, 3) float64 [m, m, rad], world frame, known exactly
+    odometry: FloatArray  # (K, T - 1, 3) float64 [m, m, rad], each in the frame of the earlier pose
+    odometry_sigmas: FloatArray  # (K, T - 1, 3) float64 [m, m, rad]
+    camera: StereoCamera  # With its noise
+    points: FloatArray  # (n, 3) float64 [m], camera frame. The measurements, by rising step, then robot.
+    robots: IntArray  # (n,) int64, who measured
+    steps: IntArray  # (n,) int64, when
+    landmarks: IntArray  # (n,) int64, which: a row of `names`
+    names: IntArray  # (L,) int64. The run's own indices of the landmarks, in the order of their first sighting.
 
     @classmethod
     def of_run(cls, run: StereoRun) -> Self:
@@ -99,18 +70,13 @@ class BatchProblem:
         order = np.argsort(firsts)
         odometry = run.odometry[1:].transpose(1, 0, 2).copy()
         return cls(
-            starts=run.true_paths[:, 0],
-            odometry=odometry,
+            starts=run.true_paths[:, 0], odometry=odometry,
             odometry_sigmas=np.array([[noise.motion.sigmas(u) for u in own] for own in odometry]).reshape(
                 odometry.shape
             ),
-            camera=noise.camera,
-            points=np.concatenate(points),
-            robots=np.concatenate(robots),
-            steps=np.concatenate(steps),
-            landmarks=np.argsort(order)[rows],
-            names=values[order],
-        )
+            camera=noise.camera, points=np.concatenate(points), robots=np.concatenate(robots),
+            steps=np.concatenate(steps), landmarks=np.argsort(order)[rows], names=values[order],
+        )  # fmt: skip
 
     @property
     def num_steps(self) -> int:
@@ -133,7 +99,6 @@ class BatchProblem:
         """Return the residuals of all measurements.
 
         Args:
-            at: Where.
             metric: False: predicted minus measured (u, v, disparity), the exact model of the noise. True: predicted
                 minus measured point, its covariance taken at the measurement; less exact, but nearly linear, and
                 defined behind the camera too, so that descent may start far away.

@@ -18,28 +18,16 @@ from training.bench.accuracy.batch_problem import BatchProblem, Estimate
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OnlineEstimate:
-    """Each pose by the readings up to its own step.
+    """Each pose by the readings up to its own step."""
 
-    Attributes:
-        paths: (K, T, 3) float64 [m, m, rad], world frame; the first poses are given.
-        covariances: (K, T, 3, 3) float64; 0 at the first poses.
-        landmarks: (L, 3) float64 [m], world frame, by all readings; in the order of `BatchProblem.names`.
-        landmark_covariances: (L, 3, 3) float64 [m^2].
-    """
-
-    paths: FloatArray
-    covariances: FloatArray
-    landmarks: FloatArray
-    landmark_covariances: FloatArray
+    paths: FloatArray  # (K, T, 3) float64 [m, m, rad], world frame; the first poses are given
+    covariances: FloatArray  # (K, T, 3, 3) float64; 0 at the first poses
+    landmarks: FloatArray  # (L, 3) float64 [m], world frame, by all readings; in the order of `BatchProblem.names`
+    landmark_covariances: FloatArray  # (L, 3, 3) float64 [m^2]
 
 
 def ideal_online(problem: BatchProblem, batch: BatchEstimate) -> OnlineEstimate:
-    """Filter a run whose readings are linearised at its batch estimate.
-
-    Args:
-        problem: Odometry and measurements.
-        batch: `batch_ml(problem)`, without a robust kernel.
-    """
+    """Filter a run whose readings are linearised at its batch estimate."""
     at = Estimate(batch.paths, batch.landmarks)
     sights, moves = problem.sights(at), problem.moves(at)
     num_robots, num_steps = len(problem.starts), problem.num_steps
@@ -85,14 +73,9 @@ def ideal_online(problem: BatchProblem, batch: BatchEstimate) -> OnlineEstimate:
 
 
 def _predict(
-    mean: FloatArray,
-    covariance: FloatArray,
-    own: slice,
-    known: int,
-    residual: FloatArray,
-    by_first: FloatArray,
+    mean: FloatArray, covariance: FloatArray, own: slice, known: int, residual: FloatArray, by_first: FloatArray,
     by_second: FloatArray,
-) -> None:
+) -> None:  # fmt: skip
     """Move one pose in place: residual + F d_before + G d_after is standard normal, hence d_after = -G^-1 (...)."""
     mean[own] = -np.linalg.solve(by_second, residual + by_first @ mean[own])
     change = -np.linalg.solve(by_second, by_first)
@@ -104,14 +87,9 @@ def _predict(
 
 
 def _append(
-    mean: FloatArray,
-    covariance: FloatArray,
-    pose: slice,
-    known: int,
-    residual: FloatArray,
-    by_pose: FloatArray,
+    mean: FloatArray, covariance: FloatArray, pose: slice, known: int, residual: FloatArray, by_pose: FloatArray,
     by_landmark: FloatArray,
-) -> None:
+) -> None:  # fmt: skip
     """Add a landmark in place, of which nothing is known but its first sighting."""
     new = slice(known, known + 3)
     mean[new] = -np.linalg.solve(by_landmark, residual + by_pose @ mean[pose])

@@ -7,20 +7,21 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend.core.validation import FloatArray, IntArray, check_choice, check_float, check_int
+from slam_backend.core.validation import FloatArray, IntArray, check_int
 from slam_backend.fastslam.filter import FastSlam
 from slam_backend.geometry import between, inverse, transform_points
 from slam_backend.models.camera import StereoCamera
 from slam_backend.models.measurements import Measurements
 from slam_backend.models.odometry import OdometryModel
 from training.bench.accuracy.world import Office, start_crossings
+from training.experiments.config import Checked, Positive, setting
 
 STEP = 0.25  # distance between frames along the path [m]
 EYE = (0.0, 0.0, 0.9)  # of the left camera on the robot [m]
 LEAST_DISPARITY = 0.5  # px; noise never brings a measured disparity below this
 NEAREST_OUTLIER = 1.0  # [m]
+Preset = Literal["good", "coarse", "paper"]
 FALSE_POINT = -1  # name of a measurement that no landmark caused
-ASSOCIATIONS = ("known", "unknown")
 
 PRECISE_WHEELS = OdometryModel(
     sigma_along=0.02, sigma_across=0.01, sigma_heading=0.0, sigma_turn=0.03, floor_position=0.0, floor_heading=0.0015
@@ -29,17 +30,11 @@ PRECISE_WHEELS = OdometryModel(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NoisePreset:
-    """True noise of a run, which the filters assume too.
+    """True noise of a run, which the filters assume too."""
 
-    Attributes:
-        sigma_px: Standard deviation of the image coordinates u and v [px].
-        sigma_disparity_px: Standard deviation of the disparity [px].
-        motion: Noise of the odometry, independent at each step.
-    """
-
-    sigma_px: float
-    sigma_disparity_px: float
-    motion: OdometryModel = field(default_factory=OdometryModel)
+    sigma_px: float  # Standard deviation of the image coordinates u and v [px]
+    sigma_disparity_px: float  # Standard deviation of the disparity [px]
+    motion: OdometryModel = field(default_factory=OdometryModel)  # Noise of the odometry, independent at each step
 
     @property
     def camera(self) -> StereoCamera:
@@ -50,57 +45,36 @@ class NoisePreset:
 # good: features located to a fifth of a pixel, disparities to a tenth; common wheels (5 % along, 2 degrees per metre).
 # coarse: to a pixel and half a pixel, as without refinement. paper: measurements that say little against the odometry
 # (2 % along, 1 % across, .0015 rad per step and 3 % of the turn), the regime in which the paper's Fig. 6 holds.
-PRESETS = {
+PRESETS: dict[str, NoisePreset] = {
     "good": NoisePreset(sigma_px=0.2, sigma_disparity_px=0.1),
     "coarse": NoisePreset(sigma_px=1.0, sigma_disparity_px=0.5),
     "paper": NoisePreset(sigma_px=10.0, sigma_disparity_px=0.6, motion=PRECISE_WHEELS),
 }
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RunSpec:
-    """What decides a simulated run, its seed apart.
+class RunSpec(Checked):
+    """What decides a simulated run, its seed apart."""
 
-    Attributes:
-        robots: K.
-        length: Of each robot's path [m].
-        measurements: B, of all robots together in a step; robot i gets B // K, and one more if i < B mod K.
-        landmarks: N.
-        preset: Key of `PRESETS`, or a preset of one's own.
-        association: "known": each measurement comes with the name of its landmark, and none is false. "unknown": by
-            appearance and position alone, with look-alikes, false points and wrong descriptors as below.
-        look_alikes: Landmarks of a class, which all have one descriptor ("unknown" only).
-        outliers: Share of the measurements whose point lies anywhere in view ("unknown" only).
-        wrong_descriptors: Share of the measurements that look like another class ("unknown" only).
-        descriptor_size: d.
-        descriptor_noise: Root mean square length of the noise added to a descriptor before it is normalised again.
-    """
-
-    robots: int = 1
-    length: float = 100.0
-    measurements: int = 15
-    landmarks: int = 300
-    preset: str | NoisePreset = "good"
+    robots: Positive = 1  # K
+    length: float = setting(100.0, ge=STEP)  # Of each robot's path [m]
+    measurements: int = 15  # B, of all robots together in a step; robot i gets B // K, and one more if i < B mod K
+    landmarks: Positive = 300  # N
+    preset: Preset | NoisePreset = "good"  # Key of `PRESETS`, or a preset of one's own
+    # "known": each measurement comes with the name of its landmark, and none is false. "unknown": by appearance and
+    # position alone, with look-alikes, false points and wrong descriptors as below.
     association: Literal["known", "unknown"] = "known"
-    look_alikes: int = 3
-    outliers: float = 0.02
-    wrong_descriptors: float = 0.03
-    descriptor_size: int = 64
-    descriptor_noise: float = 0.17
+    look_alikes: Positive = 3  # Landmarks of a class, which all have one descriptor ("unknown" only)
+    # Shares of the measurements whose point lies anywhere in view, and of those that look like another class ("unknown"
+    # only)
+    outliers: float = setting(0.02, ge=0.0, le=1.0)
+    wrong_descriptors: float = setting(0.03, ge=0.0, le=1.0)
+    descriptor_size: int = setting(64, ge=2)  # d
+    # Root mean square length of the noise added to a descriptor before it is normalised again
+    descriptor_noise: float = setting(0.17, ge=0.0)
 
-    def __post_init__(self) -> None:
-        check_int("robots", self.robots, 1, "Use at least one robot.")
-        check_float("length", self.length, "Give the metres that each robot drives.", at_least=STEP)
+    def check(self) -> None:
+        """Refuse robots that see nothing."""
         check_int("measurements", self.measurements, self.robots, "Each robot needs at least one measurement a step.")
-        check_int("landmarks", self.landmarks, 1, "An office without landmarks shows nothing.")
-        check_int("look_alikes", self.look_alikes, 1, "Use 1 for landmarks that all look different.")
-        check_int("descriptor_size", self.descriptor_size, 2, "A descriptor of one number tells nothing apart.")
-        for name in ("outliers", "wrong_descriptors"):
-            check_float(name, getattr(self, name), "Give a share of the measurements.", at_least=0.0, at_most=1.0)
-        check_float("descriptor_noise", self.descriptor_noise, "Give an L2 length.", at_least=0.0)
-        check_choice("association", self.association, ASSOCIATIONS)
-        if not isinstance(self.preset, NoisePreset):
-            check_choice("preset", self.preset, tuple(PRESETS))
 
     @property
     def noise(self) -> NoisePreset:
@@ -110,26 +84,19 @@ class RunSpec:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StereoRun:
-    """What K robots did and read in T steps, and the truth. The world frame is the map frame of `build_filter`.
+    """What K robots did and read in T steps, and the truth. The world frame is the map frame of `build_filter`."""
 
-    Attributes:
-        spec: What was asked for.
-        office: Walls and landmarks.
-        true_paths: (K, T, 3) float64 [m, m, rad], world frame.
-        odometry: (T, K, 3) float64 [m, m, rad]. Noisy motion from step t - 1 to t in the frame of t - 1; at t = 0 the
-            robots stand, and the entry is 0.
-        frames: Per step and robot its measurements, in random order; the first is taken at the start pose.
-        names: Per step and robot (n,) int64, the landmark behind each measurement; `FALSE_POINT`: none.
-        descriptors: (N, d) float32, what each landmark looks like.
-    """
-
-    spec: RunSpec
-    office: Office
-    true_paths: FloatArray
+    spec: RunSpec  # What was asked for
+    office: Office  # Walls and landmarks
+    true_paths: FloatArray  # (K, T, 3) float64 [m, m, rad], world frame
+    # (T, K, 3) float64 [m, m, rad]. Noisy motion from step t - 1 to t in the frame of t - 1; at t = 0 the robots stand,
+    # and the entry is 0.
     odometry: FloatArray
+    # Per step and robot its measurements, in random order; the first is taken at the start pose
     frames: tuple[tuple[Measurements, ...], ...]
+    # Per step and robot (n,) int64, the landmark behind each measurement; `FALSE_POINT`: none
     names: tuple[tuple[IntArray, ...], ...]
-    descriptors: NDArray[np.float32]
+    descriptors: NDArray[np.float32]  # (N, d) float32, what each landmark looks like
 
     @property
     def landmarks(self) -> FloatArray:
@@ -157,20 +124,10 @@ class StereoRun:
             yield {"odometry": odometry, "measurements": list(frames), "identities": list(names) if known else None}
 
     def build_filter(
-        self,
-        num_particles: int = 100,
-        proposal: Literal["fastslam2", "fastslam1"] = "fastslam2",
-        seed: int | np.random.SeedSequence = 0,
-        **options: Any,
-    ) -> FastSlam:
-        """Return a filter that assumes the true noise and starts all robots at their true poses in the world frame.
-
-        Args:
-            num_particles: M.
-            proposal: See `FilterOptions`.
-            seed: Of the filter's own draws.
-            options: Further arguments of `FastSlam`; they override those chosen here.
-        """
+        self, num_particles: int = 100, proposal: Literal["fastslam2", "fastslam1"] = "fastslam2",
+        seed: int | np.random.SeedSequence = 0, **options: Any,
+    ) -> FastSlam:  # fmt: skip
+        """Return a filter that assumes the true noise and starts all robots at their true poses in the world frame."""
         noise = self.spec.noise
         chosen: dict[str, Any] = {
             "num_particles": num_particles, "proposal": proposal, "camera": noise.camera, "motion": noise.motion,
@@ -192,10 +149,6 @@ def simulate_run(spec: RunSpec, seed: int) -> StereoRun:
 
     A robot's path and odometry depend on the seed and its number alone: with more robots, or another camera noise, the
     first ones drive the same ways.
-
-    Args:
-        spec: What to draw.
-        seed: An int >= 0.
     """
     check_int("seed", seed, 0, "Use 0 or a positive number.")
     layout, looks_seed, starts, *own = np.random.SeedSequence(seed).spawn(3 + 3 * spec.robots)
@@ -213,14 +166,10 @@ def simulate_run(spec: RunSpec, seed: int) -> StereoRun:
         frames.append([frame for frame, _ in seen])
         names.append([name for _, name in seen])
     return StereoRun(
-        spec=spec,
-        office=office,
-        true_paths=np.array(paths),
-        odometry=np.array(odometry).transpose(1, 0, 2).copy(),
-        frames=tuple(zip(*frames, strict=True)),
-        names=tuple(zip(*names, strict=True)),
+        spec=spec, office=office, true_paths=np.array(paths), odometry=np.array(odometry).transpose(1, 0, 2).copy(),
+        frames=tuple(zip(*frames, strict=True)), names=tuple(zip(*names, strict=True)),
         descriptors=looks.classes[looks.of_landmark].astype(np.float32),
-    )
+    )  # fmt: skip
 
 
 def _draw_looks(spec: RunSpec, rng: np.random.Generator) -> _Looks:

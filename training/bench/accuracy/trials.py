@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from slam_backend.core.validation import FloatArray, IntArray, check_choice, check_float, check_int
+from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.fastslam.existence import ExistenceModel
 from slam_backend.fastslam.filter import FastSlam
 from slam_backend.geometry import transform_points, wrap_angle
@@ -15,8 +15,9 @@ from slam_backend.metrics import align_se2, ate, map_rmse, nees
 from training.bench.accuracy.batch_ml import BatchEstimate, batch_ml
 from training.bench.accuracy.batch_problem import BatchProblem
 from training.bench.accuracy.online_bound import ideal_online
-from training.bench.accuracy.runs import FALSE_POINT, RunSpec, StereoRun, simulate_run
+from training.bench.accuracy.runs import FALSE_POINT, Preset, RunSpec, StereoRun, simulate_run
 
+TRIALS_FILE = "trials.jsonl"
 PEERS = ("dead_reckoning", "batch_ml", "ideal_online")
 FILTERS = ("fastslam1", "fastslam2", "fastslam2+existence", "fastslam2+rejuvenation")
 METHODS = (*PEERS, *FILTERS)
@@ -27,36 +28,19 @@ LEAST_SIGMA = 1e-5  # [m, rad]; a collapsed set of particles claims no error at 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Trial:
-    """What decides a trial.
+    """What decides a trial."""
 
-    Attributes:
-        preset: Of the noise.
-        association: "known" or "unknown"; what uses no filter is told the names in any case.
-        robots: K.
-        length: Of each robot's path [m].
-        method: One of `METHODS`.
-        particles: M of a filter, 0 of the others.
-        seed: Of the run, and of the filter's draws.
-        noise_factor: What a filter multiplies the true variance of the measurements by.
-        landmark_noise: Of a filter [m], see `FilterOptions`.
-    """
-
-    preset: str
-    association: Literal["known", "unknown"]
-    robots: int
-    length: float
-    method: str
-    particles: int
-    seed: int
-    noise_factor: float = 1.0
-    landmark_noise: float | None = None
+    preset: Preset  # Of the noise
+    association: Literal["known", "unknown"]  # "known" or "unknown"; what uses no filter is told the names in any case
+    robots: int  # K
+    length: float  # Of each robot's path [m]
+    method: str  # One of `METHODS`
+    particles: int  # M of a filter, 0 of the others
+    seed: int  # Of the run, and of the filter's draws
+    noise_factor: float = 1.0  # What a filter multiplies the true variance of the measurements by
+    landmark_noise: float | None = None  # Of a filter [m], see `FilterOptions`
 
     def __post_init__(self) -> None:
-        check_float("noise_factor", self.noise_factor, "Use 1 for the noise as it is.", above=0.0)
-        check_choice("method", self.method, METHODS)
-        least = 1 if self.method in FILTERS else 0
-        check_int("particles", self.particles, least, "Use at least one particle; 100 is a good start.")
-        check_int("seed", self.seed, 0, "Use 0 or a positive number.")
         _ = self.spec  # refuses the rest
 
     @property
@@ -67,23 +51,15 @@ class Trial:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Answer:
-    """What a method says about a run; None where it says nothing.
+    """What a method says about a run; None where it says nothing."""
 
-    Attributes:
-        paths: (K, T, 3) float64 [m, m, rad], world frame. Online methods: each pose as known at its own step.
-        covariances: (K, T, 3, 3) float64, of these poses.
-        means: (n, 3) float64 [m], world frame. The map at the end.
-        claims: (n,) int64. The true landmark behind each, by the run's own index; `FALSE_POINT`: none.
-        confirmed: (n,) bool. Whether it was seen at least `CONFIRMED` times.
-        extra: Further figures of a filter.
-    """
-
-    paths: FloatArray
-    covariances: FloatArray | None = None
-    means: FloatArray | None = None
+    paths: FloatArray  # (K, T, 3) float64 [m, m, rad], world frame. Online methods: each pose as known at its own step.
+    covariances: FloatArray | None = None  # (K, T, 3, 3) float64, of these poses
+    means: FloatArray | None = None  # (n, 3) float64 [m], world frame. The map at the end.
+    # (n,) int64. The true landmark behind each, by the run's own index; `FALSE_POINT`: none.
     claims: IntArray | None = None
-    confirmed: Any = None
-    extra: dict[str, float] | None = None
+    confirmed: Any = None  # (n,) bool. Whether it was seen at least `CONFIRMED` times.
+    extra: dict[str, float] | None = None  # Further figures of a filter
 
 
 def play(trial: Trial) -> dict[str, Any]:
@@ -135,10 +111,9 @@ def score(run: StereoRun, answer: Answer) -> dict[str, float]:
     errors[..., 2] = wrap_angle(errors[..., 2])
     fitted = ate(answer.paths.reshape(-1, 3), run.true_paths.reshape(-1, 3))
     row = {
-        "pose_rms_m": fitted.start,
-        "pose_aligned_rms_m": fitted.aligned,
+        "pose_rms_m": fitted.start, "pose_aligned_rms_m": fitted.aligned,
         "heading_rms_deg": float(np.degrees(np.sqrt((errors[..., 2] ** 2).mean()))),
-    }
+    }  # fmt: skip
     row |= dict.fromkeys(
         ("map_rmse_m", "map_aligned_rmse_m", "map_recall", "map_precision", "confirmed_recall", "confirmed_precision",
          "nees_median", "nees_mean", "anees", "ess_share", "nis", "wrong_match_share", "held_back_share", "step_ms",
@@ -171,13 +146,9 @@ def _score_map(run: StereoRun, means: FloatArray, claims: IntArray, confirmed: A
         apart = transform_points(motion, means[pairs[:, 0]]) - truths[pairs[:, 1]]
         aligned = float(np.sqrt((apart**2).sum(axis=1).mean()))
     return {
-        "map_rmse_m": whole.rmse,
-        "map_aligned_rmse_m": aligned,
-        "map_recall": whole.recall,
-        "map_precision": whole.precision,
-        "confirmed_recall": sure.recall,
-        "confirmed_precision": sure.precision,
-    }
+        "map_rmse_m": whole.rmse, "map_aligned_rmse_m": aligned, "map_recall": whole.recall,
+        "map_precision": whole.precision, "confirmed_recall": sure.recall, "confirmed_precision": sure.precision,
+    }  # fmt: skip
 
 
 def follow(run: StereoRun, slam: FastSlam) -> Answer:
@@ -210,10 +181,8 @@ def follow(run: StereoRun, slam: FastSlam) -> Answer:
         covariances.append([estimate.covariance for estimate in estimates])
     held = slam.map()
     return Answer(
-        paths=np.array(paths).transpose(1, 0, 2),
-        covariances=np.array(covariances).transpose(1, 0, 2, 3),
-        means=held.means,
-        claims=np.array([claims[int(i)] for i in held.ids], dtype=np.int64),
+        paths=np.array(paths).transpose(1, 0, 2), covariances=np.array(covariances).transpose(1, 0, 2, 3),
+        means=held.means, claims=np.array([claims[int(i)] for i in held.ids], dtype=np.int64),
         confirmed=held.counts >= CONFIRMED,
         extra={
             "ess_share": float(np.mean(ess)),
@@ -224,16 +193,11 @@ def follow(run: StereoRun, slam: FastSlam) -> Answer:
             "rejuvenation_ms": 1e3 * float(np.median([t for t, _ in attempts])) if attempts else float("nan"),
             "refused_share": float(np.mean([refused for _, refused in attempts])) if attempts else float("nan"),
         },
-    )
+    )  # fmt: skip
 
 
 def optimal(run: StereoRun, method: str) -> Answer:
-    """Return the batch or the ideal online estimate; both know which landmark is behind each measurement.
-
-    Args:
-        run: Whatever its association is, names are told.
-        method: "batch_ml" or "ideal_online".
-    """
+    """Return the batch or the ideal online estimate; both know which landmark is behind each measurement."""
     problem, batch = _batch_of(run)
     if method == "ideal_online":
         online = ideal_online(problem, batch)

@@ -12,6 +12,7 @@ from slam_backend.models.camera import StereoCamera
 AISLE = 3.0  # width [m]
 BLOCK = (4.5, 2.5)  # size of a block of rooms [m]
 BLOCKS = (2, 2)  # along x and y
+CROSSINGS = [(i, j) for i in range(BLOCKS[0] + 1) for j in range(BLOCKS[1] + 1)]  # of the aisles, along x and y
 HEIGHTS = (0.1, 1.9)  # of landmarks above the floor [m]
 OFF_WALL = 0.01  # landmarks stand out from their wall by this much [m]
 MAX_INCIDENCE = np.radians(80.0)  # a wall seen at a larger angle to its normal shows no landmarks [rad]
@@ -20,30 +21,18 @@ CORNER_RADIUS = 1.0  # of a robot's way round a corner [m]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Office:
-    """Walls of a rectangular building with free-standing blocks, and the landmarks on them.
+    """Walls of a rectangular building with free-standing blocks, and the landmarks on them."""
 
-    Attributes:
-        size: (2,) float64 [m]. The building spans from the origin of the world frame to here.
-        blocks: (S, 4) float64 [m], world frame. Rows x1 y1 x2 y2, x1 < x2 and y1 < y2: nobody looks through them.
-        crossings: Centre lines of the aisles: (x of those along y, y of those along x) [m].
-        landmarks: (N, 3) float64 [m], world frame.
-        normals: (N, 2) float64 [-], world frame. Out of the wall that bears the landmark.
-    """
-
-    size: FloatArray
+    size: FloatArray  # (2,) float64 [m]. The building spans from the origin of the world frame to here.
+    # (S, 4) float64 [m], world frame. Rows x1 y1 x2 y2, x1 < x2 and y1 < y2: nobody looks through them.
     blocks: FloatArray
-    crossings: tuple[FloatArray, FloatArray]
-    landmarks: FloatArray
-    normals: FloatArray
+    crossings: tuple[FloatArray, FloatArray]  # Centre lines of the aisles: (x of those along y, y of those along x) [m]
+    landmarks: FloatArray  # (N, 3) float64 [m], world frame
+    normals: FloatArray  # (N, 2) float64 [-], world frame. Out of the wall that bears the landmark.
 
     @classmethod
     def draw(cls, num_landmarks: int, rng: np.random.Generator) -> Self:
-        """Spread landmarks evenly at random over all walls, the building's own and those of the blocks.
-
-        Args:
-            num_landmarks: N.
-            rng: Source of the draws.
-        """
+        """Spread landmarks evenly at random over all walls, the building's own and those of the blocks."""
         check_int("num_landmarks", num_landmarks, 1, "An office without landmarks shows nothing.")
         starts = [AISLE + np.arange(count) * (side + AISLE) for count, side in zip(BLOCKS, BLOCK, strict=True)]
         size = np.array([count * (side + AISLE) + AISLE for count, side in zip(BLOCKS, BLOCK, strict=True)])
@@ -61,10 +50,6 @@ class Office:
 
         A landmark is visible if it lies in the image and within the camera's range, if the line of sight meets its wall
         from the front at no more than `MAX_INCIDENCE` to the normal, and if no block stands in between.
-
-        Args:
-            pose: (3,) float64 [m, m, rad], world frame.
-            camera: Its mount, field of view and range.
         """
         eye = compose(pose, np.array([*camera.mount[:2], 0.0]))[:2]
         seen = camera.sees(camera.camera_from_robot(transform_points(inverse(pose), self.landmarks)))
@@ -80,9 +65,6 @@ class Office:
 
         Args:
             node: Crossing at which the path starts, (index along x, index along y).
-            length: Of the path [m].
-            step: Distance between poses along the path [m].
-            rng: Chooses where to go at each crossing.
 
         Returns:
             (T, 3) poses [m, m, rad], world frame, T = floor(length / step) + 1, headed along the path.
@@ -112,16 +94,16 @@ class Office:
         return _along(pose, np.array(pieces), wanted)
 
 
-def start_crossings(robots: int, rng: np.random.Generator) -> list[tuple[int, int]]:
-    """Draw a different crossing for each robot.
+def check_crossings(robots: int) -> None:
+    """Refuse more robots than there are crossings, as each starts at one of its own."""
+    if check_int("robots", robots, 1, "Use at least one robot.") > len(CROSSINGS):
+        raise bad_argument("robots", f"at most {len(CROSSINGS)}", robots, "Each starts at a crossing of its own.")
 
-    Raises:
-        ValueError: If there are more robots than crossings.
-    """
-    nodes = [(i, j) for i in range(BLOCKS[0] + 1) for j in range(BLOCKS[1] + 1)]
-    if check_int("robots", robots, 1, "Use at least one robot.") > len(nodes):
-        raise bad_argument("robots", f"at most {len(nodes)}", robots, "Each starts at a crossing of its own.")
-    return [nodes[i] for i in rng.permutation(len(nodes))[:robots]]
+
+def start_crossings(robots: int, rng: np.random.Generator) -> list[tuple[int, int]]:
+    """Draw a different crossing for each robot."""
+    check_crossings(robots)
+    return [CROSSINGS[i] for i in rng.permutation(len(CROSSINGS))[:robots]]
 
 
 def _faces(size: FloatArray, blocks: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -29,19 +29,12 @@ CLASS = 3  # so many of all landmarks look the same where there are look-alikes
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapPair:
-    """Two maps, and what is true of them.
+    """Two maps, and what is true of them."""
 
-    Attributes:
-        a: The map whose frame an alignment leads to.
-        b: The other.
-        pose: (3,) float64 [m, m, rad]. True motion a_from_b; NaN where there is none.
-        pairs: (n, 2) int64 rows (a, b) of the landmarks that are truly the same.
-    """
-
-    a: LandmarkMap
-    b: LandmarkMap
-    pose: FloatArray
-    pairs: IntArray
+    a: LandmarkMap  # The map whose frame an alignment leads to
+    b: LandmarkMap  # The other
+    pose: FloatArray  # (3,) float64 [m, m, rad]. True motion a_from_b; NaN where there is none.
+    pairs: IntArray  # (n, 2) int64 rows (a, b) of the landmarks that are truly the same
 
     def bound(self) -> FloatArray:
         """Return the Cramer-Rao bound (3, 3) [m, m, rad] of (tx, ty, theta), were the true pairs known.
@@ -55,11 +48,6 @@ class MapPair:
 
 def draw_pair(overlap: float, outliers: float, rng: np.random.Generator) -> MapPair:
     """Draw two maps of 200 landmarks of which some are common, and some others look alike.
-
-    Args:
-        overlap: Share of the landmarks that are common.
-        outliers: Share of the look-alike pairs that are wrong.
-        rng: Source of the draws.
 
     Raises:
         ValueError: If there are not enough landmarks for so many wrong pairs.
@@ -79,7 +67,6 @@ def draw_identifiable(kind: str, rng: np.random.Generator) -> MapPair:
     Args:
         kind: "area" or "corridor": where the true pairs lie; "..., rival": up to half as many wrong ones agree on
             another motion; "..., look-alikes": three of all landmarks always look the same.
-        rng: Source of the draws.
     """
     check_choice("kind", kind, IDENTIFIABLE)
     right = int(rng.integers(FEWEST_TRUE, 41))
@@ -111,7 +98,6 @@ def draw_unalignable(kind: str, rng: np.random.Generator) -> MapPair:
             that two shifts are supported almost alike. "twin rooms": two rooms that look the same, of which b has seen
             one. "half alike": half of all landmarks look like wrong ones that agree on another place, about as many as
             agree on a first.
-        rng: Source of the draws.
     """
     check_choice("kind", kind, UNALIGNABLE)
     count = int(rng.integers(40, LANDMARKS + 1))
@@ -186,13 +172,9 @@ def _pair(points_a: FloatArray, points_b: FloatArray, right: int, alike: int, rn
 
 
 def _pair_of(
-    points_a: FloatArray,
-    looks_a: FloatArray,
-    points_b: FloatArray,
-    looks_b: FloatArray,
-    right: int,
+    points_a: FloatArray, looks_a: FloatArray, points_b: FloatArray, looks_b: FloatArray, right: int,
     rng: np.random.Generator,
-) -> MapPair:
+) -> MapPair:  # fmt: skip
     """Return noisy maps of points in one frame, b in a frame of its own that lies among its landmarks, shuffled."""
     centre = points_b[:, :2].mean(axis=0) + rng.uniform(-5.0, 5.0, 2)
     pose = np.array([*centre, rng.uniform(-np.pi, np.pi)])

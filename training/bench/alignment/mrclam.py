@@ -1,23 +1,25 @@
 """Real maps aligned pairwise: each robot of a MR.CLAM log maps alone from its own start; barcodes seen, then hidden."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import combinations
 from typing import Any
 
 import numpy as np
 
-from slam_backend.core.validation import IntArray, check_float, check_int
-from slam_backend.geometry import between, transform_points, wrap_angle
-from slam_backend.maps.alignment import RIVAL_ANGLE, RIVAL_DISTANCE, Alignment, AlignmentOptions, align_maps
-from slam_backend.maps.landmark_map import LandmarkMap
+from slam_backend.maps.alignment import RIVAL_ANGLE, RIVAL_DISTANCE, AlignmentOptions, align_maps
 from slam_backend.readers.mrclam import MrclamLog, load_mrclam
-from training.experiments.config import PlainConfig, check_each_once
+from training.bench.config import MrclamPairsConfig
 from training.experiments.statistics import grouped
-from training.replay.metrics import align_to_truth
-from training.replay.mrclam import Replay, ReplayConfig, replay
+from training.experiments.tables import number
+from training.replay.config import MrclamConfig
+from training.replay.metrics import motion_error
+from training.replay.mrclam import Replay, replay_team
 
-COMMAND = "bench mrclam"
+HEADINGS = (
+    "after [s]", "barcodes", "method", "pairs", "aligned", "false", "median [m]", "worst [m]", "median [°]",
+    "worst [°]",
+)  # fmt: skip
 METHODS = ("ransac", "clique")
 ENOUGH_SHARED = 5  # landmarks from which on maps are to be aligned by their barcodes
 # Maps are bent by tenths of a metre, by more the younger they are.
@@ -25,36 +27,8 @@ OPTIONS = AlignmentOptions(position_floor=0.3, min_inliers=ENOUGH_SHARED, max_si
 BARCODES: dict[str, AlignmentOptions] = {"given": OPTIONS, "hidden": replace(OPTIONS, appearance=False)}
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MrclamPairsConfig(PlainConfig):
-    """All that decides the table.
-
-    Attributes:
-        path: Folder of the log.
-        durations: After how many seconds maps are aligned [s]; 0: at the end.
-        particles: Of each robot's filter.
-        seed: Of the filters.
-    """
-
-    path: str
-    durations: tuple[float, ...] = (100.0, 200.0, 400.0, 0.0)
-    particles: int = 100
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        for duration in self.durations:
-            check_float("durations", duration, "Give seconds; 0 means all.", at_least=0.0)
-        check_each_once("durations", self.durations)
-        check_int("particles", self.particles, 1, "Use at least one particle.")
-        check_int("seed", self.seed, 0, "Use 0 or a positive number.")
-
-
 def align_log(config: MrclamPairsConfig, on_part: Callable[[float], None] = lambda share: None) -> list[dict[str, Any]]:
     """Let each robot map alone for each duration, and align all pairs of maps.
-
-    Args:
-        config: Log and sizes.
-        on_part: Called with the share of the work that is done, in (0, 1].
 
     Returns:
         Rows as `align_pairs` gives them, with `duration_s` (None: the whole log).
@@ -63,9 +37,13 @@ def align_log(config: MrclamPairsConfig, on_part: Callable[[float], None] = lamb
     for place, duration in enumerate(config.durations):
         limit = duration or None
         log = load_mrclam(config.path, None, limit, None)
-        alone = ReplayConfig(path=config.path, duration=limit, alone=True, particles=config.particles, seed=config.seed)
+        alone = MrclamConfig(path=config.path, duration=limit, alone=True, particles=config.particles, seed=config.seed)
         done = place / len(config.durations)
-        result = replay(log, alone, lambda share, report, d=done: on_part(d + share / len(config.durations)))  # type: ignore[misc]
+
+        def on_step(share: float, report: Any, done: float = done) -> None:
+            on_part(done + share / len(config.durations))
+
+        result = replay_team(log, alone, on_step)
         rows += [{"duration_s": limit} | row for row in align_pairs(result, log)]
     return rows
 
@@ -86,28 +64,16 @@ def align_pairs(result: Replay, log: MrclamLog) -> list[dict[str, Any]]:
         for barcodes, options in BARCODES.items():
             for method in METHODS:
                 found = align_maps(*maps, method, np.random.default_rng(0), options)
-                error = _error(found, maps, claims, log)
+                error = motion_error(found.transform, maps, claims, log) if found.success else None
                 rows.append(
                     {
                         "robots": [numbers[a], numbers[b]], "shared": shared, "barcodes": barcodes, "method": method,
                         "accepted": found.success, "reason": found.reason, "inliers": len(found.inliers),
-                        "error_m": error[0] if error else None, "error_deg": error[1] if error else None,
+                        "error_m": error[0] if error else None,
+                        "error_deg": float(np.rad2deg(error[1])) if error else None,
                     }
                 )  # fmt: skip
     return rows
-
-
-def _error(
-    found: Alignment, maps: Sequence[LandmarkMap], claims: Sequence[IntArray], log: MrclamLog
-) -> tuple[float, float] | None:
-    """Return how far a motion is off [m, degrees]; None if it was refused or a map cannot be fitted to the truth."""
-    fits = [align_to_truth(own, named, log) for own, named in zip(maps, claims, strict=True)]
-    if not found.success or fits[0] is None or fits[1] is None:
-        return None
-    true = between(fits[0].world_from_map, fits[1].world_from_map)
-    middle = maps[1].means[:, :2].mean(axis=0)
-    offset = transform_points(found.transform, middle) - transform_points(true, middle)
-    return float(np.hypot(*offset)), abs(float(np.rad2deg(wrap_angle(found.theta - true[2]))))
 
 
 def summarise(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
@@ -132,3 +98,11 @@ def summarise(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
                 line[f"worst_{unit}"] = float(apart[:, column].max())
         lines.append(line)
     return lines
+
+
+def cells(line: Mapping[str, Any]) -> list[str]:
+    """Return one line of the table as text."""
+    after = "all" if line["duration_s"] is None else f"{line['duration_s']:g}"
+    counts = [str(line[name]) for name in ("pairs", "accepted", "false")]
+    errors = [number(line[name]) for name in ("median_m", "worst_m", "median_deg", "worst_deg")]
+    return [after, line["barcodes"], line["method"], *counts, *errors]

@@ -18,30 +18,23 @@ from training.bench.alignment.map_pairs import (
     draw_unalignable,
 )
 
+TRIALS_FILE = "trials.jsonl"
 Kind = Literal["grid", "U", "I"]
 KINDS: tuple[Kind, ...] = ("grid", "U", "I")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Trial:
-    """One alignment.
+    """One alignment."""
 
-    Attributes:
-        kind: "grid": 200 landmarks each, of which a share is common, and of the look-alikes a share is wrong. "U": maps
-            that must not be aligned. "I": maps that just can be.
-        case: Of the hard kinds, which of `UNALIGNABLE` or `IDENTIFIABLE`; empty for the grid.
-        overlap: Of the grid, share of the landmarks that are common; 0 for the hard kinds.
-        outliers: Of the grid, share of the look-alike pairs that are wrong; 0 for the hard kinds.
-        method: Of `align_maps`.
-        seed: Of maps and search.
-    """
-
+    # "grid": 200 landmarks each, of which a share is common, and of the look-alikes a share is wrong. "U": maps that
+    # must not be aligned. "I": maps that just can be.
     kind: Kind
-    case: str
-    overlap: float
-    outliers: float
-    method: str
-    seed: int
+    case: str  # Of the hard kinds, which of `UNALIGNABLE` or `IDENTIFIABLE`; empty for the grid
+    overlap: float  # Of the grid, share of the landmarks that are common; 0 for the hard kinds
+    outliers: float  # Of the grid, share of the look-alike pairs that are wrong; 0 for the hard kinds
+    method: str  # Of `align_maps`
+    seed: int  # Of maps and search
 
 
 def cases(kind: Kind) -> tuple[str, ...]:
@@ -74,24 +67,17 @@ def play(trial: Trial) -> dict[str, Any]:
     found = align_maps(pair.a, pair.b, trial.method, rng)
     seconds, cpu_seconds = time.perf_counter() - begun, time.thread_time() - begun_cpu
     row: dict[str, Any] = {name: getattr(trial, name) for name in Trial.__dataclass_fields__} | {
-        "success": found.success,
-        "reason": found.reason,
-        "ratio": found.ratio,
-        "inliers": len(found.inliers),
-        "seconds": seconds,
-        "cpu_seconds": cpu_seconds,
-        "false": found.success,
-    }
+        "success": found.success, "reason": found.reason, "ratio": found.ratio, "inliers": len(found.inliers),
+        "seconds": seconds, "cpu_seconds": cpu_seconds, "false": found.success,
+    }  # fmt: skip
     if found.success and len(pair.pairs):
         error = found.transform - pair.pose
         error[2] = wrap_angle(error[2])
         bound = pair.bound()
         row |= {
-            "error_m": float(np.hypot(error[0], error[1])),
-            "error_rad": abs(float(error[2])),
+            "error_m": float(np.hypot(error[0], error[1])), "error_rad": abs(float(error[2])),
             "false": bool(np.hypot(error[0], error[1]) > RIVAL_DISTANCE or abs(error[2]) > RIVAL_ANGLE),
             "nees": float(error @ np.linalg.solve(found.covariance, error)),
-            "bound_m2": float(bound[0, 0] + bound[1, 1]),
-            "bound_rad2": float(bound[2, 2]),
-        }
+            "bound_m2": float(bound[0, 0] + bound[1, 1]), "bound_rad2": float(bound[2, 2]),
+        }  # fmt: skip
     return row

@@ -4,9 +4,8 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import wraps
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -24,14 +23,8 @@ from vslam_env.world import Simulator
 REST = "all else"
 
 
-@dataclass(frozen=True, slots=True)
-class Phase:
-    """A part of a step.
-
-    Attributes:
-        name: Shown in the table.
-        calls: What counts to it: owners and names of functions.
-    """
+class Phase(NamedTuple):
+    """A part of a step: its name, and the owners and names of the functions that count to it."""
 
     name: str
     calls: tuple[tuple[Any, str], ...]
@@ -47,32 +40,14 @@ PHASES = (
     Phase("errors", ((Episode, "standing"),)),
     Phase("observations", ((observation, "observe_team"),)),
     Phase("candidates", ((TeamSlots, "update"),)),
-    Phase(
-        "beliefs, dictionaries",
-        ((TeamBelief, "step"), (environment, "observations_of"), (environment, "infos_of")),
-    ),
-)
+    Phase("beliefs, dictionaries", ((TeamBelief, "step"), (environment, "observations_of"), (environment, "infos_of"))),
+)  # fmt: skip
 
 
-@dataclass(frozen=True, slots=True)
-class BudgetRow:
-    """What a phase took per step.
-
-    Attributes:
-        phase: Its name.
-        median_us: Over steps [us].
-        mean_us: Over steps; what happens now and then shows here alone [us].
-    """
-
-    phase: str
-    median_us: float
-    mean_us: float
-
-
-def measure_budget(step: Callable[[Any], Any], arguments: list[Any]) -> list[BudgetRow]:
+def measure_budget(step: Callable[[Any], Any], arguments: list[Any]) -> list[dict[str, Any]]:
     """Call `step` with each argument in turn and tell where the time went.
 
-    The clock itself costs about a microsecond for each timed call.
+    The clock itself costs about a microsecond for each timed call. What happens now and then shows in the mean alone.
     """
     totals: list[dict[str, int]] = []
     with _timed(PHASES) as spent:
@@ -85,7 +60,7 @@ def measure_budget(step: Callable[[Any], Any], arguments: list[Any]) -> list[Bud
     rows = []
     for name in (*(phase.name for phase in PHASES), REST):
         micros = np.array([total.get(name, 0) for total in totals]) / 1e3
-        rows.append(BudgetRow(name, float(np.median(micros)), float(micros.mean())))
+        rows.append({"phase": name, "median_us": float(np.median(micros)), "mean_us": float(micros.mean())})
     return rows
 
 

@@ -1,7 +1,6 @@
 """Environments timed step by step on actions that were recorded beforehand, so that no policy is timed with them."""
 
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
@@ -12,7 +11,7 @@ import numpy as np
 
 from agents.registry import make_policy
 from slam_backend.core.validation import FloatArray
-from training.experiments.step_timing import no_garbage_collection
+from training.experiments.timing import clock, no_garbage_collection
 from vslam_env import vslam_v0
 from vslam_env.config import TICK, EnvConfig
 from vslam_env.environment import ExplorationEnv
@@ -23,37 +22,20 @@ PEER = "mpe2"  # the package whose simple_spread is timed beside
 BURST = 50  # calls in a row, of plays that take turns
 
 
-@dataclass(frozen=True, slots=True)
-class StepTimes:
-    """Of calls that were timed one by one [us].
+def summarise_us(seconds: FloatArray) -> dict[str, float]:
+    """Summarise durations (n,) or (repeats, n) [s] of n `calls`.
 
-    Attributes:
-        median_us: Half of the calls took longer.
-        mean_us: What happens now and then, and what other programs take, shows here.
-        p99_us: 1 % took longer.
-        min_us: The shortest.
-        undisturbed_us: Half of the calls took longer, each at the best of its repeats.
-        per_second: Calls in a second, by the median.
-        per_second_mean: Calls in a second, by the mean.
-        calls: How many differ; each was repeated as often.
+    `undisturbed_us` is the median of the calls, each at the best of its repeats; `mean_us` shows what happens now and
+    then, and what other programs take; rates are by the median and by the mean.
     """
-
-    median_us: float
-    mean_us: float
-    p99_us: float
-    min_us: float
-    undisturbed_us: float
-    per_second: float
-    per_second_mean: float
-    calls: int
-
-    @classmethod
-    def of(cls, seconds: FloatArray) -> "StepTimes":
-        """Summarise durations (n,) or (repeats, n) [s]."""
-        micros = 1e6 * np.atleast_2d(seconds)
-        median, high = (float(q) for q in np.quantile(micros, (0.5, 0.99)))
-        mean, undisturbed = float(micros.mean()), float(np.median(micros.min(axis=0)))
-        return cls(median, mean, high, float(micros.min()), undisturbed, 1e6 / median, 1e6 / mean, micros.shape[1])
+    micros = 1e6 * np.atleast_2d(seconds)
+    median, high = (float(q) for q in np.quantile(micros, (0.5, 0.99)))
+    mean, undisturbed = float(micros.mean()), float(np.median(micros.min(axis=0)))
+    return {
+        "median_us": median, "mean_us": mean, "p99_us": high, "min_us": float(micros.min()),
+        "undisturbed_us": undisturbed, "per_second": 1e6 / median, "per_second_mean": 1e6 / mean,
+        "calls": micros.shape[1],
+    }  # fmt: skip
 
 
 def record_actions(env: ExplorationEnv, seed: int, steps: int) -> list[dict[str, Any]]:
@@ -70,35 +52,13 @@ def record_actions(env: ExplorationEnv, seed: int, steps: int) -> list[dict[str,
     return actions
 
 
-def time_steps(call: Callable[[Any], Any], arguments: Sequence[Any], warm_up: int) -> FloatArray:
-    """Return how long calls took (n - warm_up,) [s], nothing of their results kept."""
-    with no_garbage_collection():
-        return _seconds(call, arguments)[warm_up:]
-
-
-def _seconds(call: Callable[[Any], Any], arguments: Sequence[Any]) -> FloatArray:
-    """Return how long each call took (n,) [s]."""
-    durations = np.empty(len(arguments), np.int64)
-    for i, argument in enumerate(arguments):
-        begin = time.perf_counter_ns()
-        call(argument)
-        durations[i] = time.perf_counter_ns() - begin
-    return durations / 1e9
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Play:
-    """What is played again and again, the same each time.
+    """What is played again and again, the same each time."""
 
-    Attributes:
-        begin: Called before each play.
-        call: What is timed.
-        arguments: Of its calls, in order.
-    """
-
-    begin: Callable[[], object]
-    call: Callable[[Any], Any]
-    arguments: Sequence[Any]
+    begin: Callable[[], object]  # Called before each play
+    call: Callable[[Any], Any]  # What is timed
+    arguments: Sequence[Any]  # Of its calls, in order
 
 
 def play_in_turn(plays: Sequence[Play], warm_up: int, repeats: int) -> FloatArray:
@@ -116,7 +76,7 @@ def play_in_turn(plays: Sequence[Play], warm_up: int, repeats: int) -> FloatArra
             for burst, first in enumerate(range(0, count, BURST)):
                 chosen = slice(first, first + BURST)
                 for k in range(len(plays))[:: 1 if (burst + repeat) % 2 == 0 else -1]:
-                    durations[k, repeat, chosen] = _seconds(plays[k].call, plays[k].arguments[chosen])
+                    durations[k, repeat, chosen] = clock(plays[k].call, plays[k].arguments[chosen])
     return durations[:, :, warm_up:]
 
 
@@ -134,12 +94,7 @@ def play_env(env: ExplorationEnv, seed: int, steps: int) -> Play:
     return Play(partial(env.reset, seed=seed), env.step, record_actions(env, seed, steps))
 
 
-def time_env(env: ExplorationEnv, seed: int, steps: int, warm_up: int, plays: int = 1) -> StepTimes:
-    """Time `env.step` along an episode of the nearest-frontier policy, which is played again so many times."""
-    return StepTimes.of(play_in_turn([play_env(env, seed, warm_up + steps)], warm_up, plays)[0])
-
-
-def time_simulator(config: EnvConfig, seed: int, steps: int, warm_up: int) -> StepTimes:
+def time_simulator(config: EnvConfig, seed: int, steps: int, warm_up: int) -> dict[str, float]:
     """Time ticks of the simulator alone: physics, odometry, landmark sensor and scans, no filter, no observation."""
     setting = draw_setting(config, config.world, np.random.SeedSequence(seed).spawn(1)[0])
     simulator = Simulator(setting.world, setting.true_starts, config.robot_radius, TICK)
@@ -158,15 +113,21 @@ def time_simulator(config: EnvConfig, seed: int, steps: int, warm_up: int) -> St
     for _ in range(warm_up + steps):  # they wander, and meet walls now and then
         turn = np.clip(0.9 * turn + 0.4 * rng.standard_normal(config.num_robots), -1.5, 1.5)
         commands.append(np.column_stack([np.full(config.num_robots, 0.5), turn]))
-    return StepTimes.of(time_steps(tick, commands, warm_up))
+    return _timed(tick, commands, warm_up)
 
 
-def time_resets(env: ExplorationEnv, first_seed: int, resets: int) -> StepTimes:
+def _timed(call: Callable[[Any], Any], arguments: Sequence[Any], warm_up: int) -> dict[str, float]:
+    """Time calls, nothing of whose results is kept."""
+    with no_garbage_collection():
+        return summarise_us(clock(call, arguments)[warm_up:])
+
+
+def time_resets(env: ExplorationEnv, first_seed: int, resets: int) -> dict[str, float]:
     """Time resets, each of another seed; the first is not counted."""
-    return StepTimes.of(time_steps(lambda seed: env.reset(seed=seed), range(first_seed, first_seed + resets + 1), 1))
+    return _timed(lambda seed: env.reset(seed=seed), range(first_seed, first_seed + resets + 1), 1)
 
 
-def time_snapshots(env: ExplorationEnv, seed: int, steps: int, repeats: int) -> Mapping[str, StepTimes]:
+def time_snapshots(env: ExplorationEnv, seed: int, steps: int, repeats: int) -> dict[str, dict[str, float]]:
     """Time taking and restoring states after `steps` steps of the nearest-frontier policy, and clones."""
     record_actions(env, seed, steps)
     state = env.get_state()
@@ -175,10 +136,10 @@ def time_snapshots(env: ExplorationEnv, seed: int, steps: int, repeats: int) -> 
     states = [other.get_state(), state]
     some: list[int] = list(range(repeats))
     return {
-        "get_state": StepTimes.of(time_steps(lambda _: env.get_state(), some, 1)),
-        "set_state, same episode": StepTimes.of(time_steps(lambda _: env.set_state(state), some, 1)),
-        "set_state, another seed": StepTimes.of(time_steps(lambda i: other.set_state(states[i % 2]), some, 2)),
-        "clone": StepTimes.of(time_steps(lambda _: env.clone(), some, 1)),
+        "get_state": _timed(lambda _: env.get_state(), some, 1),
+        "set_state, same episode": _timed(lambda _: env.set_state(state), some, 1),
+        "set_state, another seed": _timed(lambda i: other.set_state(states[i % 2]), some, 2),
+        "clone": _timed(lambda _: env.clone(), some, 1),
     }
 
 

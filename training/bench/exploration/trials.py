@@ -8,14 +8,16 @@ from typing import Any
 import numpy as np
 
 from agents.policy import Policy
-from slam_backend.core.validation import FloatArray
+from agents.registry import action_types
+from slam_backend.core.validation import FloatArray, check_choice
 from slam_backend.geometry import compose
-from training.bench.exploration.bench import ExplorationBenchConfig, ExplorationTrial
+from training.bench.config import ExplorationBenchConfig, ExplorationTrial
 from training.episodes.metrics import score_episode
 from training.episodes.runner import EpisodeRecord, MergeRecord, run_episode
 from vslam_env import vslam_v0
 from vslam_env.belief.team_belief import Belief
 
+TRIALS_FILE = "trials.jsonl"
 NEARLY_ALL = 0.9  # of the floor
 WATCHED_S = 20.0  # a wrong merge that lasted so long, or to the end, is a false one
 CURVE_POINTS = 25
@@ -52,22 +54,27 @@ def play(config: ExplorationBenchConfig, trial: ExplorationTrial) -> dict[str, A
     points = np.linspace(0.0, record.times[-1], CURVE_POINTS)
     lines = (record.coverage, record.map_errors.mean(axis=0), errors)
     return {
-        **asdict(trial),
-        "coverage": float(record.coverage[-1]),
-        "mean_coverage": float(covered.mean()),
+        **asdict(trial), "coverage": float(record.coverage[-1]), "mean_coverage": float(covered.mean()),
         "reached_90": bool(len(reached)),
         "below_90_s": float(seconds[reached[0]] if len(reached) else record.times[-1]),
-        **{name: scores["team"][name] for name in TEAM},
-        "pose_error": float(errors[-1]),
-        "way_m": scores["team"]["path_m"],
-        **count_merges(record.merges),
-        "one_group": len(record.groups) == 1,
-        "attempts": record.attempts,
-        "collisions": sum(int(info["collisions"]) for info in record.infos),
+        **{name: scores["team"][name] for name in TEAM}, "pose_error": float(errors[-1]),
+        "way_m": scores["team"]["path_m"], **count_merges(record.merges), "one_group": len(record.groups) == 1,
+        "attempts": record.attempts, "collisions": sum(int(info["collisions"]) for info in record.infos),
         "invalid_actions": invalid,
         "decision_ms": 1e3 * float(np.median([taken for policy in timed.values() for taken in policy.seconds])),
         "curves": {"time_s": points} | {n: _at(record.times, v, points) for n, v in zip(CURVES, lines, strict=True)},
-    }
+    }  # fmt: skip
+
+
+def parted(policy: str) -> tuple[str, str]:
+    """Return a policy's name and its type of action: a goal if it knows how to set one, unless `@` says otherwise.
+
+    Raises:
+        ValueError: If there is no such policy, or it does not know this type of action.
+    """
+    name, at, wanted = policy.rpartition("@") if "@" in policy else (policy, "", "")
+    known = action_types(name)
+    return name, check_choice(f"{name}@", wanted, known, "These are the actions that it knows.") if at else known[0]
 
 
 def count_merges(merges: Sequence[MergeRecord]) -> dict[str, Any]:
@@ -75,19 +82,14 @@ def count_merges(merges: Sequence[MergeRecord]) -> dict[str, Any]:
 
     False ones are off by more than 0.5 m or 5 degrees and were in force 20 s later, or at the end. Without a right one
     `first_merge_s` and `last_merge_s` are None.
-
-    Args:
-        merges: Of an episode.
     """
     false = [m for m in merges if m.is_false and (m.undone is None or m.undone - m.time >= WATCHED_S)]
     right = [merge.time for merge in merges if not merge.is_false and merge.undone is None]
     return {
-        "right_merges": len(right),
-        "false_merges": len(false),
-        "undone_merges": sum(merge.undone is not None for merge in merges),
-        "first_merge_s": min(right, default=None),
+        "right_merges": len(right), "false_merges": len(false),
+        "undone_merges": sum(merge.undone is not None for merge in merges), "first_merge_s": min(right, default=None),
         "last_merge_s": max(right, default=None),
-    }
+    }  # fmt: skip
 
 
 class _Timed:

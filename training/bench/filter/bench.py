@@ -1,142 +1,145 @@
-"""`BenchConfig`: what `vslam bench filter` times; `run_bench`: its trials, one after the other."""
+"""`vslam bench filter`: filters that hold a map, timed step by step; and the compilation of all kernels."""
 
+import json
+import os
+import subprocess
+import sys
+import tempfile
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
-from itertools import product
+from functools import partial
+from pathlib import Path
 from typing import Any
 
-from slam_backend.core.validation import check_choice, check_int
-from slam_backend.fastslam.options import PROPOSALS
-from training.bench.filter.compile_time import time_compilation
-from training.bench.filter.trials import Row, time_row, time_state
-from training.bench.filter.workload import FilterLoad, Proposal
-from training.experiments.config import PlainConfig, check_each_once
-from training.experiments.step_timing import Timing
-from training.experiments.timed_bench import describe_machine
+import numpy as np
 
-STATE_LOAD = FilterLoad(particles=100, landmarks=300, measurements=15)
-LARGE_LOADS = [FilterLoad(particles=10_000, landmarks=n, measurements=15) for n in (300, 1000)]
+from slam_backend.core.validation import IntArray
+from slam_backend.fastslam.filter import FastSlam
+from slam_backend.fastslam.reports import StepReport
+from training.bench.config import FilterBenchConfig
+from training.bench.filter.workload import LARGE_LOADS, FilterLoad, LoadStep, LoadWorld
+from training.experiments.timing import describe_machine, run_in_turn, time_calls, timing_ms
+
 LARGE_STEPS = 60
+STATE_LOAD = FilterLoad(particles=100, landmarks=300, measurements=15)
+SWEEPS = 3  # how often each landmark was measured before
+WARM_UP = 30  # steps that are not counted
+STATE_CALLS = 200
+WARM_UP_SCRIPT = """
+import json, time
+begin = time.perf_counter()
+from slam_backend import warm_up
+ready = time.perf_counter()
+compiling = warm_up(everything=True, workers=1)
+print(json.dumps({"import_s": ready - begin, "compile_s": compiling, "warm_up_s": time.perf_counter() - ready}))
+"""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class BenchConfig(PlainConfig):
-    """All that decides the benchmark; rows are all combinations of the numbers given.
+def time_row(load: FilterLoad, steps: int) -> dict[str, Any]:
+    """Fill a `FastSlam` and time `steps` steps of it.
 
-    Attributes:
-        particles: M.
-        landmarks: N.
-        measurements: B, of all robots together.
-        robots: K.
-        proposals: Of the filter.
-        lookalikes: So many landmarks share one descriptor.
-        steps: Timed steps per row.
-        large: Also 10,000 particles with 300 and 1,000 landmarks each.
-        compile: Also the compilation of the kernels.
-        seed: Of all random draws.
+    Returns:
+        The load, its times, and: `right`, the share of the measurements that the most probable particle gave to the
+        landmark they are of; `landmarks_held` by that particle at the end; `ess`, the mean effective sample size over M
+        before resampling; `resampled`, the share of the steps that resampled; `nbytes` that the particles hold.
     """
-
-    particles: tuple[int, ...] = (100, 1000)
-    landmarks: tuple[int, ...] = (100, 300, 1000)
-    measurements: tuple[int, ...] = (5, 15)
-    robots: tuple[int, ...] = (1, 2, 3)
-    proposals: tuple[Proposal, ...] = ("fastslam1", "fastslam2")
-    lookalikes: int = 1
-    steps: int = 300
-    large: bool = False
-    compile: bool = False
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        check_int("steps", self.steps, 1, "Time at least one step.")
-        for name in ("particles", "landmarks", "measurements", "robots", "proposals"):
-            check_each_once(name, getattr(self, name))
-        for proposal in self.proposals:
-            check_choice("proposals", proposal, PROPOSALS)
-        self.loads()
-
-    def loads(self) -> list[FilterLoad]:
-        """Return what is timed, row by row."""
-        numbers = product(self.proposals, self.particles, self.landmarks, self.measurements, self.robots)
-        common = {"lookalikes": self.lookalikes, "seed": self.seed}
-        rows = [
-            FilterLoad(proposal=p, particles=m, landmarks=n, measurements=b, robots=k, **common)
-            for p, m, n, b, k in numbers
-        ]
-        large = [replace(load, proposal=p, **common) for p in self.proposals for load in LARGE_LOADS]
-        return rows + large if self.large else rows
+    world = LoadWorld(load)
+    slam, ids = filled_filter(world)
+    course = list(world.course(WARM_UP + steps))
+    seconds, reports = time_calls(lambda step: slam.step(step.odometry, step.frames), course, WARM_UP)
+    return {
+        **load.model_dump(), **timing_ms(seconds), "right": _share_right(course[WARM_UP:], reports, ids),
+        "landmarks_held": slam.map_size, "ess": float(np.mean([report.ess for report in reports])) / load.particles,
+        "resampled": float(np.mean([report.resampled for report in reports])), "nbytes": slam.nbytes,
+        "bytes_per_landmark": slam.nbytes / (load.particles * load.landmarks),
+    }  # fmt: skip
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class BenchResult:
-    """What was measured.
+def time_state(load: FilterLoad) -> dict[str, Any]:
+    """Time `get_state` and `set_state` of a filter that has run for a while."""
+    world = LoadWorld(load)
+    slam, _ = filled_filter(world)
+    for step in world.course(WARM_UP):
+        slam.step(step.odometry, step.frames)
+    state = slam.get_state()
+    taken, _ = time_calls(lambda _: len(slam.get_state()), range(STATE_CALLS), WARM_UP)  # each freed before the next
+    given, _ = time_calls(slam.set_state, [state] * STATE_CALLS, WARM_UP)
+    return {"get_state": timing_ms(taken), "set_state": timing_ms(given)}
 
-    Attributes:
-        machine: As `describe_machine` tells.
-        rows: In the order of the loads; fewer where the user stopped.
-        state: Of `get_state` and `set_state`; none where the user stopped.
-        compilation: As `time_compilation` tells, or None.
-        complete: Whether nothing is missing.
+
+def filled_filter(world: LoadWorld) -> tuple[FastSlam, IntArray]:
+    """Return a filter whose particles all hold all landmarks, and the landmarks' ids in it (N,)."""
+    load = world.load
+    options = load.options
+    slam = FastSlam(
+        load.robots, load.particles, proposal=load.proposal, resample_threshold=options.resample_threshold,
+        seed=load.seed, initial_poses=world.starts,
+    )  # fmt: skip
+    ids = np.full(load.landmarks, -1)
+    for step in world.mapping(SWEEPS):
+        created = slam.step(step.odometry, step.frames, step.names).created[0]
+        ids[step.names[0][created >= 0]] = created[created >= 0]
+    return slam, ids
+
+
+def _share_right(course: list[LoadStep], reports: list[StepReport], ids: IntArray) -> float:
+    """Return the share of all measurements that were given to the landmark they are of."""
+    found = np.concatenate([np.concatenate(report.associations) for report in reports])
+    true = np.concatenate([np.concatenate(step.names) for step in course])
+    return float(np.mean(found == ids[true]))
+
+
+def time_compilation() -> dict[str, Any]:
+    """Warm the backend up in two processes that share a cache of their own, empty at first.
+
+    Returns:
+        `"cold"` and `"cached"`, each with the seconds that the import, the compiler and the whole warm-up took, and the
+        size of the cache in files and bytes.
     """
+    with tempfile.TemporaryDirectory() as folder:
+        cold, cached = _warm_up(folder), _warm_up(folder)
+        sizes = [file.stat().st_size for file in Path(folder).rglob("*") if file.is_file()]
+    return {"cold": cold, "cached": cached, "cache_files": len(sizes), "cache_bytes": sum(sizes)}
 
-    machine: dict[str, Any]
-    rows: tuple[Row, ...]
-    state: dict[str, Timing]
-    compilation: dict[str, Any] | None
-    complete: bool
 
-    def find(self, **numbers: Any) -> Row | None:
-        """Return the first row whose load has these numbers."""
-        found = (row for row in self.rows if all(getattr(row.load, k) == v for k, v in numbers.items()))
-        return next(found, None)
-
-    def to_mapping(self) -> dict[str, Any]:
-        """Return it as plain values."""
-        return {
-            "machine": self.machine,
-            "rows": [row.to_mapping() for row in self.rows],
-            "state": {name: asdict(timing) for name, timing in self.state.items()},
-            "compilation": self.compilation,
-            "complete": self.complete,
-        }
+def _warm_up(cache: str) -> dict[str, float]:
+    """Warm up in a new process."""
+    environment = os.environ | {"NUMBA_CACHE_DIR": cache, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    command = [sys.executable, "-c", WARM_UP_SCRIPT]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    times: dict[str, float] = json.loads(done.stdout)
+    return times
 
 
 def run_bench(
-    config: BenchConfig,
+    config: FilterBenchConfig,
     on_trial: Callable[[str], None] = lambda name: None,
     should_stop: Callable[[], bool] = lambda: False,
-) -> BenchResult:
-    """Run all trials, or those until `should_stop`.
+) -> dict[str, Any]:
+    """Run all trials, or those until `should_stop`; there are `count_trials(config)`.
 
-    Args:
-        config: What to time.
-        on_trial: Called with each trial's name before it begins; there are `count_trials(config)`.
-        should_stop: Asked before each trial.
+    Returns:
+        `rows` in the order of the loads, the times of the `state`, of the `compilation` if asked for; `machine`, and
+        whether the bench is `complete`.
     """
-    left_out: list[str] = []
+    result: dict[str, Any] = {"machine": describe_machine(), "rows": [], "state": {}, "compilation": None}
 
-    def goes_on(trial: str) -> bool:
-        if should_stop():
-            left_out.append(trial)
-            return False
-        on_trial(trial)
-        return True
+    def time_load(load: FilterLoad) -> None:
+        large = load.particles >= LARGE_LOADS[0]["particles"]
+        result["rows"].append(time_row(load, min(config.steps, LARGE_STEPS) if large else config.steps))
 
-    machine = describe_machine()
-    rows = [time_row(load, _steps(config, load)) for load in config.loads() if goes_on(_name(load))]
-    state = time_state(STATE_LOAD) if goes_on("get_state, set_state") else {}
-    compilation = time_compilation() if config.compile and goes_on("compilation") else None
-    return BenchResult(machine, tuple(rows), state, compilation, not left_out)
+    trials: list[tuple[str, Callable[[], object]]] = [
+        (_name(load), partial(time_load, load)) for load in config.loads()
+    ]
+    trials.append(("get_state, set_state", lambda: result.update(state=time_state(STATE_LOAD))))
+    if config.compile:
+        trials.append(("compilation", lambda: result.update(compilation=time_compilation())))
+    result["complete"] = run_in_turn(trials, on_trial, should_stop)
+    return result
 
 
-def count_trials(config: BenchConfig) -> int:
+def count_trials(config: FilterBenchConfig) -> int:
     """Return how often `run_bench` calls `on_trial`."""
     return 1 + len(config.loads()) + config.compile
-
-
-def _steps(config: BenchConfig, load: FilterLoad) -> int:
-    """Return how many steps are timed."""
-    return min(config.steps, LARGE_STEPS) if load.particles >= LARGE_LOADS[0].particles else config.steps
 
 
 def _name(load: FilterLoad) -> str:

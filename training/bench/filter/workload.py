@@ -2,19 +2,21 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend.core.validation import FloatArray, IntArray, bad_argument, check_choice, check_int
-from slam_backend.fastslam.options import PROPOSALS, FilterOptions
+from slam_backend.core.validation import FloatArray, IntArray, bad_argument, check_int
+from slam_backend.fastslam.options import FilterOptions
 from slam_backend.geometry import between, compose, inverse, transform_points
 from slam_backend.models.camera import ROBOT_FROM_CAMERA
 from slam_backend.models.measurements import Measurements
+from training.experiments.config import Checked, NonNegative, Positive, Proposal
 
-Proposal = Literal["fastslam2", "fastslam1"]
-
+LARGE_LOADS: list[dict[str, Any]] = [
+    {"particles": 10_000, "landmarks": landmarks, "measurements": 15} for landmarks in (300, 1000)
+]
 DESCRIPTOR_SIZE = 64
 DESCRIPTOR_NOISE = 0.1  # root mean square L2 length of what is added to a descriptor before it is normalised again
 DEPTHS = (2.0, 7.0)  # [m]
@@ -25,37 +27,22 @@ SWAY_POSITION, SWAY_HEADING = 0.1, 0.03  # amplitudes of the robots' motion [m],
 SWAY_PER_STEP = np.array([0.11, 0.19])  # their phases' steps [rad]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FilterLoad:
-    """One row of the table.
+class FilterLoad(Checked):
+    """One row of the table."""
 
-    Attributes:
-        proposal: Of the filter.
-        particles: M.
-        landmarks: N; all particles hold all of them.
-        measurements: B, of all robots together in a step.
-        robots: K.
-        lookalikes: So many landmarks share one descriptor; 1: all differ.
-        seed: Of all random draws.
-    """
+    proposal: Proposal = "fastslam2"  # Of the filter
+    particles: Positive = 100  # M
+    landmarks: int = 300  # N; all particles hold all of them
+    measurements: int = 15  # B, of all robots together in a step
+    robots: Positive = 1  # K
+    lookalikes: Positive = 1  # So many landmarks share one descriptor; 1: all differ
+    seed: NonNegative = 0  # Of all random draws
 
-    proposal: Proposal = "fastslam2"
-    particles: int = 100
-    landmarks: int = 300
-    measurements: int = 15
-    robots: int = 1
-    lookalikes: int = 1
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        check_choice("proposal", self.proposal, PROPOSALS)
-        check_int("particles", self.particles, 1, "Use at least one particle; 100 is a good start.")
-        check_int("robots", self.robots, 1, "Use 1 to 8 robots.")
+    def check(self) -> None:
+        """Refuse more measurements than there can be."""
         check_int("measurements", self.measurements, self.robots, "Give each robot at least one.")
         cure = "A robot's measurements are of different landmarks, and it sees nearly all of them."
         check_int("landmarks", self.landmarks, 2 * self.measurements, cure)
-        check_int("lookalikes", self.lookalikes, 1, "Use 1 for landmarks that all look different.")
-        check_int("seed", self.seed, 0, "Use 0 or a positive number.")
 
     @property
     def options(self) -> FilterOptions:
@@ -65,17 +52,11 @@ class FilterLoad:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoadStep:
-    """The readings of one step.
+    """The readings of one step."""
 
-    Attributes:
-        odometry: Per robot (3,) [m, m, rad], or None.
-        frames: Per robot its measurements, or None.
-        names: Per robot (n_i,) int64, the true names of what it measured.
-    """
-
-    odometry: tuple[FloatArray | None, ...]
-    frames: tuple[Measurements | None, ...]
-    names: tuple[IntArray, ...]
+    odometry: tuple[FloatArray | None, ...]  # Per robot (3,) [m, m, rad], or None
+    frames: tuple[Measurements | None, ...]  # Per robot its measurements, or None
+    names: tuple[IntArray, ...]  # Per robot (n_i,) int64, the true names of what it measured
 
 
 class LoadWorld:
@@ -84,9 +65,6 @@ class LoadWorld:
     Landmarks fill the first robot's view between two depths, evenly over the image. Robots stand side by side at known
     poses and sway by decimetres, so that each sees nearly all of them at all times. Measurements in a step are drawn at
     random from what is in view, so that two steps have little in common.
-
-    Args:
-        load: How much.
     """
 
     def __init__(self, load: FilterLoad) -> None:

@@ -1,20 +1,19 @@
 """`vslam bench stereo`: how fast the stereo eye is, and how good, on rendered pairs."""
 
 import time
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Sequence
 from typing import Any
 
+import cv2
 import numpy as np
 
-from slam_backend.core.validation import check_choice, check_int
-from slam_backend.frontend import DESCRIPTORS, CornerOptions, FrontEndOptions, StereoFrontEnd
+from slam_backend.frontend import CornerOptions, FrontEndOptions, StereoFrontEnd
 from slam_backend.models.camera import StereoCamera
+from training.bench.config import StereoBenchConfig
 from training.bench.stereo.quality import quality_row, retrieval, second_looks
+from training.bench.stereo.real_images import RealPart, measure_parts
 from training.bench.stereo.scenes import Scene, panel_hall
-from training.experiments.config import PlainConfig, check_each_once
-from training.experiments.step_timing import Timing, time_calls
-from training.experiments.timed_bench import describe_machine
+from training.experiments.timing import describe_machine, time_calls, timing_ms
 from vslam_env.sensors.stereo.textures import STYLES, TextureConfig
 
 BUSY = TextureConfig(polygons=20.0, posters=0.6)  # enough corners for 100 landmarks in an image
@@ -23,57 +22,13 @@ WARM_UP = 5  # pairs that are not timed
 WINDOW = 0.6  # [m] of the descriptor window of constant physical size
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StereoBenchConfig(PlainConfig):
-    """All that decides the benchmark.
-
-    Attributes:
-        sizes: Widths of the images [px]; heights are three quarters, and the field of view stays.
-        landmarks: Numbers of landmarks in a frame.
-        walls: Numbers of walls.
-        descriptors: What is compared.
-        steps: Timed pairs per row.
-        views: Rendered pairs per descriptor for quality.
-        seed: Of all random draws.
-    """
-
-    sizes: tuple[int, ...] = (320, 640)
-    landmarks: tuple[int, ...] = (50, 100, 200)
-    walls: tuple[int, ...] = (10, 40, 120)
-    descriptors: tuple[str, ...] = DESCRIPTORS
-    steps: int = 100
-    views: int = 60
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        for name in ("sizes", "landmarks", "walls", "descriptors"):
-            check_each_once(name, getattr(self, name))
-        for name, least in (("sizes", 64), ("landmarks", 1), ("walls", 4)):
-            for value in getattr(self, name):
-                check_int(name, value, least, f"Use at least {least}.")
-        for value in self.descriptors:
-            check_choice("descriptors", value, DESCRIPTORS)
-        check_int("steps", self.steps, 1, "Time at least one pair.")
-        check_int("views", self.views, 1, "Look at least once.")
-        check_int("seed", self.seed, 0, "Use 0 or a positive number.")
-
-
 def camera_of(width: int) -> StereoCamera:
     """Return the default camera with images of another width and the same field of view."""
     return StereoCamera(focal_px=float(width), width=width, height=3 * width // 4)
 
 
 def speed_row(width: int, landmarks: int, walls: int, descriptor: Any, steps: int, seed: int) -> dict[str, Any]:
-    """Time rendering and front end on one thread.
-
-    Args:
-        width: Of the images [px].
-        landmarks: Wanted in a frame; how many there are is in the row.
-        walls: Of the world.
-        descriptor: Key of `KINDS`.
-        steps: Timed pairs.
-        seed: Of textures and noise.
-    """
+    """Time rendering and front end on one thread."""
     camera = camera_of(width)
     scene = Scene(panel_hall(walls), camera, seed, BUSY)
     spacing = CROWDED if landmarks > 100 else CornerOptions().spacing
@@ -86,31 +41,38 @@ def speed_row(width: int, landmarks: int, walls: int, descriptor: Any, steps: in
     render = _timed(lambda _: scene.look(pose, rng), steps)
     measure = _timed(lambda _: front_end.measure(view.left, view.right), steps)
     return {
-        "width": width,
-        "height": camera.height,
-        "walls": walls,
-        "wanted": landmarks,
-        "landmarks": found,
-        "descriptor": descriptor,
-        "render": render,
-        "front_end": measure,
-    }
+        "width": width, "height": camera.height, "walls": walls, "wanted": landmarks, "landmarks": found,
+        "descriptor": descriptor, "render": render, "front_end": measure,
+    }  # fmt: skip
 
 
 def _timed(call: Callable[[Any], Any], steps: int) -> dict[str, float]:
     """Time a call [ms]: by the clock, and by the processor, which counts the same on a busy machine."""
     time_calls(call, range(WARM_UP))
     begin = time.process_time()
-    timing = Timing.of(time_calls(call, range(steps))[0])
-    return asdict(timing) | {"processor_ms": 1e3 * (time.process_time() - begin) / steps}
+    timing = timing_ms(time_calls(call, range(steps))[0])
+    return timing | {"processor_ms": 1e3 * (time.process_time() - begin) / steps}
 
 
 def run_stereo_bench(
     config: StereoBenchConfig,
+    real: Sequence[RealPart] = (),
     on_part: Callable[[str], None] = lambda name: None,
     interrupted: Callable[[], bool] = lambda: False,
 ) -> dict[str, Any]:
-    """Run all parts on rendered pairs; `interrupted` is asked between them."""
+    """Run all parts, on one thread of OpenCV; `interrupted` is asked between them."""
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    result = _run_rendered(config, on_part, interrupted)
+    measure_parts(real, result, on_part, interrupted)
+    cv2.setNumThreads(threads)
+    return result
+
+
+def _run_rendered(
+    config: StereoBenchConfig, on_part: Callable[[str], None], interrupted: Callable[[], bool]
+) -> dict[str, Any]:
+    """Run all parts on rendered pairs."""
     speed: list[dict[str, Any]] = []
     middle = (320 if 320 in config.sizes else config.sizes[0], 100, 40)
     loads = [(*middle, descriptor) for descriptor in config.descriptors]
@@ -131,11 +93,11 @@ def run_stereo_bench(
     cases: list[tuple[str, float | None, str]] = [(descriptor, None, "distinct") for descriptor in config.descriptors]
     if "usurf" in config.descriptors:
         cases += [("usurf", WINDOW, "distinct"), *(("usurf", None, style) for style in STYLES if style != "distinct")]
-    for descriptor, window, style in cases:
+    for way, window, style in cases:
         if interrupted():
             return result
-        on_part(f"retrieval: {descriptor}, {style}" + (f", window {window} m" if window else ""))
-        result["retrieval"].append(retrieval(descriptor, window, style, config.seed))
+        on_part(f"retrieval: {way}, {style}" + (f", window {window} m" if window else ""))
+        result["retrieval"].append(retrieval(way, window, style, config.seed))
     on_part("second looks")
     result["second_looks"] = second_looks(config.seed)
     return result

@@ -20,13 +20,7 @@ OUTLIER_PX = 1.0
 
 
 def quality_row(descriptor: Any, views: int, seed: int) -> dict[str, Any]:
-    """Measure rendered pairs from anywhere in an office: disparities before and after each guard, NEES of second looks.
-
-    Args:
-        descriptor: Key of `KINDS`.
-        views: So many pairs.
-        seed: Of world, textures, places and noise.
-    """
+    """Measure rendered pairs from anywhere in an office: disparities before and after each guard, second looks."""
     rng, camera = np.random.default_rng(seed), StereoCamera()
     scene = Scene(make_world("office", np.random.default_rng(seed)), camera, seed)
     front_end = StereoFrontEnd(camera, FrontEndOptions(descriptor=descriptor))
@@ -41,10 +35,9 @@ def quality_row(descriptor: Any, views: int, seed: int) -> dict[str, Any]:
         passed.append(matches.passed)
         counts.append(len(frame.measurements))
     return {
-        "descriptor": descriptor,
-        "landmarks_per_frame": float(np.mean(counts)),
+        "descriptor": descriptor, "landmarks_per_frame": float(np.mean(counts)),
         "guards": guard_rows(np.concatenate(by_corners), np.concatenate(by_patches), np.concatenate(passed, axis=1)),
-    }
+    }  # fmt: skip
 
 
 def guard_rows(by_corners: FloatArray, by_patches: FloatArray, passed: Any) -> list[dict[str, Any]]:
@@ -67,13 +60,11 @@ def _errors(name: str, errors: FloatArray) -> dict[str, Any]:
     inlying = np.abs(errors) <= OUTLIER_PX
     inliers = errors[inlying]
     return {
-        "name": name,
-        "matches": len(errors),
-        "outliers": float(1.0 - inlying.mean()) if len(errors) else float("nan"),
+        "name": name, "matches": len(errors), "outliers": float(1.0 - inlying.mean()) if len(errors) else float("nan"),
         "rms_px": float(np.sqrt(np.mean(inliers**2))) if len(inliers) else float("nan"),
         "median_px": float(np.median(np.abs(inliers))) if len(inliers) else float("nan"),
         "bias_px": float(inliers.mean()) if len(inliers) else float("nan"),
-    }
+    }  # fmt: skip
 
 
 def retrieval(descriptor: Any, window: float | None, style: str, seed: int) -> dict[str, Any]:
@@ -84,10 +75,7 @@ def retrieval(descriptor: Any, window: float | None, style: str, seed: int) -> d
     those that are right.
 
     Args:
-        descriptor: Key of `KINDS`.
         window: Of constant physical size [m]; None: of constant size in the image.
-        style: Of the textures.
-        seed: Of textures and noise.
     """
     rng, camera = np.random.default_rng(seed), StereoCamera()
     scene = Scene(WALL, camera, seed, TextureConfig(style=style))
@@ -119,20 +107,15 @@ def retrieval(descriptor: Any, window: float | None, style: str, seed: int) -> d
             accepted, accepted_right = accepted + int(near.sum()), accepted_right + int((fine & near).sum())
         nan = float("nan")
         return {
-            "queries": total,
-            "recall": right / total if total else nan,
-            "precision": accepted_right / accepted if accepted else nan,
-            "accepted": accepted / total if total else nan,
-        }
+            "queries": total, "recall": right / total if total else nan,
+            "precision": accepted_right / accepted if accepted else nan, "accepted": accepted / total if total else nan,
+        }  # fmt: skip
 
     return {
-        "descriptor": descriptor,
-        "window": window,
-        "style": style,
-        "map": len(names),
+        "descriptor": descriptor, "window": window, "style": style, "map": len(names),
         "angles": {f"{angle:g}": score(DISTANCE, np.radians(angle)) for angle in ANGLES_DEG},
         "ratios": {f"{ratio:g}": score(DISTANCE * ratio, 0.0) for ratio in RATIOS},
-    }
+    }  # fmt: skip
 
 
 def second_looks(seed: int) -> dict[str, Any]:
@@ -163,10 +146,8 @@ def second_looks(seed: int) -> dict[str, Any]:
         squares = np.concatenate(values)
         within = squares <= 16.27  # 99.9 % of chi-square with 3 degrees of freedom
         result[f"{scale:g}"] = {
-            "pairs": len(squares),
-            "within": float(within.mean()),
-            "anees": float(squares[within].mean() / 3.0),
-        }
+            "pairs": len(squares), "within": float(within.mean()), "anees": float(squares[within].mean() / 3.0),
+        }  # fmt: skip
     return result
 
 

@@ -46,17 +46,11 @@ FARTHEST_SQUARES = 60.0  # points farther than this are dropped [squares]
 
 @dataclass(frozen=True, slots=True)
 class RealPart:
-    """Something that a folder of real images lets be measured.
+    """Something that a folder of real images lets be measured."""
 
-    Attributes:
-        key: Under which the bench keeps it.
-        name: Name of the part, for people.
-        measure: Returns rows, or one row.
-    """
-
-    key: str
-    name: str
-    measure: Callable[[], Any]
+    key: str  # Under which the bench keeps it
+    name: str  # Name of the part, for people
+    measure: Callable[[], Any]  # Returns rows, or one row
 
 
 def find_parts(folder: Path, descriptors: Sequence[str]) -> list[RealPart]:
@@ -65,7 +59,6 @@ def find_parts(folder: Path, descriptors: Sequence[str]) -> list[RealPart]:
     Args:
         folder: With any of OpenCV's samples; planar pairs `NAMEA`, `NAMEB` with their homography `NAME_model.txt`;
             stereo pairs in one of `LAYOUTS` with one of `CALIBRATIONS`.
-        descriptors: Keys of `KINDS`.
     """
     parts: list[RealPart] = []
     for place in (folder, *_folders_in(folder)):
@@ -92,10 +85,7 @@ def measure_parts(
     """Measure parts one after the other, and add each to a result; one that fails is noted, and the others go on.
 
     Args:
-        parts: Parts that `find_parts` returned.
         result: Result of the bench; changed. `failed` holds what was wrong, by the names of the parts.
-        on_part: Called with the name of each part.
-        interrupted: Asked before each part.
     """
     for part in parts:
         if interrupted():
@@ -128,7 +118,6 @@ def rig_rows(folder: Path, descriptors: Sequence[str]) -> list[dict[str, Any]]:
     Args:
         folder: In one of `LAYOUTS`, with one of `CALIBRATIONS`; at most `MOST_PAIRS` of its pairs are measured, evenly
             chosen.
-        descriptors: Keys of `KINDS`.
 
     Returns:
         Per descriptor: `rig`, `descriptor`, `pairs`; means over the pairs of `matches`, of those left after each guard
@@ -194,12 +183,7 @@ def _eyes(folder: Path) -> tuple[list[Path], list[Path]]:
 
 
 def aloe_rows(folder: Path, descriptor: Any) -> list[dict[str, Any]]:
-    """Return errors before and after each guard on the aloe pair, whose disparities are known to whole pixels.
-
-    Args:
-        folder: With `aloeL.jpg`, `aloeR.jpg` and `aloeGT.png`.
-        descriptor: Key of `KINDS`.
-    """
+    """Return errors before and after each guard on the aloe pair, whose disparities are known to whole pixels."""
     left, right = (read_grey(folder / f"aloe{eye}.jpg") for eye in "LR")
     true = read_grey(folder / "aloeGT.png").astype(np.float64)
     height, width = left.shape
@@ -272,22 +256,10 @@ def chessboard(folder: Path) -> dict[str, Any]:
         depths.append(points[:, 2])
     distances, depth = np.concatenate(away), np.concatenate(depths)
     return {
-        "pairs": len(away),
-        "calibration_px": float(stereo[0]),
-        "points": len(distances),
-        "median_squares": float(np.median(distances)),
-        "within_20th": float((distances < 0.05).mean()),
+        "pairs": len(away), "calibration_px": float(stereo[0]), "points": len(distances),
+        "median_squares": float(np.median(distances)), "within_20th": float((distances < 0.05).mean()),
         "median_percent_of_depth": float(100.0 * np.median(distances / depth)),
-    }
-
-
-def planar_scores(folder: Path) -> list[dict[str, Any]]:
-    """Return matching scores on planar pairs with known homographies.
-
-    Args:
-        folder: Folder with pairs `NAMEA`, `NAMEB` with `NAME_model.txt`.
-    """
-    return [row for model in sorted(folder.glob(f"*{MODEL}")) for row in planar_rows(model)]
+    }  # fmt: skip
 
 
 def planar_rows(file: Path) -> list[dict[str, Any]]:

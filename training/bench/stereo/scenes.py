@@ -31,55 +31,30 @@ def panel_hall(walls: int) -> World:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """What a camera saw of a world from a known place.
+    """What a camera saw of a world from a known place."""
 
-    Attributes:
-        pose: (3,) float64 [m, m, rad], world frame.
-        left: (H, W) uint8.
-        right: (H, W) uint8.
-    """
-
-    pose: FloatArray
-    left: Image
-    right: Image
+    pose: FloatArray  # (3,) float64 [m, m, rad], world frame
+    left: Image  # (H, W) uint8
+    right: Image  # (H, W) uint8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Named:
-    """A view's points with their true landmarks.
+    """A view's points with their true landmarks."""
 
-    Attributes:
-        frame: What the front end made of the view.
-        world: (n, 3) float64 [m], world frame, by the true pose.
-        names: (n,) int64. True landmarks, -1: none.
-        true_disparities: (n,) float64 [px]. Of what the points' rays meet.
-    """
-
-    frame: StereoFrame
-    world: FloatArray
-    names: IntArray
-    true_disparities: FloatArray
+    frame: StereoFrame  # What the front end made of the view
+    world: FloatArray  # (n, 3) float64 [m], world frame, by the true pose
+    names: IntArray  # (n,) int64. True landmarks, -1: none.
+    true_disparities: FloatArray  # (n,) float64 [px]. Of what the points' rays meet.
 
 
 class Scene:
-    """A textured world, its eyes, and its true corners.
-
-    Args:
-        world: Its walls.
-        camera: Of the eyes.
-        seed: Of textures.
-        textures: What the walls look like.
-        imaging: Noise of the images.
-    """
+    """A textured world, its eyes, and its true corners."""
 
     def __init__(
-        self,
-        world: World,
-        camera: StereoCamera,
-        seed: int,
-        textures: TextureConfig | None = None,
+        self, world: World, camera: StereoCamera, seed: int, textures: TextureConfig | None = None,
         imaging: ImagingConfig | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.world, self.camera = world, camera
         self.textures: WallTextures = draw_textures(world.walls, np.random.default_rng(seed), textures)
         self.eye = StereoEye(camera, ImagingConfig() if imaging is None else imaging, world.walls, self.textures)

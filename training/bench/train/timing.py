@@ -1,9 +1,10 @@
-"""What a decision of a training costs beside its environment: the adapter, the network, and its updates."""
+"""Cost of a decision of a training beside its environment, and environments timed over worker processes."""
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -11,11 +12,12 @@ from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 from sb3_contrib import MaskablePPO
 
-from slam_backend.core.validation import FloatArray
-from training.bench.env.timing import time_steps
+from slam_backend.core.validation import BoolArray, FloatArray
+from training.experiments.statistics import interval
+from training.experiments.timing import clock, no_garbage_collection
 from training.rl.config import TrainConfig
 from training.rl.network import GoalPolicy
-from training.vec_env import ExplorationVecEnv
+from training.vec_env import ExplorationVecEnv, make_vec_env
 from vslam_env import vslam_v0
 from vslam_env.config import EnvConfig
 
@@ -24,9 +26,11 @@ WARM_UP = 20
 RECORDED = 20  # steps of an environment that are played again and again
 ADAPTER_ALONE = "adapter alone"
 
+WORKERS_WARM_UP = 3
+CLOCK, PROCESSOR = 0, 1  # columns of what the environments of each process took
 
-@dataclass(frozen=True, slots=True)
-class Part:
+
+class Part(NamedTuple):
     """One part of a training's time, per decision of a robot [us]."""
 
     name: str
@@ -94,6 +98,12 @@ class Replay(ParallelEnv[str, Any, Any]):  # type: ignore[misc]   # PettingZoo h
         return self._recording.told[self._next]
 
 
+def _seconds(call: Callable[[Any], Any], arguments: Sequence[Any], warm_up: int) -> FloatArray:
+    """Return how long calls took (n - warm_up,) [s], nothing of their results kept."""
+    with no_garbage_collection():
+        return clock(call, arguments)[warm_up:]
+
+
 def time_adapter(recording: Recording, num_envs: int) -> list[Part]:
     """Return what the adapter adds to a decision, and what the masks cost, over environments that take no time."""
     env = ExplorationVecEnv([lambda: Replay(recording)] * num_envs)
@@ -101,9 +111,9 @@ def time_adapter(recording: Recording, num_envs: int) -> list[Part]:
     actions = [np.zeros(env.num_envs, np.int64)] * (ADAPTER_STEPS + WARM_UP)
     alone = [Replay(recording) for _ in range(num_envs)]
     # Reads what the steps return, in turn and once a step: the replay's own time, which is no adapter's.
-    bare = time_steps(lambda _: [one.step(None) for one in alone], actions, WARM_UP)
-    stepped = time_steps(env.step, actions, WARM_UP)
-    masks = time_steps(lambda _: np.stack(env.env_method("action_masks")), actions, WARM_UP)
+    bare = _seconds(lambda _: [one.step(None) for one in alone], actions, WARM_UP)
+    stepped = _seconds(env.step, actions, WARM_UP)
+    masks = _seconds(lambda _: np.stack(env.env_method("action_masks")), actions, WARM_UP)
     without = Part.of("", bare, env.num_envs)
     whole = Part.of(ADAPTER_ALONE, stepped, env.num_envs)
     return [
@@ -127,7 +137,7 @@ def time_learner(recording: Recording, config: TrainConfig) -> list[Part]:
         with torch.no_grad():
             model.policy(model.policy.obs_to_tensor(seen)[0], action_masks=masks)
 
-    drawn = time_steps(act, [None] * 60, 10)
+    drawn = _seconds(act, [None] * 60, 10)
     model.learn(config.rollout)  # fills the buffer, and warms the update up
     updates = []
     for _ in range(3):
@@ -138,3 +148,96 @@ def time_learner(recording: Recording, config: TrainConfig) -> list[Part]:
         Part.of("network, drawing", drawn, env.num_envs),
         Part.of("network, updating", np.array(updates), config.rollout),
     ]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WorkerTimes:
+    """Durations of N steps with a number of workers, each step with the same actions as with the other numbers [s]."""
+
+    workers: int  # Processes; 0: the measuring one alone
+    masks: FloatArray  # (N,) on the clock. Asking for the masks.
+    steps: FloatArray  # (N,) on the clock. The steps.
+    # (N, P, 2). What the environments of each process took of them: on the clock, and of its processor.
+    spent: FloatArray
+
+    @property
+    def whole(self) -> FloatArray:
+        """(N,) on the clock. Masks and steps."""
+        return self.masks + self.steps
+
+    @property
+    def beside(self) -> FloatArray:
+        """(N,) on the clock. What steps took beside the environments of the slowest process: adapter and pipes."""
+        beside: FloatArray = self.steps - self.spent[:, :, CLOCK].max(axis=1)
+        return beside
+
+
+def time_workers(
+    config: EnvConfig, num_envs: int, workers: Sequence[int], steps: int, seed: int
+) -> tuple[WorkerTimes, ...]:
+    """Time environments under random valid goals, in this process or over workers.
+
+    All of them play the same episodes, and take turns at each step: what else the machine does meets them all alike.
+
+    Args:
+        workers: Numbers of processes; 0: this one alone.
+    """
+    with ExitStack() as open_now:
+        envs = []
+        for count in workers:
+            env = make_vec_env(config, num_envs, count, seed)
+            open_now.callback(env.close)
+            env.reset()
+            envs.append(env)
+        rng = np.random.default_rng(seed)
+        seconds = np.empty((len(envs), steps + WORKERS_WARM_UP, 2))
+        spent = [np.empty((steps + WORKERS_WARM_UP, *env.spent.shape)) for env in envs]
+        with no_garbage_collection():
+            for step in range(steps + WORKERS_WARM_UP):
+                actions: NDArray[np.int64] | None = None
+                for row, env in enumerate(envs):
+                    begin = time.perf_counter()
+                    masks = env.env_method("action_masks")
+                    asked = time.perf_counter()
+                    actions = _drawn(masks, rng) if actions is None else actions
+                    chosen = time.perf_counter()
+                    env.step(actions)
+                    seconds[row, step] = asked - begin, time.perf_counter() - chosen
+                    spent[row][step] = env.spent
+    return tuple(
+        WorkerTimes(count, times[WORKERS_WARM_UP:, 0], times[WORKERS_WARM_UP:, 1], took[WORKERS_WARM_UP:])
+        for count, times, took in zip(workers, seconds, spent, strict=True)
+    )
+
+
+def summarise_workers(times: Sequence[WorkerTimes], slots: int) -> list[dict[str, Any]]:
+    """Return a row for each number of workers; medians over the steps where nothing else is said.
+
+    Returns:
+        Rows of `workers`; decisions of robots `per_second` by the median step, `best_per_second` by the fastest,
+        `mean_per_second` by all; `beside_us`, what a decision takes beside the environments of the slowest process;
+        `balance`, the mean over the maximum of the processes' processor times. Beside one worker, else None: `work`,
+        the processor time of all environments as a multiple of that in one worker, above 1 where processes get into
+        each other's way; `gain` in decisions per second, step by step, with its 95 % bootstrap interval.
+    """
+    alone = {each.workers: each for each in times}.get(1)
+    rows = []
+    for each in times:
+        whole, of_processors = each.whole, each.spent[:, :, PROCESSOR]
+        row: dict[str, Any] = {
+            "workers": each.workers, "per_second": slots / float(np.median(whole)),
+            "best_per_second": slots / float(whole.min()), "mean_per_second": slots * len(whole) / float(whole.sum()),
+            "beside_us": 1e6 / slots * float(np.median(each.beside)),
+            "balance": float(np.median(of_processors.mean(axis=1) / of_processors.max(axis=1))),
+        } | dict.fromkeys(("work", "gain", "gain_low", "gain_high"))  # fmt: skip
+        if alone is not None and each is not alone:
+            ratios, work = alone.whole / whole, of_processors.sum(axis=1) / alone.spent[:, :, PROCESSOR].sum(axis=1)
+            low, high = interval(ratios, np.median)
+            gain = {"gain": float(np.median(ratios)), "gain_low": low, "gain_high": high}
+            row |= {"work": float(np.median(work)), **gain}
+        rows.append(row)
+    return rows
+
+
+def _drawn(masks: Sequence[BoolArray], rng: np.random.Generator) -> NDArray[np.int64]:
+    return np.array([rng.choice(np.flatnonzero(mask)) for mask in masks], np.int64)

@@ -1,11 +1,22 @@
-"""What the paper says of its Fig. 6, asked of the data by 95 % intervals that are paired over seeds."""
+"""Trials of Fig. 6 summed up, and what the paper says of it, asked of the data by 95 % intervals paired over seeds."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from training.paper.fig6.noise_regimes import BOUND
-from training.paper.fig6.summary import error_by_seed, paired_ratio, time_by_seed
+import numpy as np
+from scipy import stats
+
+from slam_backend.core.validation import FloatArray
+from training.experiments.statistics import CONFIDENCE, grouped, mean_of
+from training.experiments.tables import csv_text
+from training.paper.fig6.trials import BOUND, FIGURES
+
+POINT = ("regime", "proposal", "robots", "particles")
+TIMES = ("median_ms", "all_median_ms", "all_mean_ms", "measured")
+LEAST = 1e-12  # [m, ms]; the logarithm of 0 is none
+
+Rows = Iterable[Mapping[str, Any]]
 
 ENOUGH = 100  # particles from which on the paper's claims about robots are asked
 PAPER = {"regime": "paper", "proposal": "fastslam1"}
@@ -15,6 +26,79 @@ LARGEST_SHARE, AT = 0.85, 100
 # which names and the whole run are known, and three robots that share the measurements gain nearly what can be had: the
 # share of the error that is left is at most so many times the share that is left with batch maximum likelihood.
 REJUVENATED, NEAR_BOUND, NEAR_ITS_GAIN = "fastslam2+rejuvenation", 1.3, 1.15
+
+
+def summarise(errors: Rows, times: Rows) -> list[dict[str, Any]]:
+    """Return one line per regime, proposal, K and M, in the order in which they first come.
+
+    Args:
+        times: As `play_time` returns them; they belong to the paper's regime.
+
+    Returns:
+        The fields of `POINT`, `seeds`, `timed_seeds`, and for each of `FIGURES` and `TIMES` its mean over the seeds,
+        with `_low` and `_high` appended the ends of its 95 % bootstrap interval; None where it is not known.
+    """
+    groups = grouped(errors, POINT)
+    clocked: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
+    for row in times:
+        for i, robots in enumerate(row["robots"]):
+            point = ("paper", "fastslam1", robots, row["particles"])
+            clocked.setdefault(point, []).append({name: row[name][i] for name in TIMES})
+    lines = []
+    for point in dict.fromkeys([*groups, *clocked]):
+        own, timed = groups.get(point, []), clocked.get(point, [])
+        line = dict(zip(POINT, point, strict=True)) | {"seeds": len(own), "timed_seeds": len(timed)}
+        for names, rows in ((FIGURES, own), (TIMES, timed)):
+            for name in names:
+                line |= mean_of(name, [row[name] for row in rows])
+        lines.append(line)
+    return lines
+
+
+def to_csv(lines: Sequence[Mapping[str, Any]]) -> str:
+    """Return the lines of `summarise` as CSV with a heading; what is not known is empty, numbers have six digits."""
+    figures = (f"{name}{end}" for name in (*FIGURES, *TIMES) for end in ("", "_low", "_high"))
+    names = [*POINT, "seeds", "timed_seeds", *figures]
+    return csv_text(names, ([line[name] for name in names] for line in lines))
+
+
+def paired_ratio(above: Mapping[int, float], below: Mapping[int, float]) -> dict[str, Any]:
+    """Return the geometric mean over seeds of `above / below`, with its 95 % interval by Student's t on the logarithms.
+
+    Returns:
+        `ratio`, `low`, `high` and `seeds`; None for what so few seeds do not tell.
+
+    >>> paired_ratio({0: 2.0, 1: 8.0, 2: 5.0}, {0: 1.0, 1: 2.0})["ratio"]
+    2.82842712474619
+    """
+    seeds = sorted(above.keys() & below.keys())
+    if not seeds:
+        return {"ratio": None, "low": None, "high": None, "seeds": 0}
+    logs: FloatArray = np.log([max(above[s], LEAST) for s in seeds]) - np.log([max(below[s], LEAST) for s in seeds])
+    centre, low, high = float(logs.mean()), None, None
+    if len(seeds) > 1:
+        half = float(stats.t.ppf(0.5 * (1.0 + CONFIDENCE), len(seeds) - 1) * logs.std(ddof=1) / np.sqrt(len(seeds)))
+        low, high = float(np.exp(centre - half)), float(np.exp(centre + half))
+    return {"ratio": float(np.exp(centre)), "low": low, "high": high, "seeds": len(seeds)}
+
+
+def error_by_seed(errors: Rows, figure: str = "map_rmse_m", **point: Any) -> dict[int, float]:
+    """Return a figure by seed of the error trials with these fields."""
+    return _by_seed(errors, point, lambda row: row[figure])
+
+
+def time_by_seed(times: Rows, robots: int, particles: int) -> dict[int, float]:
+    """Return by seed the median time [ms] of the steps with all measurements, for K robots and M particles."""
+    return _by_seed(
+        (row for row in times if robots in row["robots"]), {"particles": particles},
+        lambda row: row["median_ms"][row["robots"].index(robots)],
+    )  # fmt: skip
+
+
+def _by_seed(rows: Rows, point: Mapping[str, Any], read: Callable[[Mapping[str, Any]], Any]) -> dict[int, float]:
+    """Return what is read from the rows with these fields, by seed; what is not known is left out."""
+    chosen = (row for row in rows if all(row[name] == value for name, value in point.items()))
+    return {row["seed"]: float(value) for row in chosen if (value := read(row)) is not None}
 
 
 def flat_within(particles: int) -> float:
@@ -28,27 +112,16 @@ def flat_within(particles: int) -> float:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Claim:
-    """One statement about a ratio.
+    """One statement about a ratio."""
 
-    Attributes:
-        claim: In words.
-        ratio: Geometric mean over seeds; None without data.
-        low: Lower end of its 95 % interval, paired over seeds; None for a single seed.
-        high: Its upper end.
-        seeds: How many.
-        above: What the interval's lower end must be above; None: no such limit.
-        below: What the interval's upper end must be below; None: no such limit.
-        ratio_at_most: What the ratio itself may not be above; None: no such limit.
-    """
-
-    claim: str
-    ratio: float | None
-    low: float | None
-    high: float | None
-    seeds: int
-    above: float | None = None
-    below: float | None = None
-    ratio_at_most: float | None = None
+    claim: str  # In words
+    ratio: float | None  # Geometric mean over seeds; None without data
+    low: float | None  # Lower end of its 95 % interval, paired over seeds; None for a single seed
+    high: float | None  # Its upper end
+    seeds: int  # How many
+    above: float | None = None  # What the interval's lower end must be above; None: no such limit
+    below: float | None = None  # What the interval's upper end must be below; None: no such limit
+    ratio_at_most: float | None = None  # What the ratio itself may not be above; None: no such limit
 
     @property
     def holds(self) -> bool:
@@ -67,12 +140,7 @@ class Claim:
 
 
 def check_claims(errors: Sequence[Mapping[str, Any]], times: Sequence[Mapping[str, Any]]) -> list[Claim]:
-    """Ask the paper's claims of the trials in its regime, as far as there are any.
-
-    Args:
-        errors: As `play_error` returns them.
-        times: As `play_time` returns them.
-    """
+    """Ask the paper's claims of the trials in its regime, as far as there are any."""
     own = [row for row in errors if all(row[name] == value for name, value in PAPER.items())]
     numbers = sorted({row["particles"] for row in own})
     robots = sorted({row["robots"] for row in own})

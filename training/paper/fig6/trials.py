@@ -1,19 +1,35 @@
-"""One trial of the paper's Fig. 6: how wrong a filter's map is in the end, or how long a step takes it."""
+"""Trials of the paper's Fig. 6 under three noise regimes: the error of a filter's map, and the time of a step."""
 
 import time
 from dataclasses import asdict, dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
-from slam_backend.core.validation import BoolArray, FloatArray, bad_argument, check_choice, check_int
+from slam_backend.core.validation import BoolArray, FloatArray, check_choice, check_int
 from slam_backend.fastslam.filter import FastSlam
-from training.bench.accuracy.runs import FALSE_POINT, RunSpec, StereoRun, simulate_run
-from training.bench.accuracy.trials import Answer, follow, optimal, score
-from training.experiments.step_timing import no_garbage_collection
-from training.paper.fig6.noise_regimes import BOUND, FILTER_OPTIONS, REGIMES, Proposal
+from training.bench.accuracy.runs import FALSE_POINT, Preset, RunSpec, StereoRun, simulate_run
+from training.bench.accuracy.trials import REJUVENATE_EVERY, Answer, follow, optimal, score
+from training.experiments.timing import no_garbage_collection
 
+Proposal = Literal["fastslam1", "fastslam2", "fastslam2+rejuvenation", "batch_ml"]
+
+BOUND: Proposal = "batch_ml"  # no filter: maximum likelihood over the whole run, told all names; it has no particles
+
+FEW = (10, 100, 1000)  # particles, beside the paper's eleven numbers
+# Algorithm 1, l. 10: drawn at random in proportion to the weights, at every step. fastslam2 keeps the defaults, and
+# "+rejuvenation" draws all particles anew from smoothed paths every so many steps.
+FILTER_OPTIONS: dict[Proposal, dict[str, Any]] = {
+    "fastslam1": {"resample_threshold": 1.0, "resampling": "multinomial"}, "fastslam2": {},
+    "fastslam2+rejuvenation": {"rejuvenate_every": REJUVENATE_EVERY},
+}  # fmt: skip
+
+# Sec. 5 speaks neither of look-alikes nor of false points.
+DISTINCT = {"look_alikes": 1, "outliers": 0.0, "wrong_descriptors": 0.0}
+ERRORS_FILE, TIMES_FILE = "errors.jsonl", "times.jsonl"
+FIXED_COST = 200  # a step costs about as much as that of so many particles, however few there are
+BOUND_COST = 4000  # in the same unit, of batch maximum likelihood
 BLOCK = 20  # steps that one filter takes before the next has its turn
 FIGURES = (
     "map_rmse_m", "map_aligned_rmse_m", "map_all_rmse_m", "map_recall", "map_precision", "pose_rms_m",
@@ -22,26 +38,49 @@ FIGURES = (
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Regime:
+    """Noise, looks of the landmarks, and the filters that are tried. Association is always unknown."""
+
+    title: str  # For tables and figures
+    preset: Preset  # Of the noise
+    looks: dict[str, Any]  # Fields of `RunSpec` that say how landmarks are confused
+    proposals: tuple[Proposal, ...]  # Of the filters; with `BOUND`, what nothing can beat stands beside them
+    few: bool  # Whether the numbers of particles in `FEW` are enough
+
+    def spec(self, robots: int, length: float, measurements: int = 15) -> RunSpec:
+        """Return the run of K robots, each driving `length` [m]; all together measure at most B landmarks in a step."""
+        return RunSpec(
+            preset=self.preset, association="unknown", robots=robots, length=length, measurements=measurements,
+            **self.looks,
+        )  # fmt: skip
+
+
+REGIMES = {
+    "paper": Regime(
+        title="as in the paper", preset="paper", looks=DISTINCT, proposals=("fastslam1",), few=False
+    ),
+    "look_alikes": Regime(
+        title="with look-alikes and false points", preset="paper", looks={}, proposals=("fastslam1",),
+        few=True,
+    ),
+    "good": Regime(
+        title="good stereo", preset="good", looks=DISTINCT,
+        proposals=("fastslam1", "fastslam2", "fastslam2+rejuvenation", BOUND), few=True,
+    ),
+}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
 class ErrorTrial:
-    """What decides how wrong a map is.
+    """What decides how wrong a map is."""
 
-    Attributes:
-        regime: Key of `REGIMES`.
-        proposal: Of the filter, or `BOUND`.
-        robots: K.
-        particles: M; 0 of the bound.
-        measurements: B, of all robots together.
-        length: Of each robot's path [m].
-        seed: Of the run, and of the filter's draws.
-    """
-
-    regime: str
-    proposal: Proposal
-    robots: int
-    particles: int
-    measurements: int
-    length: float
-    seed: int
+    regime: str  # Key of `REGIMES`
+    proposal: Proposal  # Of the filter, or `BOUND`
+    robots: int  # K
+    particles: int  # M; 0 of the bound
+    measurements: int  # B, of all robots together
+    length: float  # Of each robot's path [m]
+    seed: int  # Of the run, and of the filter's draws
 
     def __post_init__(self) -> None:
         check_choice("regime", self.regime, tuple(REGIMES))
@@ -57,38 +96,32 @@ class ErrorTrial:
         return REGIMES[self.regime].spec(self.robots, self.length, self.measurements)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class TimeTrial:
-    """What decides how long steps take; all numbers of robots are timed together.
+    """What decides how long steps take; all numbers of robots are timed together."""
 
-    Attributes:
-        robots: Numbers K.
-        particles: M.
-        measurements: B, of all robots together.
-        length: Of each robot's path [m].
-        seed: Of the runs, and of the filters' draws.
-    """
-
-    robots: tuple[int, ...]
-    particles: int
-    measurements: int
-    length: float
-    seed: int
+    robots: tuple[int, ...]  # Numbers K
+    particles: int  # M
+    measurements: int  # B, of all robots together
+    length: float  # Of each robot's path [m]
+    seed: int  # Of the runs, and of the filters' draws
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "robots", tuple(self.robots))
-        if not self.robots or len(set(self.robots)) < len(self.robots):
-            raise bad_argument("robots", "at least one number, each once", list(self.robots), "Correct the list.")
         for robots in self.robots:
-            ErrorTrial(
-                regime="paper", proposal="fastslam1", robots=robots, particles=self.particles,
-                measurements=self.measurements, length=self.length, seed=self.seed,
-            )  # fmt: skip
+            ErrorTrial("paper", "fastslam1", robots, self.particles, self.measurements, self.length, self.seed)
 
     @property
     def specs(self) -> list[RunSpec]:
         """The runs that are simulated, one for each number of robots."""
         return [REGIMES["paper"].spec(robots, self.length, self.measurements) for robots in self.robots]
+
+
+def cost(trial: ErrorTrial | TimeTrial) -> int:
+    """Return about how long a trial takes, in an arbitrary unit: what a progress bar counts."""
+    if isinstance(trial, TimeTrial):
+        return (trial.particles + FIXED_COST) * len(trial.robots)
+    return BOUND_COST if trial.proposal == BOUND else trial.particles + FIXED_COST
 
 
 def play_error(trial: ErrorTrial) -> dict[str, Any]:

@@ -1,0 +1,143 @@
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from slam_backend.geometry import transform_points
+from slam_backend.maps.alignment import AlignmentOptions, align_maps, candidate_matches
+from training.bench.alignment.map_pairs import (
+    IDENTIFIABLE,
+    LANDMARKS,
+    LEAST_SPREAD,
+    NOISE,
+    UNALIGNABLE,
+    draw_identifiable,
+    draw_pair,
+    draw_unalignable,
+)
+from training.bench.alignment.report import summarise
+from training.bench.alignment.trials import Trial, play
+from training.bench.config import GRID, AlignmentBenchConfig
+
+
+@pytest.mark.parametrize(("overlap", "outliers"), GRID)
+def test_pairs_have_the_shares_that_were_asked_for(overlap: float, outliers: float) -> None:
+    """So many landmarks are common, to their noise; so many of the candidates are wrong; heights never tell which."""
+    pair = draw_pair(overlap, outliers, np.random.default_rng(100))
+    right = round(overlap * LANDMARKS)
+    assert len(pair.pairs) == right
+    rows_a, rows_b = pair.pairs.T
+    apart = pair.a.means[rows_a] - transform_points(pair.pose, pair.b.means[rows_b])
+    assert np.sqrt((apart**2).mean()) == pytest.approx(np.sqrt(2.0) * NOISE, rel=0.25)
+    candidates = candidate_matches(pair.a, pair.b, AlignmentOptions())
+    true = set(map(tuple, pair.pairs.tolist()))
+    wrong = sum(tuple(row) not in true for row in candidates.tolist())
+    assert len(candidates) - wrong >= 0.97 * right
+    assert wrong / len(candidates) == pytest.approx(outliers, abs=0.03)
+
+
+def test_the_bound_is_reached_by_least_squares_on_true_pairs() -> None:
+    """With nothing wrong the motion's squared error over many draws is the Cramer-Rao bound."""
+    squares, bounds = [], []
+    for seed in range(100, 250):
+        pair = draw_pair(0.1, 0.0, np.random.default_rng(seed))
+        error = align_maps(pair.a, pair.b).transform - pair.pose
+        squares.append(error[:2] @ error[:2])
+        bounds.append(np.trace(pair.bound()[:2, :2]))
+    assert np.sqrt(np.mean(squares) / np.mean(bounds)) == pytest.approx(1.0, abs=0.2)  # 4 sigma
+
+
+@pytest.mark.parametrize("kind", IDENTIFIABLE)
+def test_identifiable_maps_are_what_they_claim(kind: str) -> None:
+    """At least 12 true pairs, spread over 2 m or more."""
+    for seed in range(100, 120):
+        pair = draw_identifiable(kind, np.random.default_rng(seed))
+        assert len(pair.pairs) >= 12
+        points = pair.b.means[pair.pairs[:, 1], :2]
+        assert np.linalg.norm(points[:, None] - points[None], axis=2).max() > LEAST_SPREAD - 4.0 * NOISE
+
+
+@pytest.mark.parametrize("kind", UNALIGNABLE)
+def test_unalignable_maps_have_no_true_motion_and_are_refused(kind: str) -> None:
+    """There is nothing to find, and nothing is found, though most pairs of maps have candidates enough."""
+    for seed in range(100, 108):
+        pair = draw_unalignable(kind, np.random.default_rng(seed))
+        assert np.isnan(pair.pose).all()
+        if kind != "twin rooms":
+            assert len(candidate_matches(pair.a, pair.b, AlignmentOptions())) >= 20
+        assert not align_maps(pair.a, pair.b).success
+
+
+def test_pairs_that_cannot_be_drawn_are_refused() -> None:
+    """With half of the landmarks common there is room for as many wrong pairs, and no more."""
+    with pytest.raises(ValueError, match=r"outliers: expected a finite number >= 0 and <= 0.5.* got 0.9"):
+        draw_pair(0.5, 0.9, np.random.default_rng(0))
+    with pytest.raises(ValueError, match="kind: expected one of 'no overlap'"):
+        draw_unalignable("fog", np.random.default_rng(0))
+
+
+def row(**changed: Any) -> dict[str, Any]:
+    """Return the row of a trial on the grid that succeeded."""
+    return {
+        "kind": "grid", "case": "", "overlap": 0.5, "outliers": 0.0, "method": "ransac", "success": True, "reason": "",
+        "false": False, "seconds": 0.002, "cpu_seconds": 0.001, "error_m": 0.02, "error_rad": 0.001, "nees": 3.0,
+        "bound_m2": 4e-4, "bound_rad2": 1e-6,
+    } | changed  # fmt: skip
+
+
+def refusal(reason: str, **changed: Any) -> dict[str, Any]:
+    """Return the row of a trial that was refused."""
+    found = ("error_m", "error_rad", "nees", "bound_m2", "bound_rad2")
+    whole = row(success=False, reason=reason, **changed)
+    return {name: value for name, value in whole.items() if name not in found}
+
+
+def test_errors_are_told_over_the_bound_and_refusals_count_as_failures() -> None:
+    """RMS error over the root of the mean bound; a refused trial is no success and has no error."""
+    rows = [row(), row(error_m=0.04, error_rad=0.003), refusal("ambiguous")]
+    line = summarise(rows)[0]
+    assert line["right"] == pytest.approx(2 / 3)
+    assert line["translation"] == pytest.approx(np.sqrt(0.5 * (0.02**2 + 0.04**2)) / 0.02)
+    assert line["rotation"] == pytest.approx(np.sqrt(5.0))
+    assert line["reasons"] == {"ambiguous": 1}
+    assert line["anees"] == 1.0
+    assert line["anees_low"] < 1.0 < line["anees_high"]
+
+
+def test_a_trial_repeats() -> None:
+    """The same trial gives the same figures, time apart, whatever was played before."""
+    trial = Trial(kind="I", case="area", overlap=0.0, outliers=0.0, method="clique", seed=103)
+    first = play(trial)
+    play(Trial(kind="U", case="half alike", overlap=0.0, outliers=0.0, method="svd", seed=9))
+    again = play(trial)
+    assert first.keys() == again.keys()
+    assert all(first[name] == again[name] for name in first if "seconds" not in name)
+
+
+def test_every_method_meets_the_same_trials() -> None:
+    """Trials come cell by cell and seed by seed, each once for each method; U and I never share a seed's maps."""
+    config = AlignmentBenchConfig(methods=("ransac", "gnc"), seeds=3, hard=10, seed=100)
+    trials = config.trials()
+    assert len(trials) == len(set(trials)) == 2 * (3 * len(GRID) + 20)
+    assert {trial.case for trial in trials if trial.kind == "I"} == set(IDENTIFIABLE)
+    assert AlignmentBenchConfig.from_mapping(config.to_mapping() | {"seed": 100}) == config
+
+
+def test_the_command_leaves_tables_a_figure_and_every_trial(vslam: Any, tmp_path: Path) -> None:
+    """A small bench leaves its tables; begun again in the same folder, nothing is run twice."""
+    out, copy = tmp_path / "bench", tmp_path / "copy.json"
+    options = ("--methods", "ransac,gnc", "--seeds", "1", "--hard", "9", "--first-seed", "100", "--out", str(out))
+    said = vslam("bench", "alignment", *options, "--json", str(copy))
+    assert said.status == 0
+    assert "Maps that just can be aligned" in said.out
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics == json.loads(copy.read_text())
+    assert (out / "alignment.png").stat().st_size > 10_000
+    assert "| 10 % | 90 % | ransac | 100.0 |" in (out / "tables.md").read_text()
+    trials = (out / "trials.jsonl").read_text()
+    assert len(trials.splitlines()) == 2 * (len(GRID) + 18)
+    assert vslam("bench", "alignment", *options).status == 0
+    assert (out / "trials.jsonl").read_text() == trials
+    assert "bench alignment" in (out / "config.toml").read_text()

@@ -1,0 +1,226 @@
+"""The bench of exploration: who meets which worlds, how an episode is scored, summed up and gone on with."""
+
+import csv
+import io
+import json
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from training.bench.config import ExplorationBenchConfig, ExplorationTrial
+from training.bench.exploration import trials as exploration_trials
+from training.bench.exploration.report import (
+    FIGURES,
+    compare_oracles,
+    compare_policies,
+    curves,
+    draw_exploration,
+    markdown,
+    print_tables,
+    summarise,
+    to_csv,
+)
+from training.bench.exploration.trials import CURVE_POINTS, CURVES, TRIALS_FILE, count_merges, play
+from training.episodes.runner import MergeRecord
+from vslam_env import vslam_v0
+
+SMALL = ExplorationBenchConfig(
+    policies=("frontier", "random_walk", "frontier@continuous"), worlds=("fig5",), robots=(2,), duration=8.0,
+    particles=20, seeds=2, seed=200,
+)  # fmt: skip
+TOLD_M = 1e-3  # an oracle's merge is sure to a tenth of a millimetre
+OWN = """
+class Stubborn:
+    def reset(self):
+        pass
+
+    def act(self, observation, belief, rng):
+        return int((observation["action_mask"] == 0).argmax())
+"""
+
+
+@pytest.fixture
+def own_policy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """A user's policy in the current folder: it always chooses an action that is not there."""
+    (tmp_path / "a_users_policies.py").write_text(OWN)
+    monkeypatch.chdir(tmp_path)
+    yield "a_users_policies:Stubborn"
+    sys.modules.pop("a_users_policies", None)
+
+
+@pytest.fixture(scope="module")
+def rows() -> list[dict[str, Any]]:
+    """One seed of a small bench: three policies, told nothing and all."""
+    return [play(SMALL, trial) for trial in SMALL.trials() if trial.seed == SMALL.seed]
+
+
+def _row(policy: str, seed: int, oracle: str = "none", **figures: Any) -> dict[str, Any]:
+    """Return a row in which all figures that are not given are one half."""
+    values = dict.fromkeys(FIGURES, 0.5) | {"right_merges": 2, "false_merges": 0} | figures
+    line = {"time_s": [0.0, 1.0]} | {name: [0.0, 0.1 * seed] for name in CURVES}
+    return (
+        {"policy": policy, "world": "office", "robots": 3, "oracle": oracle, "seed": seed} | values | {"curves": line}
+    )
+
+
+def test_all_policies_of_a_seed_meet_the_same_world() -> None:
+    """Walls, landmarks and starts depend on the seed and the split alone, not on policy, kind of action or oracle."""
+
+    def met(config: ExplorationBenchConfig, trial: ExplorationTrial) -> tuple[bytes, ...]:
+        env = vslam_v0.parallel_env(config=config.environment(trial))
+        env.reset(seed=trial.seed)
+        return env.scene().walls.tobytes(), env.true_landmarks.tobytes(), env.true_start_poses.tobytes()
+
+    places = {seed: {met(SMALL, trial) for trial in SMALL.trials() if trial.seed == seed} for seed in (200, 201)}
+    assert [len(found) for found in places.values()] == [1, 1]
+    other = ExplorationBenchConfig.from_mapping(SMALL.to_mapping() | {"split": "test", "seed": 200})
+    assert len({*places[200], *places[201], met(other, other.trials()[0])}) == 3
+
+
+def test_robots_that_are_told_all_know_where_they_are(rows: list[dict[str, Any]]) -> None:
+    """With all oracles poses have no error; without, they have; both play as long as was asked."""
+    for row in rows:
+        told = row["oracle"] == "all"
+        assert (row["pose_error"] < TOLD_M) is told
+        assert (row["ate_start_m"] < TOLD_M) is told
+        assert row["curves"]["time_s"][-1] == pytest.approx(8.0)
+        assert len(row["curves"]["coverage"]) == CURVE_POINTS
+        assert row["curves"]["coverage"][-1] == row["coverage"] > row["curves"]["coverage"][0]
+        assert row["curves"]["pose_error"][-1] == pytest.approx(row["pose_error"])
+        assert row["curves"]["coverage"][0] <= row["mean_coverage"] <= max(row["curves"]["coverage"]) + 1e-9
+
+
+def test_a_trial_repeats_itself(rows: list[dict[str, Any]]) -> None:
+    """Played again a trial has the same figures; the time that a decision takes is not one of them."""
+    again = play(SMALL, SMALL.trials()[0])
+    assert {**again, "decision_ms": 0.0, "curves": 0} == {**rows[0], "decision_ms": 0.0, "curves": 0}
+    for name in ("time_s", *CURVES):
+        np.testing.assert_array_equal(again["curves"][name], rows[0]["curves"][name])
+
+
+def test_a_users_own_policy_takes_part(own_policy: str) -> None:
+    """A policy is named by its module; each of its actions that was not there is counted."""
+    config = ExplorationBenchConfig(policies=(own_policy,), worlds=("fig5",), robots=(2,), duration=4.0, particles=10)
+    row = play(config, config.trials()[0])
+    assert row["invalid_actions"] == 2 * 4  # two robots, a decision each second
+    assert row["way_m"] == 0.0
+
+
+def _merge(time: float, error_m: float, undone: float | None = None) -> MergeRecord:
+    return MergeRecord(round(10 * time), time, (0,), (1,), 9, error_m, 1.0, undone)
+
+
+def test_merges_are_right_false_or_undone() -> None:
+    """False is what was wrong for 20 s or at the end; one that is undone sooner is not, nor a right one."""
+    merges = [_merge(5.0, 0.1), _merge(9.0, 0.2), _merge(11.0, 0.7), _merge(12.0, 0.9, 31.0), _merge(13.0, 0.9, 33.0)]
+    assert count_merges([*merges, _merge(2.0, 0.1, 3.0)]) == {
+        "right_merges": 2, "false_merges": 2, "undone_merges": 3, "first_merge_s": 5.0, "last_merge_s": 9.0,
+    }  # fmt: skip
+    assert count_merges([])["first_merge_s"] is None
+
+
+def test_policies_are_compared_with_the_first_on_common_seeds() -> None:
+    """Differences are the other's less the first's; the share of seeds in which it is better knows which way."""
+    rows = [_row("a", seed, mean_coverage=0.1 * seed, map_error=0.3) for seed in (1, 2, 3, 4)]
+    rows += [_row("b", seed, mean_coverage=0.1 * seed + 0.2, map_error=0.1 * seed) for seed in (1, 2, 4, 9)]
+    found = {line["figure"]: line for line in compare_policies(rows)}
+    assert {(line["policy"], line["than"], line["seeds"]) for line in found.values()} == {("b", "a", 3)}
+    covered = [found["mean_coverage"][name] for name in ("more", "more_low", "more_high", "better")]
+    np.testing.assert_allclose(covered, [0.2, 0.2, 0.2, 1.0])
+    assert found["map_error"]["better"] == pytest.approx(2 / 3)
+    assert compare_oracles(rows) == []
+
+
+def test_what_an_oracle_is_worth_is_paired_too() -> None:
+    """Each policy is compared with itself without the oracle."""
+    rows = [
+        _row("a", seed, told, map_rmse_m=0.1 * seed - 0.05 * (told == "all"))
+        for seed in (1, 2)
+        for told in ("none", "all")
+    ]
+    found = {line["figure"]: line for line in compare_oracles(rows)}
+    assert found["map_rmse_m"]["more"] == pytest.approx(-0.05)
+    assert (found["map_rmse_m"]["oracle"], found["map_rmse_m"]["than"]) == ("all", "none")
+    assert found["pose_error"]["better"] == 0.0
+    assert compare_policies(rows) == []
+
+
+def test_times_that_were_never_reached_do_not_count() -> None:
+    """Without a merge there is no time of the first one: the mean is over the seeds that have one."""
+    (line,) = summarise([_row("a", 1, first_merge_s=None), _row("a", 2, first_merge_s=30.0)])
+    assert line["seeds"] == 2
+    assert line["first_merge_s"] == 30.0
+    assert line["first_merge_s_low"] is None
+    assert [row["coverage"] for row in curves([_row("a", 1), _row("a", 3)])] == pytest.approx([0.0, 0.2])
+
+
+def test_tables_fit_into_80_columns(rows: list[dict[str, Any]]) -> None:
+    """Nothing is cut on a terminal of 80 columns; the Markdown has all policies, told and not."""
+    lines = summarise(rows)
+    console = Console(file=io.StringIO(), width=80)
+    print_tables(console, lines, compare_policies(rows), compare_oracles(rows))
+    text = console.file.getvalue()  # type: ignore[attr-defined]
+    assert "…" not in text
+    assert text.count("told all\n") + text.count("told all ") >= 6
+    assert "random_walk, told all" in markdown(lines, compare_policies(rows), compare_oracles(rows))
+
+
+def test_curves_are_drawn_and_written(rows: list[dict[str, Any]], tmp_path: Path) -> None:
+    """The CSV has a line per policy, oracle and time; the picture is one."""
+    found = list(csv.DictReader(io.StringIO(to_csv(curves(rows)))))
+    assert len(found) == 3 * 2 * CURVE_POINTS
+    last = [line for line in found if (line["policy"], line["oracle"]) == ("frontier", "none")][-1]
+    assert float(last["coverage"]) == pytest.approx(rows[0]["coverage"], rel=1e-5)
+    draw_exploration(tmp_path / "exploration.png", curves(rows))
+    assert (tmp_path / "exploration.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_command_keeps_what_was_played(
+    vslam: Any, own_policy: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A trial that is kept is not played again; one that was cut off is, to the same figures."""
+    out = tmp_path / "run"
+    command = (
+        "bench", "exploration", "--policies", f"frontier,{own_policy}", "--worlds", "fig5", "--robots", "2",
+        "--oracles", "none", "--duration", "3", "--particles", "10", "--seeds", "2", "--first-seed", "200",
+        "--out", str(out),
+    )  # fmt: skip
+    assert vslam(*command).status == 0
+    kept = (out / TRIALS_FILE).read_text().splitlines()
+    first = json.loads((out / "metrics.json").read_text())
+    assert [(row["policy"], row["seed"]) for row in first["trials"]] == [
+        ("frontier", 200), (own_policy, 200), ("frontier", 201), (own_policy, 201),
+    ]  # fmt: skip
+    assert len((out / "trials.csv").read_text().splitlines()) == 5
+    assert (out / "tables.md").read_text().startswith("### fig5, K=2, 2 seeds")
+    (out / TRIALS_FILE).write_text("\n".join([*kept[:3], kept[3][:40]]))
+    played: list[ExplorationTrial] = []
+
+    def watched(config: ExplorationBenchConfig, trial: ExplorationTrial) -> dict[str, Any]:
+        played.append(trial)
+        return play(config, trial)
+
+    monkeypatch.setattr(exploration_trials, "play", watched)
+    assert vslam(*command).status == 0
+    assert [(trial.policy, trial.seed) for trial in played] == [(own_policy, 201)]
+    assert (out / TRIALS_FILE).read_text().splitlines()[:3] == kept[:3]
+    again = json.loads((out / "metrics.json").read_text())["trials"]
+    assert [row | {"decision_ms": 0} for row in again] == [row | {"decision_ms": 0} for row in first["trials"]]
+
+
+def test_paths_are_kept_absolute(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A bench can be gone on with from another folder: worlds that are files have their full path."""
+    (tmp_path / "room.json").write_text(
+        '{"name": "room", "walls": [[0, 0, 9, 0], [9, 0, 9, 7], [9, 7, 0, 7], [0, 7, 0, 0]]}'
+    )
+    monkeypatch.chdir(tmp_path)
+    config = ExplorationBenchConfig.from_mapping({"worlds": ["office", "room.json"]})
+    assert config.worlds == ("office", str(tmp_path / "room.json"))
+    assert config.environment(config.trials()[-1]).world_split is None  # one building is not split
+    assert config.environment(config.trials()[0]).world_split == "validation"
+    assert ExplorationBenchConfig.from_mapping(config.to_mapping() | {"seed": 0}) == config

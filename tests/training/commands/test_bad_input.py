@@ -1,0 +1,149 @@
+"""Bad input of every command is one line of stderr and exit status 2, before anything is computed or written."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+
+from training.cli import app
+
+MRCLAM = "path: expected a folder of the MR.CLAM log, with Barcodes.dat, Landmark_Groundtruth.dat and Robot*.dat"
+ROBOTS = "robots: expected an int from 1 to 8, got"
+LIST = "expected numbers with commas between, got"
+# Per command its bad arguments, each with how the line begins. Ranges: tests/training/experiments/test_configs.py.
+BAD: dict[str, dict[str, str]] = {
+    "run": {
+        "--world nowhere": "world: expected one of 'office', 'maze', 'loops', 'hall', 'fig5', or a path",
+        "--world broken.json": "world: expected",
+        "--policy nobody": "policy: expected one of 'frontier', 'random_goals', 'random_walk', got 'nobody'.",
+        "--policy random_walk --action-type goal": "action_type: expected 'continuous' or 'discrete'",
+        "--robots 9": f"{ROBOTS} 9. Use 1 to 8 robots.", "--robots 0 --json -": f"{ROBOTS} 0.",
+        "--action-type fly": "action_type: expected one of 'continuous', 'discrete', 'goal', got 'fly'.",
+        "--json full": "json: expected a file, got a folder. Name a file in 'full'.",
+        "--world fig5 --out full": "out: expected a new or empty folder",
+        "--world fig5 --out /proc/version/run": "out: expected a folder that can be written",
+    },
+    "train": {"--robots 9": f"{ROBOTS} 9.", "--world castle": "world: expected one of 'office'"},
+    "evaluate": {
+        "": "model: expected a model that vslam train wrote, got no model",
+        "none.npz": "model: expected a model that vslam train wrote, got no such file",
+        "none.npz --policies best": "policy: expected one of 'frontier'",
+        "none.npz --policies random_walk": "action_type: expected 'continuous' or 'discrete' for policy",
+        "none.npz --processes 0": "processes: expected an int >= 1, got 0.",
+    },
+    "replay mrclam": {
+        "--path /nowhere": MRCLAM + ", got no such path. Check '/nowhere'; if --path is left away, it is ",
+        "": MRCLAM + ", got no --path. Name it, or set VSLAM_DATA.",
+        "--path . --robots 1;2": f"robots: {LIST} '1;2'.",
+        "--path . --robots 7": "robots: expected different numbers from 1 to 5, got (7,).",
+        "--path . --duration -1": "duration: expected a finite number > 0, got -1.0.",
+        "--path . --rejuvenate-every -1": "rejuvenate_every: expected an int >= 0, got -1. Give a number of steps,",
+    },
+    "replay victoria": {
+        "--path . --particles 0": "particles: expected an int >= 1, got 0.",
+        "": "path: expected a folder of the Victoria Park log, with ",
+    },
+    "replay kitti": {
+        "--path . --estimator ekf": "estimator: expected one of 'fastslam2', 'fastslam1', got 'ekf'.",
+        "": "path: expected an archive (.npz) of KITTI features, ",
+    },
+    "replay stereo": {"--path none": "path: expected a folder with two stereo pairs (left_img_0.png, "},
+    "bench accuracy": {
+        "--preset best": "preset: expected one of 'good', 'coarse', 'paper', got 'best'.",
+        "--particles ten": f"particles: {LIST} 'ten'. Write them like 10,100.",
+        "--particles 9,9": "particles: expected at least one value, each once, got [9, 9].",
+        "--length 0": "length: expected a finite number >= 0.25, got 0.0.",
+        "--processes 0": "processes: expected an int >= 1, got 0.",
+    },
+    "bench alignment": {"--first-seed -1": "first_seed: expected an int >= 0, got -1."},
+    "bench mrclam": {"--path . --durations -1": "durations: expected a finite number >= 0, got -1.0."},
+    "bench filter": {
+        "--particles 10;20": f"particles: {LIST} '10;20'. Write them like",
+        "--landmarks 20": "landmarks: expected an int >= 30, got 20.",
+    },
+    "bench stereo": {
+        "--descriptors surf": "descriptors: expected one of 'usurf', 'sift', 'orb', got 'surf'.",
+        "--real none": "real: expected a folder of real images, got no such folder.",
+        "--real full": "real: expected a folder with pairs with a model file: NAMEA, NAMEB and NAME_model.txt",
+    },
+    "bench env": {"--robots 9": f"{ROBOTS} 9", "--worlds castle": "world: expected one of 'office'"},
+    "bench train": {
+        "--workers x": f"workers: {LIST}", "--world castle": "world: expected one of 'office'",
+        "--envs 1 --workers 2": "workers: expected at most one per environment, 1, got 2",
+    },
+    "bench exploration": {
+        "--policies nobody": "policy: expected one of 'frontier', 'random_goals', 'random_walk', got 'nobody'.",
+        "--policies no_module:Nobody": "policy: expected MODULE:NAME of a policy, got no module 'no_module'.",
+        "--policies random_walk@goal": "random_walk@: expected one of 'continuous', 'discrete', got 'goal'.",
+        "--policies none.npz": "model: expected a model that vslam train wrote, got no such file.",
+        "--worlds nowhere": "world: expected",
+        "--robots 9": f"{ROBOTS} 9.",
+    },
+    "paper fig1": {"--robots 10": "robots: expected at most 9, got 10."},
+    "paper fig2": {"--length 2": "length: expected a finite number >= 5, got 2.0"},
+    "paper fig3": {"--length 1 --particles 5 --seed 101": "length: expected maps that can be aligned, got a refusal: "},
+    "paper fig4": {"--landmarks 0": "landmarks: expected an int >= 1, got 0."},
+    "paper fig5": {"--decisions 0": "decisions: expected an int >= 1, got 0."},
+    "paper fig6": {"--robots 16": "measurements: expected an int >= 16, got 15.", "--robots a": f"robots: {LIST} 'a'."},
+    "worlds validate": {
+        "castle": "world: expected one of 'office'",
+        "fig5 --first-seed -1": "first_seed: expected an int >= 0",
+        "fig5 --seeds 0": "seeds: expected an int >= 1",
+    },
+    "worlds list": {"--seeds 0": "seeds: expected an int >= 1"},
+    "worlds preview": {"fig5 --out worlds.txt": "out: expected a name that ends in .png, got 'worlds.txt'"},
+    "worlds import": {
+        "gone.png plan.json": "world: expected a file",
+        "gone.yaml plan.json --metres-per-pixel 0.1": "metres_per_pixel: expected none beside",
+    },
+}  # fmt: skip
+ROWS = [(command, arguments, begins) for command, rows in BAD.items() for arguments, begins in rows.items()]
+
+
+def _commands(command: Any, path: str = "") -> dict[str, Any]:
+    """Return all commands of the command line by their words."""
+    inner = getattr(command, "commands", None)
+    if inner is None:
+        return {path: command}
+    return {
+        name: each for word, below in inner.items() for name, each in _commands(below, f"{path} {word}".strip()).items()
+    }
+
+
+COMMANDS = _commands(typer.main.get_command(app))
+WITH_FOLDER = [name for name, each in COMMANDS.items() if any("--config" in param.opts for param in each.params)]
+
+
+def _need_learner(command: str) -> None:
+    if command.endswith("train"):
+        pytest.importorskip("sb3_contrib", reason="torch is not installed")
+
+
+@pytest.mark.parametrize(("command", "arguments", "begins"), ROWS, ids=lambda value: value.split(":")[0])
+def test_bad_input_is_one_line_and_status_2(
+    command: str, arguments: str, begins: str, refusal: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Name, what was expected, what came and a hint on one line of stderr; nothing is written."""
+    _need_learner(command)
+    monkeypatch.delenv("VSLAM_DATA", raising=False)
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "file").touch()
+    (tmp_path / "broken.json").write_text("{walls: [1, 2")
+    assert refusal(*command.split(), *arguments.split()).startswith(f"error {begins}")
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["broken.json", "full"]
+
+
+@pytest.mark.parametrize("command", WITH_FOLDER)
+def test_files_that_cannot_be_had_are_refused_by_every_command(command: str, refusal: Any) -> None:
+    """A missing configuration, and a place where the metrics cannot be written, are found before any work."""
+    _need_learner(command)
+    missing = refusal(*command.split(), "--config", "/nowhere")
+    assert missing.startswith("error config: expected the config.toml of an earlier run, got no such file.")
+    unwritable = refusal(*command.split(), "--json", "none/copy.json")
+    assert unwritable.startswith("error json: expected a file that can be written, got 'none/copy.json'. The system")
+
+
+def test_every_command_is_among_them() -> None:
+    """Each command has bad arguments above, but for the one that needs a screen."""
+    assert BAD.keys() == COMMANDS.keys() - {"drive"}

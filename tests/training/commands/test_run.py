@@ -1,0 +1,278 @@
+import json
+import signal
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from slam_backend.geometry import between, compose
+from slam_backend.maps.landmark_map import LandmarkMap
+from slam_backend.trajectory import Trajectory
+from training.commands.run import describe, live_progress
+from training.episodes.config import EPISODE_S, RunConfig
+from training.episodes.figures import draw_errors, draw_maps
+from training.episodes.metrics import score_episode
+from training.episodes.runner import EpisodeRecord, MergeRecord, Progress, run_episode
+from training.episodes.tables import print_tables
+from vslam_env import vslam_v0
+from vslam_env.config import EnvConfig
+from vslam_env.world import World
+
+# A room of 7 x 5 m in which two robots look at the same wall from places that are not the same.
+ROOM = World(
+    "room",
+    np.array([[0.0, 0.0, 7.0, 0.0], [7.0, 0.0, 7.0, 5.0], [7.0, 5.0, 0.0, 5.0], [0.0, 5.0, 0.0, 0.0]]),
+    start_poses=np.array([[2.0, 1.5, 0.2], [1.5, 3.5, -0.4]]),
+)
+STEPS = 31
+MERGE_KEYS = {"step", "time_s", "robots_a", "robots_b", "landmarks", "error_m", "error_deg", "false", "undone_s"}
+
+
+def play(**options: object) -> EpisodeRecord:
+    """Return the record of two random walkers in the room."""
+    config = RunConfig(robots=2, policy="random_walk", seed=3)
+    env = vslam_v0.parallel_env(**{"world": ROOM, "num_robots": 2, "max_cycles": STEPS, "num_particles": 13} | options)
+    return run_episode(env, config.make_policies(env), config.seed)
+
+
+@pytest.fixture(scope="module")
+def record() -> EpisodeRecord:
+    """Return an episode in which the oracle merges both maps as soon as they share three landmarks."""
+    return play(oracle_merge=True)
+
+
+def test_a_record_has_a_row_for_the_reset_and_for_each_step(record: EpisodeRecord) -> None:
+    """Times, poses, errors and coverage have one entry more than there are steps, and begin at the reset."""
+    assert record.complete
+    np.testing.assert_allclose(record.times, 0.1 * np.arange(STEPS + 1))
+    for poses in (record.true_poses, record.estimated, record.reckoned):
+        assert poses.shape == (2, STEPS + 1, 3)
+    assert record.map_errors.shape == (2, STEPS + 1)
+    assert record.coverage.shape == (STEPS + 1,)
+    np.testing.assert_allclose(record.true_poses[:, 0], ROOM.start_poses)
+    np.testing.assert_allclose(record.estimated[:, 0], 0.0, atol=1e-9)
+    np.testing.assert_array_equal(record.reckoned[:, 0], 0.0)
+    assert record.coverage[-1] >= record.coverage[0] > 0.0
+
+
+def test_the_oracle_merges_without_error(record: EpisodeRecord) -> None:
+    """A merge with the true transform has no error, and both robots are alone until then."""
+    (merge,) = record.merges
+    assert (merge.robots_a, merge.robots_b) == ((0,), (1,))
+    assert merge.error_m < 1e-9
+    assert merge.error_deg < 1e-9
+    assert not merge.is_false
+    assert record.groups == ((0, 1),)
+    assert record.alone_until == (merge.time, merge.time)
+
+
+def test_an_episode_repeats_from_its_seed() -> None:
+    """The same seed gives the same record, bit by bit; goal actions are recorded tick by tick as well."""
+    first, second = play(), play()
+    for name in ("true_poses", "estimated", "reckoned", "map_errors", "coverage"):
+        np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
+    config = RunConfig(robots=2, action_type="goal", seed=3)
+    env = vslam_v0.parallel_env(world=ROOM, num_robots=2, action_type="goal", max_cycles=3, num_particles=13)
+    goal = run_episode(env, config.make_policies(env), config.seed)
+    np.testing.assert_allclose(goal.times, [0.0, 1.0, 2.0, 3.0])
+    # Thirty readings are chained to three rows: noisy, but no further off than odometry can be after three metres.
+    for robot in range(2):
+        truth = between(goal.true_poses[robot, 0], goal.true_poses[robot])
+        assert np.abs(goal.reckoned[robot] - truth).max() < 0.5
+
+
+def test_an_episode_can_be_stopped() -> None:
+    """`should_stop` ends the episode after the current step, and the record says so."""
+    config = RunConfig(robots=2, policy="random_walk", seed=3)
+    env = vslam_v0.parallel_env(world=ROOM, num_robots=2, max_cycles=STEPS, num_particles=13)
+    seen: list[int] = []
+    stopped = run_episode(env, config.make_policies(env), 3, lambda p: seen.append(p.step), lambda: len(seen) > 5)
+    assert seen == [0, 1, 2, 3, 4, 5]
+    assert not stopped.complete
+    assert len(stopped.times) == 6
+
+
+def test_every_agent_needs_a_policy() -> None:
+    """A missing policy is named before anything runs."""
+    env = vslam_v0.parallel_env(world=ROOM, num_robots=2)
+    with pytest.raises(ValueError, match=r"policies: expected a policy for each agent, got no policy for \['robot_0'"):
+        run_episode(env, {}, 0)
+
+
+def test_scores_of_a_perfect_path_are_zero_and_dead_reckoning_is_scored_beside_it(record: EpisodeRecord) -> None:
+    """The true path scores 0; one that ends 0.6 m off after 12 m is 5 % off; turning it alone is aligned away."""
+    own = between(record.true_poses[:, :1], record.true_poses)
+    off = own.copy()
+    off[:, -1, 0] += 0.6
+    infos = tuple({**info, "distance": 12.0} for info in record.infos)
+    metrics = score_episode(replace(record, estimated=own, reckoned=off, infos=infos))
+    for robot in metrics["robots"]:
+        assert robot["ate_start_m"] < 1e-12
+        assert robot["ate_aligned_m"] < 1e-12
+        assert robot["dead_reckoning_end_percent"] == pytest.approx(5.0)
+        assert robot["dead_reckoning_ate_start_m"] == pytest.approx(0.6 / np.sqrt(STEPS + 1))
+    turned = score_episode(replace(record, estimated=compose([0.0, 0.0, 0.3], own)))
+    for robot in turned["robots"]:
+        assert robot["ate_start_m"] > 10.0 * robot["ate_aligned_m"]
+    assert metrics["team"]["path_m"] == 12.0
+
+
+def test_metrics_have_the_promised_names(record: EpisodeRecord) -> None:
+    """Independent checks rely on these keys."""
+    metrics = score_episode(record)
+    assert {"robots", "merges", "groups", "coverage", "attempts", "refusals"} <= set(metrics)
+    assert sum(row["attempts"] for row in metrics["refusals"]) == metrics["attempts"]
+    promised = {
+        "ate_aligned_m", "ate_start_m", "dead_reckoning_ate_aligned_m", "map_rmse_m", "map_recall", "map_precision",
+        "map_error", "map_rmse_start_m", "map_rmse_aligned_m", "robot",
+    }  # fmt: skip
+    assert all(promised <= set(robot) for robot in metrics["robots"])
+    assert set(metrics["merges"][0]) == MERGE_KEYS
+    for robot in metrics["robots"]:
+        assert robot["map_rmse_aligned_m"] <= robot["map_rmse_start_m"] == robot["map_rmse_m"]
+
+
+@pytest.mark.parametrize(("error_m", "error_deg", "false"), [(0.5, 5.0, False), (0.51, 0.0, True), (0.0, 5.1, True)])
+def test_a_merge_is_false_beyond_half_a_metre_or_five_degrees(error_m: float, error_deg: float, false: bool) -> None:
+    """The limits of the definition, either of which suffices."""
+    merge = MergeRecord(12, 1.2, (0,), (1, 2), 9, error_m, error_deg)
+    assert merge.is_false is false
+    assert describe(merge).startswith("   1.2 s  maps of 0 and 1, 2 merged on 9 landmarks, off by")
+
+
+def test_figures_are_drawn_for_any_team(record: EpisodeRecord, tmp_path: Path) -> None:
+    """One robot or five, merged or not, and a run that was stopped at once: all give two pictures."""
+
+    def cut(robots: int, rows: int) -> EpisodeRecord:
+        chosen = [k % 2 for k in range(robots)]
+        return replace(
+            record, times=record.times[:rows], coverage=record.coverage[:rows],
+            map_errors=record.map_errors[chosen, :rows],
+            **{n: getattr(record, n)[chosen, :rows] for n in ("true_poses", "estimated", "reckoned")},
+            infos=tuple(record.infos[k] for k in chosen), own_maps=tuple(record.own_maps[k] for k in chosen),
+            alone_until=tuple(None if k == 0 else 1.0 for k in chosen),
+            scene=replace(record.scene, robots=tuple(record.scene.robots[k] for k in chosen)),
+            merges=record.merges * (robots - 1),
+        )  # fmt: skip
+
+    for robots, rows in ((1, 1), (1, STEPS), (5, STEPS)):
+        for draw in (draw_maps, draw_errors):
+            file = tmp_path / f"{draw.__name__}-{robots}-{rows}.png"
+            draw(cut(robots, rows), file)
+            assert file.read_bytes().startswith(b"\x89PNG")
+
+
+def test_tables_show_what_is_not_known_as_a_dash(record: EpisodeRecord) -> None:
+    """A missing figure is a dash, units in brackets survive, and a false merge is called so."""
+    metrics = score_episode(record)
+    metrics["robots"][1]["map_rmse_m"] = None
+    metrics["merges"][0]["false"] = True
+    console = Console(width=100, record=True, file=open("/dev/null", "w"))  # noqa: SIM115 - closed with the console
+    print_tables(console, metrics)
+    console.file.close()
+    text = console.export_text()
+    for word in ("map error E [m], errors cut at 1 m", "off by [deg]", "false", " - ", "robot 1", "team"):
+        assert word in text
+
+
+def test_live_figures_tell_of_merges(record: EpisodeRecord) -> None:
+    """Each merge is printed as it comes, beside the bar."""
+    with open("/dev/null", "w") as nowhere:
+        console = Console(width=120, record=True, file=nowhere)
+        infos = {f"robot_{k}": info for k, info in enumerate(record.infos)}
+        with live_progress(console, STEPS, list(infos)) as show:
+            show(Progress(5, 0.5, infos, record.merges))
+    assert "maps of 0 and 1 merged" in console.export_text()
+
+
+SHORT = ("--robots", "2", "--particles", "11", "--max-cycles", "23", "--world", "fig5")
+
+
+@pytest.mark.slow
+def test_a_run_folder_repeats_itself(vslam: Any, tmp_path: Path) -> None:
+    """A run leaves all promised files, and its own config repeats its paths byte by byte and its metrics exactly."""
+    one, two, copy = tmp_path / "one", tmp_path / "two", tmp_path / "copy.json"
+    assert vslam("run", *SHORT, "--seed", "5", "--out", str(one), "--json", str(copy)).status == 0
+    assert vslam("run", "--config", str(one / "config.toml"), "--no-video", "--out", str(two)).status == 0
+    names = {file.name for file in one.iterdir()}
+    paths = {f"robot{k}_{kind}.tum" for k in range(2) for kind in ("estimate", "dead_reckoning", "truth")}
+    usual = {"config.toml", "environment.toml", "metrics.json", "map.png", "error.png", "video.mp4"}
+    groups = json.loads((one / "metrics.json").read_text())["groups"]
+    stems = {f"map_{'-'.join(map(str, group))}" for group in groups}
+    assert names == paths | usual | {f"{stem}.{kind}" for stem in stems for kind in ("npz", "csv")}
+    assert all(len(LandmarkMap.load(one / f"{stem}.npz")) > 0 for stem in stems)
+    assert {file.name for file in two.iterdir()} == names - {"video.mp4"}
+    first, second = (json.loads((folder / "metrics.json").read_text()) for folder in (one, two))
+    assert first == second == json.loads(copy.read_text())
+    assert (first["seed"], first["config"]["world"], first["complete"]) == (5, "fig5", True)
+    for folder in (one, two):
+        config = EnvConfig.from_toml(folder / "environment.toml")
+        assert (config.world, config.num_robots, config.max_cycles) == ("fig5", 2, 23)
+    for name in paths:
+        assert (one / name).read_bytes() == (two / name).read_bytes()
+        assert len(Trajectory.load_tum(one / name)) == 24
+
+
+@pytest.mark.parametrize(("policy", "action_type"), [("a_policy_of_mine:Still", "discrete"), ("random_goals", "goal")])
+def test_a_policy_brings_its_kind_of_action(
+    policy: str, action_type: str, vslam: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Who names a policy that knows no continuous actions, one of his own as well, need not say which it knows."""
+    lines = ("class Still:", "    action_type = 'discrete'", "    def reset(self): pass", "    def act(*_): return 0")
+    (tmp_path / "a_policy_of_mine.py").write_text("\n".join(lines))
+    monkeypatch.chdir(tmp_path)
+    few = ("--world", "fig5", "--robots", "1", "--max-cycles", "3", "--particles", "5", "--no-video", "--out", "run")
+    assert vslam("run", "--policy", policy, *few).status == 0
+    metrics = json.loads(Path("run/metrics.json").read_text())
+    assert (metrics["config"]["policy"], metrics["config"]["action_type"]) == (policy, action_type)
+    assert (metrics["robots"][0]["path_m"] == 0.0) is (action_type == "discrete")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_run_writes_what_it_has(
+    number: signal.Signals, monkeypatch: pytest.MonkeyPatch, vslam: Any, tmp_path: Path
+) -> None:
+    """A signal after seven steps leaves a whole folder about these seven steps, and its usual exit status."""
+
+    @contextmanager
+    def stopping(*arguments: Any) -> Iterator[Callable[[Progress], None]]:
+        with live_progress(*arguments) as usual:
+
+            def show(progress: Progress) -> None:
+                usual(progress)
+                if progress.step == 7:
+                    signal.raise_signal(number)
+
+            yield show
+
+    monkeypatch.setattr(sys.modules["training.commands.run"], "live_progress", stopping)
+    assert vslam("run", *SHORT, "--out", str(tmp_path / "run")).status == 128 + number
+    metrics: Mapping[str, object] = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert metrics["complete"] is False
+    assert metrics["duration_s"] == pytest.approx(0.7)
+    assert len(Trajectory.load_tum(tmp_path / "run" / "robot1_truth.tum")) == 8
+    assert (tmp_path / "run" / "video.mp4").stat().st_size > 1000
+    assert not [file for file in (tmp_path / "run").iterdir() if file.name.startswith(".")]
+
+
+@pytest.mark.parametrize(("action_type", "step_s"), [("continuous", 0.1), ("discrete", 0.1), ("goal", 1.0)])
+def test_an_episode_lasts_as_long_with_any_actions(action_type: str, step_s: float) -> None:
+    """By default the simulated time is the same, whatever a step is."""
+    config = RunConfig(action_type=action_type)
+    assert config.step_s == pytest.approx(step_s)
+    assert config.num_steps * config.step_s == pytest.approx(EPISODE_S)
+    assert RunConfig.from_mapping(config.to_mapping()) == config.replace(max_cycles=config.num_steps)
+
+
+def test_a_config_repeats_a_run_from_any_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """The path of a world is stored whole; the name of a family stays a name."""
+    monkeypatch.chdir(tmp_path)
+    assert RunConfig(world="plan.png").to_mapping()["world"] == str(tmp_path.resolve() / "plan.png")
+    assert RunConfig(world="fig5").to_mapping()["world"] == "fig5"

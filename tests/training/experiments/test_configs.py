@@ -1,0 +1,189 @@
+"""What holds for the configurations of all commands: they come back from a `config.toml`, and bad values do not."""
+
+from pathlib import Path
+from typing import Any, get_args
+
+import pytest
+
+from slam_backend.fastslam.options import PROPOSALS
+from slam_backend.frontend import DESCRIPTORS
+from slam_backend.maps.alignment import METHODS
+from slam_backend.readers.stereo_files import StereoFiles
+from training.bench import config as bench
+from training.bench.accuracy import runs, trials
+from training.episodes.config import RunConfig
+from training.experiments import config as experiments
+from training.experiments.config import ExperimentConfig
+from training.experiments.run_folder import RunFolder, read_config
+from training.paper import config as paper
+from training.paper.fig6.trials import REGIMES
+from training.replay import config as replay
+from training.rl.config import TRAIN_PRESETS, EvaluateConfig, TrainConfig
+from vslam_env.config import ACTION_TYPES, MAX_ROBOTS, SENSORS
+from vslam_env.presets import PRESETS
+from vslam_env.world import SPLITS
+
+# Per class what it cannot do without, and a value that is not its default.
+CASES: dict[type[ExperimentConfig], dict[str, Any]] = {
+    bench.AccuracyConfig: {"lengths": (5.0, 7.5)}, bench.AlignmentBenchConfig: {"methods": ("icp", "svd")},
+    bench.EnvBenchConfig: {"worlds": ("fig5",)},
+    bench.ExplorationBenchConfig: {"policies": ("frontier@discrete",), "worlds": ("maze",)},
+    bench.FilterBenchConfig: {"proposals": ("fastslam1",), "large": True},
+    bench.StereoBenchConfig: {"descriptors": ("orb",)}, bench.TrainBenchConfig: {"workers": (0, 2)},
+    bench.MrclamPairsConfig: {"path": "log", "durations": (50.0,)},
+    EvaluateConfig: {"model": str(Path("model.npz").resolve()), "policies": ("random_goals",)},
+    TrainConfig: {"preset": "smoke", "learning_rate": 1e-4}, paper.Fig1Config: {"every": 2.5},
+    paper.Fig2Config: {"length": 25.0}, paper.PairConfig: {"landmarks": 40}, paper.Fig5Config: {"decisions": 3},
+    paper.Fig6Config: {"regimes": ("good",)}, replay.ImagesConfig: {"path": "images", "descriptor": "orb"},
+    replay.KittiConfig: {"path": "drive", "truth": "poses.txt"},
+    replay.MrclamConfig: {"path": "log", "robots": (1, 4), "motion": {"sigma_along": 0.125}},
+    replay.PairsConfig: {"path": "room", "max_range": 7.0},
+    replay.VictoriaConfig: {"path": "log", "sensor": {"range": 0.25}}, RunConfig: {"world": "maze", "max_cycles": 12},
+}  # fmt: skip
+KINDS = [pytest.param(kind, id=kind.__name__) for kind in CASES]
+AT_LEAST_0 = "an int >= 0"
+AT_LEAST_1 = "an int >= 1"
+ROBOTS = "an int from 1 to 8"
+ABOVE_0 = "a finite number > 0"
+# Per class bad values, each with what was expected of it.
+BAD: dict[type[ExperimentConfig], dict[str, dict[Any, str]]] = {
+    bench.AccuracyConfig: {
+        "seeds": {0: AT_LEAST_1}, "particles": {(0,): AT_LEAST_1, (): "at least one value, each once"},
+        "presets": {("fine",): "one of 'good', 'coarse', 'paper'"}, "methods": {("magic",): "one of 'dead_reckoning'"},
+        "lengths": {(0.1,): "a finite number >= 0.25"}, "noise_factor": {0.0: ABOVE_0},
+        "robots": {(16,): "an int >= 16"},
+    },
+    bench.AlignmentBenchConfig: {
+        "seeds": {0: AT_LEAST_1}, "hard": {-1: AT_LEAST_0}, "methods": {("magic",): "one of 'ransac'"},
+    },
+    bench.EnvBenchConfig: {
+        "robots": {(9,): ROBOTS}, "modes": {("image",): "one of 'dict', 'flat', 'goal'"}, "steps": {1: "an int >= 2"},
+        "particles": {(0,): AT_LEAST_1}, "plays": {0: AT_LEAST_1}, "peer": {1: "a bool"},
+    },
+    bench.ExplorationBenchConfig: {
+        "split": {"all": "one of 'train', 'validation', 'test', 'any'"}, "robots": {(9,): ROBOTS},
+        "oracles": {("pose", "fate"): "one of 'none', 'pose', 'association', 'merge', 'all'"},
+        "duration": {0.0: "a finite number >= 1"}, "seeds": {0: AT_LEAST_1},
+        "preset": {"dire": "one of 'easy', 'standard', 'hard'"}, "rejuvenate_every": {-1: AT_LEAST_0},
+        "policies": {("frontier", "frontier"): "at least one value, each once", (3,): "a text"},
+    },
+    bench.FilterBenchConfig: {
+        "steps": {0: AT_LEAST_1}, "proposals": {("ekf",): "one of 'fastslam2', 'fastslam1'"},
+        "particles": {(5, 5): "at least one value, each once"}, "lookalikes": {0: AT_LEAST_1},
+        "landmarks": {(9,): "an int >= 10"},
+    },
+    bench.StereoBenchConfig: {
+        "sizes": {(32,): "an int >= 64"}, "walls": {(3,): "an int >= 4"}, "views": {0: AT_LEAST_1},
+    },
+    bench.TrainBenchConfig: {
+        "robots": {9: ROBOTS}, "workers": {(99,): "at most one per environment, 16"}, "steps": {1: "an int >= 2"},
+    },
+    bench.MrclamPairsConfig: {"durations": {(-1.0,): "a finite number >= 0"}, "particles": {0: AT_LEAST_1}},
+    EvaluateConfig: {"seeds": {1: "an int >= 2"}, "split": {"train": "one of 'validation', 'test'"}},
+    TrainConfig: {
+        "preset": {"slow": "one of 'quick', 'smoke'"}, "noise": {"calm": "one of 'easy'"}, "robots": {9: ROBOTS},
+        "batch": {1: "an int >= 2"}, "gamma": {1.5: "a finite number > 0 and <= 1"}, "clip": {0.0: ABOVE_0},
+        "entropy": {-1.0: "a finite number >= 0"}, "envs": {0: AT_LEAST_1}, "straighten": {1: "a bool"},
+    },
+    paper.Fig1Config: {"every": {0.1: "a finite number >= 0.25"}, "robots": {10: "at most 9"}},
+    paper.Fig2Config: {"every": {0.1: "a finite number >= 0.25"}, "length": {1.0: "a finite number >= 5"}},
+    paper.PairConfig: {"length": {0.1: "a finite number >= 0.25"}, "landmarks": {0: AT_LEAST_1}},
+    paper.Fig5Config: {"robots": {9: ROBOTS}, "decisions": {0: AT_LEAST_1}, "measurements": {0: AT_LEAST_1}},
+    paper.Fig6Config: {
+        "seeds": {0: AT_LEAST_1}, "regimes": {("calm",): "one of 'paper', 'look_alikes', 'good'"},
+        "robots": {(10,): "at most 9", (0,): AT_LEAST_1}, "measurements": {2: "an int >= 3"},
+        "length": {0.1: "a finite number >= 0.25"},
+    },
+    replay.ImagesConfig: {
+        "descriptor": {"surf": "one of 'usurf', 'sift', 'orb'"}, "max_range": {3.0: "a finite number > 3"},
+    },
+    replay.KittiConfig: {"sigma_px": {0.0: ABOVE_0}, "rejuvenate_every": {-1: AT_LEAST_0}, "duration": {-1.0: ABOVE_0}},
+    replay.MrclamConfig: {
+        "identities": {"lost": "one of 'given', 'hidden'"}, "alone": {"yes": "a bool"}, "dt": {0.0: ABOVE_0},
+        "estimator": {"ekf": "one of 'fastslam2', 'fastslam1'"}, "particles": {0: AT_LEAST_1},
+        "drive": {3: "a table of delay, speed, turn"}, "duration": {float("nan"): ABOVE_0},
+    },
+    replay.PairsConfig: {"max_range": {0.0: ABOVE_0}, "descriptor": {"surf": "one of 'usurf', 'sift', 'orb'"}},
+    replay.VictoriaConfig: {"particles": {True: AT_LEAST_1, 2.5: AT_LEAST_1}},
+    RunConfig: {
+        "robots": {0: ROBOTS, 9: ROBOTS}, "sensor": {"sonar": "one of 'landmark', 'stereo'"},
+        "action_type": {"jump": "one of 'continuous', 'discrete', 'goal'"}, "max_cycles": {0: AT_LEAST_1},
+        "rejuvenate_every": {-1: AT_LEAST_0},
+    },
+}  # fmt: skip
+# Fields whose options have other names, by which they are refused.
+OPTIONS = {"seed": "first_seed", "presets": "preset", "associations": "association", "lengths": "length"}
+BAD_VALUES = [
+    pytest.param(kind, name, value, expected, id=f"{kind.__name__}-{name}-{value}")
+    for kind, names in BAD.items()
+    for name, values in ({"seed": {-1: AT_LEAST_0}} | names).items()
+    for value, expected in values.items()
+]
+
+
+def test_every_configuration_is_among_them() -> None:
+    """The laws below are asked of all classes that the commands use."""
+
+    def below(kind: type[ExperimentConfig]) -> set[str]:
+        subclasses = [each for each in kind.__subclasses__() if each.__module__.startswith("training.")]
+        return {each.__name__ for each in subclasses}.union(*map(below, subclasses))
+
+    assert below(ExperimentConfig) - {"ReplayConfig"} == {kind.__name__ for kind in CASES}
+    assert BAD.keys() == CASES.keys()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_run_folder_brings_the_same_configuration_back(kind: type[ExperimentConfig], tmp_path: Path) -> None:
+    """Values written to `config.toml` and read again make an equal configuration, tables and lists included."""
+    config = kind.from_mapping(CASES[kind] | {"seed": 7})
+    RunFolder.create(tmp_path / "run", "some command", config.to_mapping(), config.seed)
+    values, seed = read_config(tmp_path / "run", "some command")
+    assert seed == 7
+    assert "seed" not in values
+    assert kind.from_mapping(values | {"seed": seed}) == config
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_misspelt_name_is_told_with_those_that_there_are(kind: type[ExperimentConfig]) -> None:
+    """What the configuration does not know is named, and not taken for nothing."""
+    with pytest.raises(ValueError, match=r"^config: expected names among .*seed.*, got 'sede'\. Correct the name\."):
+        kind.from_mapping(CASES[kind] | {"sede": 1})
+
+
+@pytest.mark.parametrize(("kind", "name", "value", "expected"), BAD_VALUES)
+def test_bad_values_are_refused_by_name(kind: type[ExperimentConfig], name: str, value: Any, expected: str) -> None:
+    """One line: the name, what was expected, what came, and a hint."""
+    with pytest.raises(ValueError, match="expected") as refusal:
+        kind.from_mapping(CASES[kind] | {name: value})
+    text = str(refusal.value)
+    names = {name, OPTIONS.get(name, name), "measurements" if name == "robots" else name}
+    assert text.startswith(tuple(f"{each}: expected {expected}" for each in names))
+    assert ", got " in text
+    assert text.endswith(".")
+    assert "\n" not in text
+
+
+def test_a_table_of_another_package_is_checked_there() -> None:
+    """An unknown name and a bad number in a table are refused by both names."""
+    with pytest.raises(ValueError, match=r"motion: expected names among sigma_along, .* got 'sigma'"):
+        replay.VictoriaConfig(path="log", motion={"sigma": 1.0})
+    with pytest.raises(ValueError, match="sigma_along: expected a finite number"):
+        replay.VictoriaConfig(path="log", motion={"sigma_along": -1.0})
+
+
+def test_choices_are_those_of_the_packages() -> None:
+    """Configurations name the choices, so that `--help` imports none of the packages that have them."""
+    assert get_args(experiments.Proposal) == PROPOSALS
+    assert get_args(experiments.Descriptor) == DESCRIPTORS
+    assert get_args(experiments.ActionType) == ACTION_TYPES
+    assert get_args(experiments.NoisePreset) == PRESETS
+    assert get_args(experiments.Sensor) == SENSORS
+    assert get_args(bench.AlignmentMethod) == METHODS
+    assert get_args(bench.Method) == trials.METHODS
+    assert paper.STEP == runs.STEP
+    assert tuple(TRAIN_PRESETS) == ("quick", "smoke")
+    assert paper.Fig6Config().regimes == tuple(REGIMES)
+    assert bench.EnvBenchConfig().robots[-1] == MAX_ROBOTS
+    assert set(SPLITS) < {"train", "validation", "test", "any"}
+    files, pairs = StereoFiles(), replay.PairsConfig(path="room")
+    assert (pairs.left, pairs.right, pairs.calibration) == (files.left, files.right, files.calibration)

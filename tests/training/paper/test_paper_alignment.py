@@ -1,0 +1,137 @@
+"""Figs. 2 to 4 of the paper: two robots' own maps, aligned and fused."""
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from slam_backend.geometry import transform_points
+from training.bench.accuracy.runs import FALSE_POINT
+from training.paper.config import Fig2Config, PairConfig
+from training.paper.fig2 import ENOUGH_SHARED, METHODS, OURS, check_claims, play, refusals, summarise
+from training.paper.fig3 import AlignedPair, align_pair, fuse_pair
+from training.paper.map_pairs import map_alone, simulate_pair, true_motion
+
+SMALL = Fig2Config(length=30.0, every=10.0, particles=30, seeds=2, seed=100)
+
+
+@pytest.fixture(scope="module")
+def rows() -> list[dict[str, Any]]:
+    """Two short runs."""
+    return [play(trial) for trial in SMALL.trials()]
+
+
+@pytest.fixture(scope="module")
+def pair() -> AlignedPair:
+    """Two aligned maps."""
+    return align_pair(PairConfig(length=25.0, particles=30, seed=100))
+
+
+def test_names_tell_the_true_landmark_behind_each_of_a_map() -> None:
+    """Moved by the true motion, landmarks of both robots' own maps that bear one name lie at one place."""
+    run_of_two = simulate_pair(100, 20.0, 300)
+    *_, stage = map_alone(run_of_two, 30, 100, 20.0)
+    truth = true_motion(run_of_two)
+    assert stage.shared > 20
+    map_a, map_b = stage.maps
+    moved = transform_points(truth, map_b.means)
+    apart = []
+    for row, name in enumerate(stage.names[0].tolist()):
+        for other in np.flatnonzero(stage.names[1] == name):
+            if name != FALSE_POINT:
+                apart.append(np.linalg.norm(map_a.means[row] - moved[other]))
+    assert np.median(apart) < 0.15
+    assert len(apart) >= stage.shared
+
+
+def test_stages_hold_the_errors_of_all_methods(rows: list[dict[str, Any]]) -> None:
+    """Maps grow along the way, and where they share enough RANSAC and ours are near the truth, others need not be."""
+    for row in rows:
+        sizes = [stage["size"] for stage in row["stages"]]
+        assert len(sizes) == 3
+        assert sizes == sorted(sizes)
+        for stage in row["stages"]:
+            assert set(METHODS) <= set(stage)
+            if stage["shared"] >= 40:
+                assert stage["ransac"]["translation_m"] < 0.5
+                assert stage[OURS]["rotation_deg"] < 3.0
+            if not stage["shared"]:
+                assert stage[OURS] is None
+    assert any(stage["shared"] >= ENOUGH_SHARED for row in rows for stage in row["stages"])
+    assert refusals(rows)["false"] == 0
+
+
+def test_a_run_repeats() -> None:
+    """The same seed gives the same stages."""
+    trial = Fig2Config(length=10.0, every=10.0, particles=10, seeds=1, seed=102).trials()[0]
+    assert play(trial) == play(trial)
+
+
+def stage(size: float, errors: dict[str, float | None], shared: int = 50) -> dict[str, Any]:
+    """Return a stage at which each method errs by so much, in metres and degrees alike."""
+    told = {m: None if e is None else {"translation_m": e, "rotation_deg": e} for m, e in errors.items()}
+    return {"length": 5.0, "size": size, "shared": shared, **dict.fromkeys(METHODS), **told}
+
+
+def test_the_papers_statement_is_asked_of_the_data() -> None:
+    """It holds where RANSAC is best and near zero at every size, and fails where it is not at one of them."""
+    good = {"svd": 2.0, "icp": 1.0, "impicp": 0.5, "ransac": 0.1, OURS: 0.1}
+    fine = [{"stages": [stage(60.0, good), stage(160.0, good), stage(160.0, good, shared=3)]}]
+    lines = summarise(fine)
+    assert [line["stages"] for line in lines] == [1] * 10
+    assert all(claim["holds"] for claim in check_claims(lines))
+    poor = [{"stages": [stage(60.0, good), stage(160.0, good | {"ransac": 3.0})]}]
+    holding = {claim["claim"] for claim in check_claims(summarise(poor)) if claim["holds"]}
+    assert holding == {f"RANSAC over svd, mean {figure}" for figure in ("translation [m]", "rotation [°]")}
+    lost = [{"stages": [stage(60.0, good | {"ransac": None})]}]
+    assert not any(claim["holds"] for claim in check_claims(summarise(lost)))
+    assert not any(claim["holds"] for claim in check_claims([]))
+
+
+def test_false_alignments_are_counted() -> None:
+    """Ours is false where it accepts and is off by more than 0.5 m or 5 degrees, whatever the maps share."""
+    stages = [stage(60.0, {OURS: 0.6}), stage(60.0, {OURS: 0.4}), stage(60.0, {OURS: 4.0}, shared=2), stage(60.0, {})]
+    assert refusals([{"stages": stages}]) == {"share_too_little": 1, "false": 2}
+
+
+def test_the_motion_found_lays_one_map_on_the_other(pair: AlignedPair) -> None:
+    """Nearly all inliers are true, and the error is of the size that the covariance says and the maps' own bend."""
+    figures = pair.figures()
+    assert figures["inliers"] >= 20
+    assert figures["true_inliers"] >= 0.95 * figures["inliers"]
+    assert figures["translation_error_m"] < 0.4
+    assert figures["rotation_error_deg"] < 2.0
+
+
+def test_fused_ellipses_are_smaller_than_both(pair: AlignedPair) -> None:
+    """Fusion never adds uncertainty, and the fused mean lies between both in Mahalanobis terms."""
+    fused = fuse_pair(pair)
+    assert len(fused.names) == 3
+    one, two, both = fused.covariances
+    for other in (one, two):
+        assert np.linalg.eigvalsh(other - both).min() > -1e-12
+    assert (np.linalg.det(both) < np.minimum(np.linalg.det(one), np.linalg.det(two))).all()
+
+
+def test_the_commands_write_pictures_and_tables(vslam: Any, tmp_path: Path) -> None:
+    """Each figure ends as PNG, CSV and metrics.json; fig2 begun again in its folder runs nothing twice."""
+    options = ("--seeds", "1", "--first-seed", "100", "--length", "10", "--every", "10", "--particles", "20")
+    for _ in range(2):
+        said = vslam("paper", "fig2", *options, "--out", str(tmp_path / "fig2"))
+        assert said.status == 0
+        assert "RANSAC, median translation [m], worst size" in said.out
+        assert len((tmp_path / "fig2" / "runs.jsonl").read_text().splitlines()) == 1
+    for name in ("fig3", "fig4"):
+        few = ("--seed", "100", "--length", "20", "--particles", "20")
+        assert vslam("paper", name, *few, "--out", str(tmp_path / name)).status == 0
+    for name, head in (("fig2", "seed"), ("fig3", "true_a"), ("fig4", "landmark")):
+        folder = tmp_path / name
+        with (folder / f"{name}.csv").open() as file:
+            table = list(csv.reader(file))
+        assert table[0][0] == head
+        assert len(table) > 5
+        assert (folder / f"{name}.png").stat().st_size > 10_000
+        assert "config" in json.loads((folder / "metrics.json").read_text())

@@ -1,0 +1,157 @@
+"""`--rejuvenate-every`: it reaches the filters of each command, and config.toml repeats it."""
+
+import json
+import tomllib
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+from small_logs import write_drive, write_log, write_park
+
+from slam_backend.fastslam import rejuvenation as _rejuvenation_step
+from slam_backend.fastslam.reports import RejuvenationReport
+from training.commands.replay import _rejuvenations
+from training.episodes.config import RunConfig
+from training.replay.config import ImagesConfig, KittiConfig, MrclamConfig, VictoriaConfig
+from training.replay.single_robot import RejuvenationCount
+from vslam_env.config import EnvConfig
+from vslam_env.presets import preset_config
+
+WRITERS: Mapping[str, Callable[[Path], None]] = {
+    "mrclam": lambda folder: write_log(folder, noise=1.0),
+    "victoria": lambda folder: write_park(folder, skew=0.01),
+    "kitti": lambda folder: write_drive(folder, bias=0.05),
+}
+
+PARTICLES = 20
+
+
+def estimates(folder: Path) -> list[bytes]:
+    """Return the estimated paths of a run folder, as they were written."""
+    return [file.read_bytes() for file in sorted(folder.glob("*estimate.tum"))]
+
+
+@pytest.fixture
+def reasons(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Return the list to which attempts add why they were refused, "" if not; those that warm up are left out."""
+    said: list[str] = []
+    usual = _rejuvenation_step.rejuvenate
+
+    def rejuvenate(*arguments: Any) -> Any:
+        result = usual(*arguments)
+        if arguments[4] == PARTICLES:
+            said.append(result.reason)
+        return result
+
+    monkeypatch.setattr(_rejuvenation_step, "rejuvenate", rejuvenate)
+    return said
+
+
+@pytest.mark.parametrize("command", WRITERS)
+def test_a_replay_is_rejuvenated_and_repeats_itself(
+    command: str, vslam: Any, tmp_path: Path, reasons: list[str]
+) -> None:
+    """Most attempts succeed, the estimates change, the option stands in config.toml, which repeats the paths."""
+    log, plain, one, two = (tmp_path / name for name in ("log", "plain", "one", "two"))
+    log.mkdir()
+    WRITERS[command](log)
+    options = ("replay", command, "--path", str(log), "--duration", "8", "--seed", "104")
+    options += ("--particles", str(PARTICLES))
+    assert vslam(*options, "--rejuvenate-every", "0", "--out", str(plain)).status == 0
+    assert not reasons
+    assert vslam(*options, "--rejuvenate-every", "8", "--out", str(one)).status == 0
+    assert reasons.count("") > 0.5 * len(reasons) > 0.0
+    assert vslam("replay", command, "--config", str(one), "--out", str(two)).status == 0
+    counts = json.loads((one / "metrics.json").read_text())["rejuvenations"]
+    assert counts["drawn"] == reasons.count("") // 2  # of two runs
+    assert sum(counts["refused"].values()) == (len(reasons) - reasons.count("")) // 2
+    off = tmp_path / "off"
+    never = ("--config", str(one), "--rejuvenate-every", "0", "--out", str(off))
+    assert vslam("replay", command, *never).status == 0
+    assert json.loads((off / "metrics.json").read_text())["rejuvenations"] == {"drawn": 0, "refused": {}}
+    assert estimates(off) == estimates(plain)
+    assert "rejuvenate_every = 8" in (one / "config.toml").read_text()
+    assert "rejuvenate_every = 0" in (plain / "config.toml").read_text()
+    assert estimates(one) == estimates(two)
+    assert all(with_it != without for with_it, without in zip(estimates(one), estimates(plain), strict=True))
+    first, second = (json.loads((folder / "metrics.json").read_text()) for folder in (one, two))
+    assert first == second
+
+
+def test_all_replays_are_rejuvenated_as_often_as_environments_unless_told_otherwise() -> None:
+    """The default is one interval, that of the environments' filters."""
+    usual = preset_config("standard").belief.filter.rejuvenate_every
+    for config in (MrclamConfig, VictoriaConfig, KittiConfig, ImagesConfig):
+        assert config(path="log").rejuvenate_every == usual
+
+
+@pytest.mark.parametrize("command", WRITERS)
+def test_a_replay_tells_whether_its_filters_are_consistent(command: str, vslam: Any, tmp_path: Path) -> None:
+    """The table and metrics.json have a row for each robot, with a warning in words where there is one."""
+    log, run = tmp_path / "log", tmp_path / "run"
+    log.mkdir()
+    WRITERS[command](log)
+    done = vslam("replay", command, "--path", str(log), "--duration", "8", "--particles", "9", "--out", str(run))
+    rows = json.loads((run / "metrics.json").read_text())["consistency"]
+    assert len(rows) == len(json.loads((run / "metrics.json").read_text())["robots"])
+    assert all(row["frames"] > 0 and 0.0 <= row["nis_share"] <= 1.0 for row in rows)
+    assert "Consistency" in done.out
+    for row in rows:
+        for warning in row["warnings"]:
+            assert " ".join(warning["text"].split()) in " ".join(done.out.split())
+
+
+@pytest.mark.parametrize("sensor", ["landmark", "stereo"])
+def test_the_filters_of_a_run_are_told(sensor: str) -> None:
+    """The environment's filters get the particles and the interval of the run; all else is that of the preset."""
+    config = RunConfig(world="fig5", particles=17, rejuvenate_every=9, preset="hard", sensor=sensor)
+    chosen = config.make_env().config
+    assert (chosen.belief.filter.num_particles, chosen.belief.filter.rejuvenate_every) == (17, 9)
+    expected = preset_config("hard", sensor).replace(world="fig5", max_cycles=1800)
+    usual = {"filter": {"num_particles": 100, "rejuvenate_every": expected.belief.filter.rejuvenate_every}}
+    assert chosen.replace(belief=usual) == expected
+
+
+def test_a_run_is_rejuvenated_as_the_environment_has_it_unless_told_otherwise() -> None:
+    """Without a word the environment's interval holds; 0 is never."""
+    assert RunConfig().make_env().config.belief == preset_config("standard").belief
+    assert preset_config("standard").belief.filter.rejuvenate_every is not None
+    assert RunConfig(rejuvenate_every=0).make_env().config.belief.filter.rejuvenate_every is None
+
+
+@pytest.mark.slow
+def test_a_run_is_rejuvenated_and_repeats_itself(vslam: Any, tmp_path: Path) -> None:
+    """Of three runs of the command, that without differs from that with, and that from its config does not."""
+    plain, one, two = (tmp_path / name for name in ("plain", "one", "two"))
+    options = ("--robots", "2", "--particles", "11", "--max-cycles", "40", "--world", "fig5", "--seed", "104")
+    with_it, without = (*options, "--rejuvenate-every", "10"), (*options, "--rejuvenate-every", "0")
+    for folder, extra in ((plain, without), (one, with_it), (two, ("--config", str(one)))):
+        assert vslam("run", *extra, "--no-video", "--out", str(folder)).status == 0
+    assert tomllib.loads((one / "config.toml").read_text())["config"]["rejuvenate_every"] == 10
+    assert EnvConfig.from_toml(one / "environment.toml").belief.filter.rejuvenate_every == 10
+    assert estimates(one) == estimates(two)
+    assert estimates(one) != estimates(plain)
+
+
+def _count_of(*reasons: str | None) -> dict[str, Any]:
+    """Return the count of attempts with these reasons; None: a step without any."""
+    count = RejuvenationCount()
+    for reason in reasons:
+        count.add(None if reason is None else RejuvenationReport(reason, 1.0, 1, 1))
+    return count.to_mapping()
+
+
+def test_refusals_are_told_apart_by_their_words() -> None:
+    """Numbers within a reason do not make it another one, and steps without an attempt do not count."""
+    sizes = [f"an effective sample size of {size}" for size in ("1.5", "29.9")]
+    refused = {"an effective sample size of n": 2, "no convergence in n iterations": 1}
+    assert _count_of("", *sizes, None, "", "no convergence in 15 iterations") == {"drawn": 2, "refused": refused}
+
+
+def test_the_sentence_tells_all_there_is() -> None:
+    """Draws alone, draws and refusals, and nothing where nothing was attempted."""
+    assert _rejuvenations(_count_of(None)) == ""
+    assert _rejuvenations(_count_of("", "")) == "Particles were drawn anew 2 times."
+    told = _rejuvenations(_count_of("no pose to seek", ""))
+    assert told == "Particles were drawn anew 1 times, and not, for: no pose to seek (1)."

@@ -1,0 +1,263 @@
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from small_logs import LANDMARKS, write_log
+
+from slam_backend.geometry import compose, inverse, transform_points
+from slam_backend.maps.landmark_map import LandmarkMap
+from slam_backend.metrics import align_se2
+from slam_backend.models.odometry import OdometryModel
+from slam_backend.readers.mrclam import Drive, SightingNoise, load_mrclam
+from slam_backend.trajectory import Trajectory
+from training.replay.config import MrclamConfig
+from training.replay.metrics import align_to_truth, score_path, summarise
+from training.replay.mrclam import replay_team
+
+EXACT = MrclamConfig(
+    path="log", particles=7, drive=Drive(),
+    motion=OdometryModel(sigma_along=1e-3, sigma_across=1e-3, sigma_heading=1e-3, sigma_turn=1e-3),
+    sensor=SightingNoise(range_floor=0.02, range_share=0.0, bearing=0.01, height=0.01),
+)  # fmt: skip
+
+
+def test_without_noise_the_team_is_right(tmp_path: Path) -> None:
+    """Exact readings that are believed give one group, and paths, maps and the merge exact to centimetres."""
+    write_log(tmp_path, noise=0.0)
+    log = load_mrclam(tmp_path)
+    result = replay_team(log, EXACT)
+    paths = [score_path(result, robot, own.truth) for robot, own in enumerate(log.robots)]
+    metrics = summarise(result, log, paths)
+    assert metrics["groups"] == [[2, 5]]
+    assert len(metrics["merges"]) == 1
+    assert metrics["merges"][0]["error_m"] < 0.05
+    assert metrics["merges"][0]["false"] is False
+    assert {"step", "landmarks"} <= set(metrics["merges"][0])
+    assert metrics["merges"][0]["error_deg"] < 1.0
+    for row in metrics["robots"]:
+        assert row["ate_aligned_m"] < 0.05
+        assert row["dead_reckoning_ate_start_m"] < 1e-3
+        assert row["map_rmse_m"] < 0.05
+        assert row["map_precision"] == 1.0
+        assert row["map_rmse_aligned_m"] == row["map_rmse_m"]
+        assert row["map_rmse_m"] - 1e-3 < row["map_rmse_start_m"] < 0.1
+
+
+def test_noise_is_removed_that_dead_reckoning_keeps(tmp_path: Path) -> None:
+    """With biased odometry each path is at most a third as wrong as dead reckoning, in both kinds of score."""
+    write_log(tmp_path, noise=1.0)
+    log = load_mrclam(tmp_path)
+    result = replay_team(log, MrclamConfig(path=str(tmp_path), particles=25, seed=4))
+    for robot, own in enumerate(log.robots):
+        path = score_path(result, robot, own.truth)
+        assert path is not None
+        assert path.ate_aligned < 0.5 * path.reckoned_aligned
+    assert len(result.groups) == 1
+
+
+def test_a_run_is_written_and_repeats_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, vslam: Any) -> None:
+    """The command leaves a complete folder, and run again from its config the same metrics to the last digit."""
+    log, first, second = (tmp_path / name for name in ("log", "first", "second"))
+    log.mkdir()
+    write_log(log, noise=1.0)
+    monkeypatch.setenv("VSLAM_DATA", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    options = ("--path", "log", "--duration", "20", "--particles", "7", "--seed", "5")
+    for arguments in (
+        (*options, "--out", str(first), "--json", str(tmp_path / "copy.json")),
+        ("--config", str(first), "--out", str(second)),
+    ):
+        said = vslam("replay", "mrclam", *arguments)
+        assert said.status == 0
+        monkeypatch.chdir(first)  # the config works from any folder
+    assert "odometry" in said.out
+    names = {f"robot{n}_{kind}.tum" for n in (2, 5) for kind in ("estimate", "dead_reckoning", "truth")}
+    assert {file.name for file in first.iterdir()} == {
+        "config.toml", "metrics.json", "replay.png", "joint_map_2-5.png", "timing.json", "map_2-5.npz", "map_2-5.csv",
+        *names,
+    }  # fmt: skip
+    assert "Maps as data: map_2-5" in said.out
+    for file in first.glob("*.png"):
+        assert file.read_bytes()[:4] == b"\x89PNG"
+    metrics = json.loads((first / "metrics.json").read_text())
+    assert metrics["groups"] == [[2, 5]]  # whose map is drawn alone
+    assert metrics == json.loads((tmp_path / "copy.json").read_text())
+    assert metrics == json.loads((second / "metrics.json").read_text())
+    assert metrics["seed"] == 5
+    assert metrics["coverage"] is None
+    assert metrics["config"]["particles"] == 7
+    assert set(metrics) >= {"robots", "merges", "groups", "coverage", "config", "seed", "versions"}
+    estimate = Trajectory.load_tum(first / "robot5_estimate.tum")
+    assert np.array_equal(estimate.poses, Trajectory.load_tum(second / "robot5_estimate.tum").poses)
+
+
+def test_maps_are_left_as_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, vslam: Any) -> None:
+    """Each group's map is an archive that `LandmarkMap.load` reads, in its first robot's start frame, and a CSV."""
+    write_log(tmp_path, noise=0.0)
+    monkeypatch.chdir(tmp_path)
+    options = ("--duration", "20", "--particles", "7", "--alone", "--out", "run")
+    assert vslam("replay", "mrclam", "--path", ".", *options).status == 0
+    log = load_mrclam(tmp_path, duration=20.0)
+    config = MrclamConfig.from_mapping(json.loads((tmp_path / "run" / "metrics.json").read_text())["config"])
+    for robot, own in zip((2, 5), replay_team(log, config).maps, strict=True):
+        found = LandmarkMap.load(tmp_path / "run" / f"map_{robot}.npz")
+        for name in ("means", "covariances", "descriptors", "counts", "ids"):
+            assert np.array_equal(getattr(found, name), getattr(own, name))
+        table = np.genfromtxt(tmp_path / "run" / f"map_{robot}.csv", delimiter=",", names=True)
+        assert table["id"].astype(int).tolist() == own.ids.tolist()
+        assert table["count"].astype(int).tolist() == own.counts.tolist()
+        assert np.array_equal(np.column_stack([table[f"{axis}_m"] for axis in "xyz"]), own.means)
+        for pair, (i, j) in {"xx": (0, 0), "xy": (0, 1), "yz": (1, 2), "zz": (2, 2)}.items():
+            assert np.array_equal(table[f"cov_{pair}_m2"], own.covariances[:, i, j])
+
+
+def test_a_folder_without_truth_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, vslam: Any) -> None:
+    """Where nothing is known, the command says so in place of tables of dashes; what was sorted is one line."""
+    write_log(tmp_path, noise=1.0)
+    for file in tmp_path.glob("*Groundtruth.dat"):
+        file.unlink()
+    rows = (tmp_path / "Robot5_Odometry.dat").read_text().splitlines()
+    (tmp_path / "Robot5_Odometry.dat").write_text("\n".join([rows[1], rows[0], *rows[2:]]))
+    monkeypatch.chdir(tmp_path)
+    options = ("--particles", "7", "--seed", "5", "--out", "run")
+    said = vslam("replay", "mrclam", "--path", ".", "--duration", "20", *options)
+    assert said.status == 0
+    assert "Paths of robots 2, 5: no ground truth in this folder." in said.out
+    assert "Maps of robots 2, 5: no ground truth in this folder." in said.out
+    assert "│" not in said.out.split("Merges")[0]
+    assert "off by" not in said.out
+    assert "Sorted by time: Robot5_Odometry.dat (1 row, up to 0.100 s back)." in said.out.splitlines()
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert metrics["notes"] == ["Sorted by time: Robot5_Odometry.dat (1 row, up to 0.100 s back)."]
+    row = metrics["robots"][0]
+    assert {row[key] for key in ("ate_aligned_m", "map_rmse_m", "map_recall", "map_precision", "map_error")} == {None}
+    assert metrics["groups"] == [[2, 5]]
+
+
+def test_the_map_error_says_that_errors_are_cut(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, vslam: Any) -> None:
+    """The column of E says at which distance each error is cut."""
+    write_log(tmp_path, noise=0.0)
+    monkeypatch.chdir(tmp_path)
+    said = vslam("replay", "mrclam", "--path", ".", "--duration", "5", "--particles", "2", "--out", "run")
+    assert "map error E (m)," in said.out
+    assert "errors cut at 1 m," in said.out
+
+
+def test_a_log_without_truth_has_no_path_scores(tmp_path: Path) -> None:
+    """Where the true path is not known its errors are NaN, while the map is scored."""
+    write_log(tmp_path, noise=1.0)
+    (tmp_path / "Robot5_Groundtruth.dat").unlink()
+    log = load_mrclam(tmp_path, robots=(5,), duration=10.0)
+    result = replay_team(log, MrclamConfig(path=str(tmp_path), particles=5))
+    row = summarise(result, log, [score_path(result, 0, log.robots[0].truth)])["robots"][0]
+    assert np.isnan([row["ate_aligned_m"], row["dead_reckoning_ate_start_m"], row["map_error"]]).all()
+    assert row["map_rmse_m"] < 0.6
+
+
+def test_map_is_aligned_by_its_most_seen_landmarks(tmp_path: Path) -> None:
+    """A duplicate seen once does not turn the map; it lowers the precision."""
+    write_log(tmp_path, noise=0.0)
+    log = load_mrclam(tmp_path)
+    world_from_map = np.array([1.0, -2.0, 0.7])
+    means = transform_points(inverse(world_from_map), LANDMARKS[[0, 3, 5, 3]])
+    means[3] += 2.0
+    covariances, counts = np.tile(np.eye(3), (4, 1, 1)), np.array([9, 9, 9, 1])
+    landmarks = LandmarkMap(np.column_stack([means, np.zeros(4)]), covariances, np.ones((4, 1)), counts)
+    found = align_to_truth(landmarks, np.array([0, 3, 5, 3]), log)
+    assert found is not None
+    np.testing.assert_allclose(found.world_from_map, world_from_map, atol=1e-9)
+    assert found.score.precision == 0.75
+    assert found.score.recall == 3 / 14
+    assert align_to_truth(LandmarkMap.empty(14), np.empty(0, dtype=np.int64), log) is None
+
+
+def test_robots_that_stay_alone_never_merge(tmp_path: Path) -> None:
+    """Alone, each robot ends with its own map, and what it estimates does not depend on which others are replayed."""
+    write_log(tmp_path, noise=1.0)
+    config = MrclamConfig(path=str(tmp_path), particles=7, alone=True, seed=4)
+    both, first = load_mrclam(tmp_path, duration=20.0), load_mrclam(tmp_path, (2,), duration=20.0)
+    result = replay_team(both, config)
+    assert result.groups == ((0,), (1,))
+    assert not result.attempts
+    assert not summarise(result, both, [None, None])["refusals"]
+    np.testing.assert_array_equal(result.paths[0][:80], replay_team(first, config).paths[0][:80])
+
+
+def test_hidden_identities_are_found_by_position(tmp_path: Path) -> None:
+    """Without barcodes exact readings of landmarks that stand apart still give each of them once."""
+    write_log(tmp_path, noise=0.0)
+    apart: list[int] = []
+    for row, place in enumerate(LANDMARKS):
+        if all(np.hypot(*(place - LANDMARKS[other])) > 1.1 for other in apart):
+            apart.append(row)
+    file = tmp_path / "Robot2_Measurement.dat"
+    kept = [line for line in file.read_text().splitlines() if int(line.split()[1]) - 106 in apart]
+    file.write_text("\n".join(kept))
+    log = load_mrclam(tmp_path, (2,))
+    result = replay_team(log, EXACT.replace(identities="hidden"))
+    assert (result.maps[0].descriptors == 1.0).all()
+    row = summarise(result, log, [score_path(result, 0, log.robots[0].truth)])["robots"][0]
+    assert row["ate_aligned_m"] < 0.05
+    assert row["map_rmse_m"] < 0.05
+    assert row["map_precision"] == 1.0
+
+
+@pytest.mark.slow
+def test_five_real_robots_become_one_team(data_dir: Path) -> None:
+    """On the real log all five end in one group by right merges, paths a tenth as wrong as dead reckoning.
+
+    That of robot 1, whose first headings are hardly known, turns with what merges tell of them: a fifth.
+    """
+    log = load_mrclam(data_dir / "mrclam" / "MRCLAM_Dataset7")
+    result = replay_team(log, MrclamConfig(path="MRCLAM_Dataset7", particles=100))
+    metrics = summarise(result, log, [score_path(result, robot, own.truth) for robot, own in enumerate(log.robots)])
+    assert metrics["groups"] == [[1, 2, 3, 4, 5]]
+    assert not any(merge["false"] for merge in metrics["merges"])
+    shares = [row["ate_aligned_m"] / row["dead_reckoning_ate_start_m"] for row in metrics["robots"]]
+    assert np.mean(shares) <= 0.1
+    assert shares[0] <= 0.2
+    assert max(shares[1:]) <= 0.13
+    for row in metrics["robots"]:
+        assert row["map_rmse_m"] < 0.2
+        assert row["map_recall"] == 1.0
+
+
+@pytest.mark.slow
+def test_real_robots_alone_are_as_good_as_a_careful_filter(data_dir: Path) -> None:
+    """Each by itself, the five robots reach on average a path of 0.33 m and a map of 0.13 m."""
+    log = load_mrclam(data_dir / "mrclam" / "MRCLAM_Dataset7")
+    result = replay_team(log, MrclamConfig(path="MRCLAM_Dataset7", alone=True))
+    rows = summarise(result, log, [score_path(result, r, own.truth) for r, own in enumerate(log.robots)])["robots"]
+    assert np.mean([row["ate_aligned_m"] for row in rows]) <= 0.33
+    assert np.mean([row["map_rmse_m"] for row in rows]) <= 0.13
+
+
+@pytest.mark.slow
+def test_the_same_assumptions_hold_on_another_log(data_dir: Path) -> None:
+    """On data set 4, robot 3, with true poses from a file of their own, reaches a path of 0.15 m, a map of 0.1 m.
+
+    The odometry noise was calibrated on it, and on data set 7.
+    """
+    truth = data_dir / "mrclam_extra_gt" / "D4_robot3" / "Groundtruth.csv"
+    log = load_mrclam(data_dir / "mrclam" / "MRCLAM_Dataset4", (3,), truth=truth)
+    result = replay_team(log, MrclamConfig(path="MRCLAM_Dataset4"))
+    row = summarise(result, log, [score_path(result, 0, log.robots[0].truth)])["robots"][0]
+    assert row["ate_aligned_m"] <= 0.15
+    assert row["map_rmse_m"] <= 0.1
+
+
+def test_paths_in_start_frames_and_group_frames_agree(tmp_path: Path) -> None:
+    """Late poses, moved into the group's frame, fit the true poses by the same motion as the group's map."""
+    write_log(tmp_path, noise=0.0)
+    log = load_mrclam(tmp_path)
+    result = replay_team(log, EXACT)
+    late = compose(inverse(result.start_from_group), result.paths[:, -4])
+    group_map = result.maps[0].moved(inverse(result.start_from_group[0]))
+    rows = group_map.descriptors.argmax(axis=1)
+    world_from_group = align_se2(LANDMARKS[rows], group_map.means[:, :2])
+    for pose, own in zip(late, log.robots, strict=True):
+        assert own.truth is not None
+        error = compose(inverse(own.truth.at(result.times[-4])), compose(world_from_group, pose))
+        assert np.abs(error).max() < 0.05

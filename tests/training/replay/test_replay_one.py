@@ -1,0 +1,232 @@
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from small_logs import EAST, TREES, write_drive, write_park
+
+from slam_backend.geometry import compose, transform_points
+from slam_backend.maps.landmark_map import LandmarkMap
+from slam_backend.readers.conversions import integrate_commands
+from slam_backend.readers.kitti import load_kitti
+from slam_backend.readers.victoria import axle_velocities, load_victoria, steps
+from slam_backend.trajectory import Trajectory
+from training.replay.config import KittiConfig, VictoriaConfig
+from training.replay.kitti import find_loop, mean_drift
+from training.replay.kitti import replay as replay_kitti
+from training.replay.kitti import score as score_kitti
+from training.replay.kitti import summarise as summarise_kitti
+from training.replay.single_robot import path_length, score_positions
+from training.replay.victoria import describe_by_place
+from training.replay.victoria import replay as replay_victoria
+from training.replay.victoria import score as score_victoria
+from training.replay.victoria import summarise as summarise_victoria
+
+
+def test_a_park_is_mapped_by_position_alone(tmp_path: Path) -> None:
+    """With steering told wrong by half a degree, nameless trees keep the path right, and each is in the map once."""
+    write_park(tmp_path, skew=0.01)
+    log = load_victoria(tmp_path)
+    result = replay_victoria(log, VictoriaConfig(path="log", particles=10, seed=3))
+    scored = score_victoria(result, log)
+    row = summarise_victoria(result, scored)["robots"][0]
+    assert row["ate_aligned_m"] < 0.1 < 1.0 < row["dead_reckoning_ate_start_m"]
+    assert row["ate_start_m"] < 0.2
+    assert result.rejected == 0
+    assert len(result.landmarks) == len(TREES)
+    world = transform_points(scored.scores[0].world_from_path, result.landmarks.means[:, :2])
+    nearest = np.hypot(*(world[:, None] - transform_points(EAST, TREES)[None]).transpose(2, 0, 1)).min(axis=1)
+    assert nearest.max() < 0.3
+
+
+def test_exact_dead_reckoning_needs_no_fit(tmp_path: Path) -> None:
+    """Controls that are followed lead the antenna through all fixes; start and fit then agree."""
+    write_park(tmp_path)
+    log = load_victoria(tmp_path)
+    scored = score_victoria(replay_victoria(log, VictoriaConfig(path="log", particles=2)), log)
+    assert scored.scores[1].start < 0.01
+    start = integrate_commands(axle_velocities(log.controls), log.scan_times[:1])[0]  # of the first scan
+    np.testing.assert_allclose(scored.scores[1].world_from_path, compose(EAST, start), atol=1e-3)
+
+
+def test_trees_are_described_by_where_they_stand(tmp_path: Path) -> None:
+    """Seen from the true pose, descriptors are the trees' places."""
+    write_park(tmp_path)
+    log = load_victoria(tmp_path)
+    frame = steps(log).measurements[0]
+    assert frame is not None
+    pose = integrate_commands(axle_velocities(log.controls), log.scan_times[:1])[0]
+    found = describe_by_place(frame, pose)
+    gaps = np.hypot(*(found.descriptors[:, None] - TREES[None]).transpose(2, 0, 1)).min(axis=1)
+    assert gaps.max() < 1e-4
+    np.testing.assert_array_equal(found.points, frame.points)
+
+
+def test_a_stretch_with_fewer_than_two_fixes_has_no_scores(tmp_path: Path) -> None:
+    """A stretch without GPS is replayed, but cannot be scored."""
+    write_park(tmp_path)
+    log = load_victoria(tmp_path, duration=0.4)
+    result = replay_victoria(log, VictoriaConfig(path="log", particles=2))
+    assert score_victoria(result, log) is None
+    assert np.isnan(summarise_victoria(result, None)["robots"][0]["ate_aligned_m"])
+
+
+@pytest.mark.parametrize("command", ["victoria", "kitti"])
+def test_a_folder_without_truth_says_so(
+    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, vslam: Any
+) -> None:
+    """Without GPS or true poses there is a line in place of the table, and no dash."""
+    (write_park if command == "victoria" else write_drive)(tmp_path)
+    (tmp_path / ("aa3_gpsx.mat" if command == "victoria" else "poses/00.txt")).unlink()
+    monkeypatch.chdir(tmp_path)
+    said = vslam("replay", command, "--path", ".", "--duration", "3", "--particles", "2", "--out", "run")
+    assert said.status == 0
+    assert "Errors: no ground truth in this folder." in said.out
+    assert " - " not in said.out
+    assert "RMS" not in said.out
+    assert json.loads((tmp_path / "run" / "metrics.json").read_text())["robots"][0]["ate_aligned_m"] is None
+
+
+def test_the_command_tells_drift_and_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, vslam: Any) -> None:
+    """Over 100 m KITTI's drift is printed as a share, and the error at the end, of the estimate and of odometry."""
+    write_drive(tmp_path, bias=0.05)
+    monkeypatch.chdir(tmp_path)
+    said = vslam("replay", "kitti", "--path", ".", "--particles", "2", "--out", "run")
+    row = json.loads((tmp_path / "run" / "metrics.json").read_text())["robots"][0]
+    assert row["end_error_percent"] == pytest.approx(100.0 * row["end_error_m"] / row["true_path_m"])
+    assert row["dead_reckoning_end_error_m"] > 5.0 * row["end_error_m"] > 0.0
+    assert (
+        f"End of {row['true_path_m']:.1f} m, from the start, no fit: off by {row['end_error_m']:.2f} m, "
+        f"{row['end_error_percent']:.2f} % of the path (odometry {row['dead_reckoning_end_error_m']:.2f} m, "
+    ) in said.out
+    assert ("Drift" in said.out) == (row["mean_drift"] is not None)
+
+
+def test_tracks_correct_the_turn_of_a_drive(tmp_path: Path) -> None:
+    """With the turn rate told wrong, tracked features leave a tenth of dead reckoning's error."""
+    write_drive(tmp_path, bias=0.05)
+    log = load_kitti(tmp_path)
+    result = replay_kitti(log, KittiConfig(path="log", particles=10, seed=3))
+    scored = score_kitti(result, log)
+    assert scored is not None
+    row = summarise_kitti(result, scored)["robots"][0]
+    assert row["dead_reckoning_ate_start_m"] > 5.0
+    assert row["ate_start_m"] < 0.1 * row["dead_reckoning_ate_start_m"]
+    assert row["loop_error_m"] != row["loop_error_m"]  # there is no loop
+
+
+def test_tracks_on_a_bus_are_refused(tmp_path: Path) -> None:
+    """Eight tracks that move with a bus are refused once they move, and the path stays right to a decimetre."""
+    write_drive(tmp_path, bus=True)
+    log = load_kitti(tmp_path)
+    result = replay_kitti(log, KittiConfig(path="log", particles=10, seed=3))
+    scored = score_kitti(result, log)
+    assert scored is not None
+    assert scored.scores[0].start < 0.1
+    assert result.rejected > 300
+
+
+def test_a_drive_without_truth_has_no_scores(tmp_path: Path) -> None:
+    """Where the true path is not known, errors are NaN."""
+    write_drive(tmp_path)
+    (tmp_path / "poses" / "00.txt").unlink()
+    log = load_kitti(tmp_path, duration=1.0)
+    result = replay_kitti(log, KittiConfig(path="log", particles=2))
+    assert score_kitti(result, log) is None
+    assert np.isnan(summarise_kitti(result, None)["robots"][0]["ate_aligned_m"])
+
+
+def test_a_loop_is_the_place_that_is_passed_twice() -> None:
+    """On a circle of 160 m that is driven one and a quarter times, the loop's ends are one round apart."""
+    angles = np.linspace(0.0, 2.5 * np.pi, 126)
+    radius = 80.0 / np.pi
+    circle = np.column_stack([radius * np.cos(angles), radius * np.sin(angles), angles])
+    loop = find_loop(circle)
+    assert loop is not None
+    assert np.hypot(*(circle[loop[0]] - circle[loop[1]])[:2]) < 1.0
+    assert loop[1] - loop[0] in (100, 101)
+    assert find_loop(circle[:80]) is None
+
+
+def test_drift_is_a_share_of_the_way_in_any_frame() -> None:
+    """A path 3 % too long drifts by that, wherever it starts; one that turns, by the chord; a short one has none."""
+    along = np.arange(0.0, 351.0)
+    truth = np.column_stack([along, np.zeros_like(along), np.zeros_like(along)])
+    assert mean_drift(compose(np.array([5.0, -2.0, 0.7]), truth * [1.03, 1.0, 1.0]), truth) == pytest.approx(0.03)
+    turned = np.where(along < 120.0, 0.0, 0.1)  # after 120 m all goes aside
+    bent = np.column_stack([np.cumsum(np.cos(turned)), np.cumsum(np.sin(turned)), turned])
+    starts, lengths = np.arange(0.0, 351.0, 10.0), np.array([100.0, 200.0, 300.0])
+    aside = np.clip(starts + lengths[:, None] - 119.0, 0.0, lengths[:, None]) * (starts < 120.0)
+    shares = (2.0 * np.sin(0.05) * aside / lengths[:, None])[starts + lengths[:, None] <= 350.0]
+    assert mean_drift(bent, truth) == pytest.approx(shares.mean(), rel=1e-6)
+    assert np.isnan(mean_drift(truth[:90], truth[:90]))
+
+
+def test_positions_are_scored_before_and_after_the_fit() -> None:
+    """A path that is only moved has no error after the fit, and before it as much as it was moved."""
+    points = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 2.0], [4.0, 3.0]])
+    score = score_positions(points, transform_points([3.0, 4.0, 0.0], points), np.zeros(3))
+    assert score.start == pytest.approx(5.0)
+    assert score.aligned == pytest.approx(0.0, abs=1e-12)
+    np.testing.assert_allclose(score.world_from_path, [3.0, 4.0, 0.0], atol=1e-12)
+
+
+@pytest.mark.parametrize("command", ["victoria", "kitti"])
+def test_a_run_is_written_and_repeats_itself(
+    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, vslam: Any
+) -> None:
+    """The command leaves a complete folder, and run again from its config the same metrics to the last digit."""
+    log, first, second = (tmp_path / name for name in ("log", "first", "second"))
+    log.mkdir()
+    (write_park if command == "victoria" else write_drive)(log)
+    monkeypatch.chdir(tmp_path)
+    options = ("--path", "log", "--duration", "6", "--particles", "3", "--seed", "5")
+    for arguments in (
+        (*options, "--out", str(first), "--json", str(tmp_path / "copy.json")),
+        ("--config", str(first), "--out", str(second)),
+    ):
+        said = vslam("replay", command, *arguments)
+        assert said.status == 0
+        monkeypatch.chdir(first)  # the config works from any folder
+    assert "times real time" in said.out
+    assert "RMS distance to the truth [m]" in said.out
+    truth = {"truth.tum"} if command == "kitti" else set()
+    assert {file.name for file in first.iterdir()} == truth | {
+        "config.toml", "metrics.json", "replay.png", "timing.json", "estimate.tum", "dead_reckoning.tum",
+        "map_1.npz", "map_1.csv",
+    }  # fmt: skip
+    assert (first / "replay.png").read_bytes()[:4] == b"\x89PNG"
+    assert "Maps as data: map_1 (" in said.out
+    assert len(LandmarkMap.load(first / "map_1.npz")) == json.loads((first / "metrics.json").read_text())["landmarks"]
+    assert json.loads((first / "timing.json").read_text())["times_real_time"] > 0.0
+    metrics = json.loads((first / "metrics.json").read_text())
+    assert metrics == json.loads((tmp_path / "copy.json").read_text())
+    assert metrics == json.loads((second / "metrics.json").read_text())
+    assert set(metrics) >= {"robots", "merges", "groups", "coverage", "config", "seed", "versions"}
+    estimate = Trajectory.load_tum(first / "estimate.tum")
+    assert np.array_equal(estimate.poses, Trajectory.load_tum(second / "estimate.tum").poses)
+
+
+@pytest.mark.slow
+def test_victoria_park_is_followed_to_five_metres(data_dir: Path) -> None:
+    """Over the whole real log dead reckoning is off by 149 m, the estimate, fitted to all fixes, by less than 5 m."""
+    log = load_victoria(data_dir / "victoria_park")
+    assert sum(len(scan) for scan in log.scans) == 52_974
+    scored = score_victoria(replay_victoria(log, VictoriaConfig(path="log", particles=30)), log)
+    assert scored.scores[1].start == pytest.approx(149.0, abs=1.0)
+    assert scored.scores[0].aligned < 5.0
+    assert np.median(scored.scores[0].errors) < 2.0
+
+
+@pytest.mark.slow
+def test_a_real_drive_is_followed_to_one_per_cent(data_dir: Path) -> None:
+    """Over 694 m of KITTI, smoothed tracks leave less than 1 % of the way, and its length is right to 2 %."""
+    log = load_kitti(data_dir / "kitti_landmarks")
+    result = replay_kitti(log, KittiConfig(path="log", rejuvenate_every=50))
+    scored = score_kitti(result, log)
+    assert scored is not None
+    assert scored.scores[0].aligned < min(6.9, scored.scores[1].aligned / 2.0)
+    assert path_length(scored.paths[0]) == pytest.approx(path_length(scored.truth), rel=0.02)
+    assert result.rejected < 0.1 * (result.matched + result.rejected)
+    assert scored.loop is not None

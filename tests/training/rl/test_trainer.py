@@ -1,0 +1,342 @@
+"""Trainings: they learn, repeat, go on where they stopped, and refuse what is damaged or not there."""
+
+import hashlib
+import json
+import os
+import pickle
+import signal
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from gymnasium import spaces
+from pettingzoo import ParallelEnv
+from typer.testing import CliRunner
+
+pytest.importorskip("torch", reason="torch is not installed: pip install .[train]")
+pytest.importorskip("stable_baselines3", reason="stable-baselines3 is not installed: pip install .[train]")
+pytest.importorskip("sb3_contrib", reason="sb3-contrib is not installed: pip install .[train]")
+pytest.importorskip("tensorboard", reason="tensorboard is not installed: pip install .[train]")
+
+import torch
+from sb3_contrib import MaskablePPO
+
+from agents.goal_network import logits
+from agents.trained import load_model
+from slam_backend.core.state_codec import decoded, encoded
+from training.cli import app
+from training.rl.checkpoint import CHECKPOINT_FILE, FORMAT, MAGIC, read_checkpoint, write_checkpoint
+from training.rl.config import TrainConfig
+from training.rl.network import GoalPolicy
+from training.rl.trainer import Training, as_arrays, as_tensors, check_device, kept_of
+from training.vec_env import ExplorationVecEnv
+from vslam_env.belief.observation import observation_space
+from vslam_env.state_kinds import ENV_KINDS
+
+SMOKE = TrainConfig.from_mapping({"preset": "smoke", "seed": 5})
+SPACE = observation_space(32, 8.0, True, False)
+runner = CliRunner()
+
+
+class _NearIsGood(ParallelEnv):  # type: ignore[misc]
+    """One robot in fresh surroundings at each step is paid the more, the shorter the path to what it chose."""
+
+    possible_agents = ("robot_0",)
+    render_mode = None
+
+    def observation_space(self, agent: str) -> Any:
+        return SPACE
+
+    def action_space(self, agent: str) -> Any:
+        return spaces.Discrete(17)
+
+    def reset(self, seed: int | None = None, options: Any = None) -> tuple[Any, Any]:
+        self.rng = np.random.default_rng(seed)
+        self.agents = ["robot_0"]
+        return self._seen(), {"robot_0": {}}
+
+    def step(self, actions: Any) -> tuple[Any, ...]:
+        action = int(actions["robot_0"])
+        gained = 0.0 if action == 0 else 1.0 / (1.0 + self.lengths[action - 1])
+        return self._seen(), {"robot_0": gained}, {"robot_0": False}, {"robot_0": False}, {"robot_0": {}}
+
+    def _seen(self) -> Any:
+        seen = {name: np.zeros(box.shape, box.dtype) for name, box in SPACE.spaces.items()}
+        slots = self.rng.permutation(16)[: self.rng.integers(2, 7)]
+        seen["candidates"][slots, 2] = self.rng.uniform(0.5, 15.0, len(slots))
+        seen["action_mask"][[0, *(1 + slots)]] = 1
+        self.lengths = seen["candidates"][:, 2].copy()
+        return {"robot_0": seen}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+    """Return the folder of an uninterrupted training, and its weights."""
+    folder = tmp_path_factory.mktemp("whole")
+    return folder, _trained(folder)
+
+
+def _trained(folder: Path, stop_after: int | None = None, resume: bool = False) -> dict[str, Any]:
+    training = Training(SMOKE, folder)
+    if resume:
+        training.restore(kept_of(folder, SMOKE))
+    counted: list[int] = []
+    training.watch.listen(lambda row: None, lambda: len(training.rows) == stop_after, counted.append)
+    assert training.run() == (stop_after is None)
+    assert counted == list(range(20 if resume else 4, 20 if stop_after else 52, 4))  # told of each step, and no other
+    training.close()
+    weights: dict[str, Any] = training.model.policy.actor_weights()
+    return weights
+
+
+def _assert_same(ours: dict[str, Any], theirs: dict[str, Any]) -> None:
+    assert ours.keys() == theirs.keys()
+    for name in ours:
+        np.testing.assert_array_equal(ours[name], theirs[name])
+
+
+def test_both_forms_of_the_network_agree() -> None:
+    """Torch and numpy give the same logits for the same weights and observations."""
+    torch.manual_seed(3)
+    policy = GoalPolicy(SPACE, spaces.Discrete(17), lambda left: 1e-3)
+    with torch.no_grad():
+        for tensor in policy.parameters():
+            tensor.add_(0.1 * torch.randn_like(tensor))  # biases that begin as zeros count too
+    SPACE.seed(1)
+    some = [SPACE.sample() for _ in range(4)]
+    for observation in some:
+        observation["candidates"] *= 0.1
+        observation["map_stats"] *= np.array([1e-2, 0.1, 0.1, 1e-2, 1.0, 1.0], np.float32)
+    seen = {name: np.stack([observation[name] for observation in some]) for name in SPACE.spaces}
+    with torch.no_grad():
+        theirs = policy.get_distribution(policy.obs_to_tensor(seen)[0]).distribution.logits.numpy()
+    ours = logits(policy.actor_weights(), seen)
+    ours = ours - np.log(np.exp(ours).sum(axis=1, keepdims=True))
+    np.testing.assert_allclose(ours, theirs, atol=2e-5)
+    assert np.ptp(theirs) > 0.1
+
+
+@pytest.mark.slow
+def test_it_learns_what_is_good() -> None:
+    """Where short paths pay, a few updates make the network choose much shorter ones than chance does."""
+    torch.set_num_threads(1)
+    env = ExplorationVecEnv([_NearIsGood] * 12)
+    model = MaskablePPO(
+        GoalPolicy, env, n_steps=50, batch_size=100, n_epochs=6, learning_rate=3e-3, gamma=0.5, seed=1, device="cpu"
+    )
+    model.learn(3000)
+    seen = env.reset()
+    chances = torch.softmax(torch.tensor(logits(model.policy.actor_weights(), seen)), 1).numpy() * seen["action_mask"]
+    gains = np.hstack([np.zeros((12, 1)), 1.0 / (1.0 + seen["candidates"][:, :, 2])])
+    learnt = (chances * gains).sum(1) / chances.sum(1)
+    random = (seen["action_mask"][:, 1:] * gains[:, 1:]).sum(1) / seen["action_mask"][:, 1:].sum(1)
+    assert learnt.mean() > 1.2 * random.mean()
+
+
+@pytest.mark.slow
+def test_one_seed_gives_the_same_weights(whole: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
+    """A second training equals the first to the byte, and what it saved; another seed does not."""
+    again = _trained(tmp_path)
+    _assert_same(again, whole[1])
+    _assert_same(dict(load_model(tmp_path)[0]), whole[1])
+    fresh = Training(TrainConfig.from_mapping({"preset": "smoke", "seed": 6}), tmp_path).model.policy.actor_weights()
+    assert not np.array_equal(fresh["slot.weight"], whole[1]["slot.weight"])
+
+
+@pytest.mark.slow
+def test_resumed_equals_uninterrupted(whole: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
+    """A training that was stopped after its first rollout and resumed in a new object ends with the same weights."""
+    stopped = _trained(tmp_path, stop_after=1)
+    assert not np.array_equal(stopped["slot.weight"], whole[1]["slot.weight"])
+    _assert_same(_trained(tmp_path, resume=True), whole[1])
+    assert read_checkpoint(tmp_path / CHECKPOINT_FILE)["watch"] == read_checkpoint(whole[0] / CHECKPOINT_FILE)["watch"]
+
+
+def test_rows_tell_of_episodes(whole: tuple[Path, dict[str, Any]]) -> None:
+    """Each rollout has a row: a return that is the sum of its terms, and TensorBoard gets the same numbers."""
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    rows = read_checkpoint(whole[0] / CHECKPOINT_FILE)["watch"]["rows"]
+    assert [row["steps"] for row in rows] == [16.0, 32.0, 48.0]
+    assert all(row["return"] == pytest.approx(row["reward/map_error"] + row["reward/own_coverage"]) for row in rows)
+    curves = EventAccumulator(str(whole[0] / "tensorboard"))
+    curves.Reload()
+    for name in ("return", "map_error", "map_recall", "merges", "reward/map_error"):
+        points = curves.Scalars(f"episode/{name}")
+        assert [point.step for point in points] == [16, 32, 48]
+        np.testing.assert_allclose([point.value for point in points], [row[name] for row in rows], rtol=1e-6)
+
+
+def test_damaged_checkpoints_are_refused(whole: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
+    """A missing, cut, foreign or changed checkpoint, one of another configuration or version, is told with its cure."""
+    file = tmp_path / CHECKPOINT_FILE
+    with pytest.raises(ValueError, match="resume: expected the checkpoint of a training, got no such file"):
+        kept_of(tmp_path, SMOKE)
+    bytes_whole = (whole[0] / CHECKPOINT_FILE).read_bytes()
+    file.write_bytes(bytes_whole[: len(bytes_whole) // 2])
+    with pytest.raises(ValueError, match=r"resume: .* got a broken file of \d+. .* was cut off or changed"):
+        kept_of(tmp_path, SMOKE)
+    file.write_bytes(b"something else")
+    with pytest.raises(ValueError, match=r"resume: .* got a broken file. .* is none: train anew"):
+        kept_of(tmp_path, SMOKE)
+    file.write_bytes(bytes_whole.replace(b'"torch": "', b'"torch": "0', 1))
+    with pytest.raises(ValueError, match=r"resume: expected a checkpoint made with torch .* Install torch==0"):
+        kept_of(tmp_path, SMOKE)
+    write_checkpoint(file, {"config": {**SMOKE.to_mapping(), "gamma": 0.5}, "seed": 5})
+    with pytest.raises(ValueError, match="resume: expected a checkpoint of the folder's configuration"):
+        kept_of(tmp_path, SMOKE)
+
+
+class Trap:
+    """What a pickle of makes a file when it is read."""
+
+    def __init__(self, file: Path) -> None:
+        self.file = file
+
+    def __reduce__(self) -> Any:
+        return Path.touch, (self.file,)
+
+
+def _marked(body: bytes, number: int) -> bytes:
+    """Return a checkpoint of a format with another body, as if it had been written so."""
+    mark = {"format": number, "versions": {}, "bytes": len(body), "sha256": hashlib.sha256(body).hexdigest()}
+    return MAGIC + json.dumps(mark).encode() + b"\n" + body
+
+
+def test_a_pickle_in_the_place_of_a_checkpoint_is_not_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever its format and checksum say, it runs nothing; checkpoints of other formats are refused by number."""
+    monkeypatch.setattr("training.rl.checkpoint._versions", dict)
+    file, proof = tmp_path / CHECKPOINT_FILE, tmp_path / "proof"
+    body = pickle.dumps({"config": Trap(proof)})
+    for number, says in ((FORMAT, "got a broken file"), (1, "expected one of format 2, got a checkpoint of format 1")):
+        file.write_bytes(_marked(body, number))
+        with pytest.raises(ValueError, match=f"resume: .*{says}"):
+            kept_of(tmp_path, SMOKE)
+    assert not proof.exists()
+    file.write_bytes(_marked(encoded([1, 2], ENV_KINDS), FORMAT))
+    with pytest.raises(ValueError, match="resume: expected the checkpoint of a training, got a broken file"):
+        kept_of(tmp_path, SMOKE)
+
+
+def test_tensors_are_kept_as_arrays() -> None:
+    """The states of networks and optimizers come back as they were, moments and step counts included."""
+    layer = torch.nn.Linear(3, 2)
+    optimizer = torch.optim.Adam(layer.parameters())
+    layer(torch.ones(3)).sum().backward()
+    optimizer.step()
+    for state in (layer.state_dict(), optimizer.state_dict(), torch.get_rng_state(), None):
+        arrays = as_arrays(state)
+        back = as_tensors(decoded(encoded(arrays, ENV_KINDS), ENV_KINDS))
+        assert encoded(as_arrays(back), ENV_KINDS) == encoded(arrays, ENV_KINDS)
+    optimizer.load_state_dict(as_tensors(as_arrays(optimizer.state_dict())))
+
+
+@pytest.mark.slow
+def test_a_checkpoint_with_other_parts_is_refused(whole: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
+    """A checkpoint that is whole, but of which a part is none of this training's, is refused with its cure."""
+    kept = read_checkpoint(whole[0] / CHECKPOINT_FILE)
+    training = Training(SMOKE, tmp_path)
+    streams = kept["draws"]["numpy"]
+    beyond = streams | {"state": streams["state"] | {"pos": 10**9}}
+    for part in (
+        {"policy": {}},
+        {"optimizer": None},
+        {"environments": {"environments": [], "masks": None}},
+        {"draws": kept["draws"] | {"numpy": beyond}},
+        {"draws": kept["draws"] | {"torch": np.zeros(3, np.uint8)}},
+    ):
+        with pytest.raises(ValueError, match="resume: expected the parts that a training saved, got 'others'"):
+            training.restore(kept | part)
+    training.close()
+
+
+def test_a_missing_gpu_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A GPU is refused where torch finds none; so are devices that are none."""
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(ValueError, match="device: expected a GPU that torch can use, got a machine with 0 of them"):
+        check_device("cuda")
+    for name in ("gpu", "mps"):
+        with pytest.raises(ValueError, match=f"device: expected cpu, cuda or cuda:0, got '{name}'"):
+            check_device(name)
+
+
+@pytest.mark.slow
+def test_a_second_ctrl_c_tells_how_to_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is interrupted at once says whether a checkpoint is there, and with which command it goes on."""
+    out = tmp_path / "run"
+
+    def interrupted(training: Training) -> bool:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Training, "run", interrupted)
+    begin = ["train", "--preset", "smoke", "--workers", "0"]
+    result = runner.invoke(app, [*begin, "--out", str(out)])
+    assert result.exit_code == 130
+    assert "Stopped before the first checkpoint: nothing was saved." in result.output
+    monkeypatch.undo()
+    result = runner.invoke(app, ["train", "--resume", str(out), "--workers", "0"])
+    assert "resume: expected the checkpoint of a training, got no such file" in str(result.exception)
+    training = Training(TrainConfig.from_mapping({"preset": "smoke"}), out)
+    training.watch.listen(lambda row: None, lambda: True)
+    training.run()
+    monkeypatch.setattr(Training, "run", interrupted)
+    result = runner.invoke(app, ["train", "--resume", str(out), "--workers", "0"])
+    assert f"Go on: vslam train --resume {out}" in result.output.replace("\n", "")
+
+
+@pytest.mark.slow
+def test_the_commands_train_go_on_evaluate_and_play(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ctrl-C saves, `--resume` ends the training, `evaluate` compares with paired seeds, `run` plays the model."""
+    out = tmp_path / "run"
+    begin = ["train", "--preset", "smoke", "--seed", "5", "--workers", "0", "--out", str(out)]
+    kept_run = Training.run
+
+    def interrupted(training: Training) -> bool:
+        tell = training.watch._tell
+        training.watch._tell = lambda row: (tell(row), os.kill(os.getpid(), signal.SIGINT))
+        return kept_run(training)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Training, "run", interrupted)
+        result = runner.invoke(app, begin)
+    assert result.exit_code == 0, result.output
+    assert "Stopped; the checkpoint holds all until here." in result.output
+    assert json.loads((out / "metrics.json").read_text())["complete"] is False
+    result = runner.invoke(app, ["train", "--resume", str(out), "--workers", "0"])
+    assert result.exit_code == 0, result.output
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["complete"] is True
+    assert metrics["decisions"] == 48
+    assert (out / "learning.png").stat().st_size > 10_000
+    assert len((out / "curves.csv").read_text().splitlines()) == 4
+    result = runner.invoke(app, ["train", "--resume", str(out), "--workers", "0"])
+    assert "This training is complete already." in result.output
+    assert json.loads((out / "metrics.json").read_text())["decisions"] == 48
+    result = runner.invoke(app, ["train", "--resume", str(out), "--steps", "96"])
+    assert "resume: expected no other options that decide the training, got ['steps']" in str(result.exception)
+
+    tried = tmp_path / "tried"
+    result = runner.invoke(app, ["evaluate", str(out), "--seeds", "2", "--first-seed", "100", "--out", str(tried)])
+    assert result.exit_code == 0, result.output
+    metrics = json.loads((tried / "metrics.json").read_text())
+    assert [line["policy"] for line in metrics["policies"]] == ["model", "random_goals", "frontier"]
+    returns = {(row["policy"], row["seed"]): row["return"] for row in metrics["trials"]}
+    for lead in metrics["leads"]:
+        gaps = [returns["model", seed] - returns[lead["over"], seed] for seed in (100, 101)]
+        assert lead["lead"] == pytest.approx(np.mean(gaps))
+        assert lead["lead_low"] <= lead["lead"] <= lead["lead_high"]
+
+    plan = tmp_path / "plan.png"
+    cv2.imwrite(str(plan), np.pad(np.full((200, 300), 255, np.uint8), 5))
+    result = runner.invoke(app, ["evaluate", str(out), "--world", str(plan), "--split", "test"])
+    assert "split: expected worlds of which there are many" in str(result.exception)
+
+    played = tmp_path / "played"
+    arguments = ["run", "--policy", str(out), "--world", "fig5", "--robots", "2", "--particles", "5", "--max-cycles"]
+    result = runner.invoke(app, [*arguments, "3", "--no-video", "--out", str(played)])
+    assert result.exit_code == 0, result.output
+    assert json.loads((played / "metrics.json").read_text())["config"]["action_type"] == "goal"
+    assert tomllib.loads((played / "environment.toml").read_text())["decision_ticks"] == SMOKE.decision_ticks == 20

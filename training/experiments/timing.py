@@ -1,0 +1,105 @@
+"""Calls timed one by one, the garbage collector off, and what the benches of times have in common."""
+
+import gc
+import os
+import platform
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from slam_backend.core.validation import FloatArray
+
+BUSY = 1.2  # load of the last minute above which another process was running
+
+
+def timing_ms(seconds: FloatArray) -> dict[str, float]:
+    """Summarise durations (n,) [s] of `calls`: their median, least, and the ends of the middle 80 % [ms]."""
+    low, median, high = (float(q) for q in np.quantile(1e3 * seconds, (0.1, 0.5, 0.9)))
+    least = float(1e3 * seconds.min())
+    return {"median_ms": median, "low_ms": low, "high_ms": high, "min_ms": least, "calls": len(seconds)}
+
+
+@contextmanager
+def no_garbage_collection() -> Iterator[None]:
+    """Collect once, then not again until the block ends: a collection falls on one call and belongs to many."""
+    was_on = gc.isenabled()
+    gc.collect()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_on:
+            gc.enable()
+
+
+def time_calls(call: Callable[[Any], Any], arguments: Sequence[Any], warm_up: int = 0) -> tuple[FloatArray, list[Any]]:
+    """Time `call(argument)` for each argument in turn, the first `warm_up` of which are not counted.
+
+    Returns:
+        Durations (n - warm_up,) [s], and what these calls returned.
+    """
+    results: list[Any] = [None] * len(arguments)
+
+    def keep(i: int) -> None:
+        results[i] = call(arguments[i])
+
+    with no_garbage_collection():
+        seconds = clock(keep, range(len(arguments)))
+    return seconds[warm_up:], results[warm_up:]
+
+
+def clock(call: Callable[[Any], Any], arguments: Sequence[Any]) -> FloatArray:
+    """Return how long each call took (n,) [s]; nothing of the results is kept."""
+    durations = np.empty(len(arguments), np.int64)
+    for i, argument in enumerate(arguments):
+        begin = time.perf_counter_ns()
+        call(argument)
+        durations[i] = time.perf_counter_ns() - begin
+    return durations / 1e9
+
+
+def run_in_turn(
+    trials: Sequence[tuple[str, Callable[[], object]]],
+    on_trial: Callable[[str], None],
+    should_stop: Callable[[], bool],
+) -> bool:
+    """Run named trials until all are done or the user stops; return whether all are done.
+
+    `on_trial` is called with the name of each trial before it begins, `should_stop` is asked before that.
+    """
+    for name, trial in trials:
+        if should_stop():
+            return False
+        on_trial(name)
+        trial()
+    return True
+
+
+def describe_machine() -> dict[str, Any]:
+    """Return the processor, its number of cores, and the load of the last minute."""
+    load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
+    return {"processor": processor(), "cores": os.cpu_count(), "load_before": load}
+
+
+def processor() -> str:
+    """Return the processor's name, as far as the system reports it."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        lines = []
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()
+
+
+def print_caveats(console: Console, result: Mapping[str, Any]) -> None:
+    """Say if the machine was busy, and if the user stopped the bench."""
+    load = result["machine"]["load_before"]
+    if load is not None and load > BUSY:
+        console.print(f"The machine was busy (load {load:.1f}): times may be too long.")
+    if not result["complete"]:
+        console.print("Stopped early: the tables hold what was timed until then.")
