@@ -119,7 +119,7 @@ def test_a_fresh_process_plays_it_without_a_learner(tmp_path: Path) -> None:
 
 
 def test_files_keep_everything(tmp_path: Path) -> None:
-    """Weights and what is told of them come back as they were."""
+    """Weights and what is said of them come back as they were."""
     weights = _weights(4)
     save_model(tmp_path / "a.npz", weights, {"steps": 7, **ABOUT})
     kept, about = load_model(tmp_path / "a.npz")
@@ -132,7 +132,7 @@ def test_files_keep_everything(tmp_path: Path) -> None:
 
 
 def test_damaged_models_are_refused(tmp_path: Path) -> None:
-    """A missing, cut, changed or foreign file, or one of another version, is told by name with its cure."""
+    """A missing, cut, changed or foreign file, or one of another version, is refused by name with its cure."""
     file = tmp_path / "model.npz"
     with pytest.raises(ValueError, match=r"model: expected a model that vslam train wrote, got no such file. Check"):
         load_model(file)

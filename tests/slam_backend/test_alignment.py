@@ -1,9 +1,9 @@
 import tracemalloc
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import pytest
+from builders.maps import D, blurred, covariances, unit
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -22,26 +22,7 @@ from slam_backend.maps.correspondences import may_suffice, mutual_nearest
 from slam_backend.maps.fusion import alignment_jacobian
 from slam_backend.maps.landmark_map import LandmarkMap, unchecked_map
 
-D = 32
 SQUARE = 30.0  # [m]
-
-
-def unit(rng: np.random.Generator, n: int) -> np.ndarray:
-    """Draw n unit descriptors."""
-    d = rng.standard_normal((n, D))
-    return d / np.linalg.norm(d, axis=1, keepdims=True)
-
-
-def blurred(rng: np.random.Generator, descriptors: np.ndarray) -> np.ndarray:
-    """Return descriptors with a noise of 0.17 in L2, of unit length again."""
-    d = descriptors + rng.standard_normal(descriptors.shape) * 0.17 / np.sqrt(D)
-    return d / np.linalg.norm(d, axis=1, keepdims=True)
-
-
-def covariances(rng: np.random.Generator, n: int, low: float, high: float) -> np.ndarray:
-    """Draw n covariances whose axes have standard deviations between `low` and `high` [m]."""
-    axes = np.linalg.qr(rng.standard_normal((n, 3, 3)))[0]
-    return np.einsum("nij,nj,nkj->nik", axes, rng.uniform(low, high, (n, 3)) ** 2, axes)
 
 
 @dataclass
@@ -336,7 +317,7 @@ def test_duplicates_do_not_kill_a_match_but_look_alikes_elsewhere_do() -> None:
 
 
 @given(st.integers(0, 2**32), st.integers(0, 12), st.integers(0, 12), st.integers(0, 4), st.booleans())
-def test_maps_that_cannot_have_enough_candidates_are_told_by_their_looks(
+def test_looks_show_which_maps_cannot_have_enough_candidates(
     seed: int, common: int, others: int, look_alikes: int, appearance: bool
 ) -> None:
     """Where looks alone say no, the maps have too few candidates; where enough landmarks are common they say yes."""
@@ -371,47 +352,3 @@ def test_twenty_thousand_landmarks_stay_within_memory() -> None:
     assert found.success
     assert len(found.inliers) == 19_000
     assert peak < 100e6
-
-
-def test_bad_input_gives_one_clear_error() -> None:
-    """Unknown methods, seeds in place of generators and descriptors of another size are refused by name."""
-    with pytest.raises(ValueError, match=r"rng: expected a numpy.random.Generator or None, got 7"):
-        align_maps(RICH, RICH, rng=7)  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match=r"method: expected one of 'ransac', 'svd', 'icp', .*, got 'magic'"):
-        align_maps(RICH, RICH, "magic")
-    narrow = replace(RICH, descriptors=RICH.descriptors[:, :5])
-    with pytest.raises(ValueError, match="map_b: expected descriptors of size 32, as in map_a, got 5"):
-        align_maps(RICH, narrow)
-
-
-@pytest.mark.parametrize(
-    ("name", "value", "message"),
-    [
-        ("descriptor_gate", 0.0, "options.descriptor_gate: expected a finite number > 0"),
-        ("descriptor_ratio", 1.5, "options.descriptor_ratio: expected a finite number > 0 and <= 1"),
-        ("appearance", 1, "options.appearance: expected a bool, got 1"),
-        ("max_ratio", 0.0, "options.max_ratio: expected"),
-        ("same_place", -1.0, "options.same_place: expected a finite number >= 0"),
-        ("min_spread", float("nan"), "options.min_spread: expected"),
-        ("min_inliers", 2, "options.min_inliers: expected an int >= 3, got 2"),
-        ("look_alikes", -1, "options.look_alikes: expected an int >= 0, got -1"),
-        ("max_samples", 0, "options.max_samples: expected an int >= 1"),
-        ("success_probability", 1.0, "options.success_probability: expected"),
-        ("position_floor", "wide", "options.position_floor: expected"),
-    ],
-)
-def test_bad_options_are_refused(name: str, value: Any, message: str) -> None:
-    """Each option is checked when it is set."""
-    with pytest.raises(ValueError, match=message):
-        replace(AlignmentOptions(), **{name: value})
-
-
-def test_alignments_refuse_contradictions() -> None:
-    """A success without a motion, and a refusal without a known reason, cannot be built."""
-    none = np.empty((0, 2), np.int64)
-    with pytest.raises(ValueError, match="tx, ty, theta: expected finite numbers"):
-        Alignment(True, "", 0.0, float("nan"), 0.0, np.eye(3), none, 0.0)
-    with pytest.raises(ValueError, match="reason: expected '' on success, else one of too few candidates"):
-        Alignment(False, "bad luck", 0.0, 0.0, 0.0, np.eye(3), none, 0.0)
-    with pytest.raises(ValueError, match=r"covariance: expected an array of shape \(3, 3\)"):
-        Alignment(True, "", 0.0, 0.0, 0.0, np.eye(2), none, 0.0)

@@ -1,10 +1,13 @@
+"""Methods of alignment find the motion among wrong matches, and refuse what is ambiguous."""
+
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from builders.kernels import python_entry
+from builders.maps import D, blurred, unit
 from hypothesis import given
 from hypothesis import strategies as st
-from python_entry import python_entry
 
 from slam_backend.geometry import between, inverse, transform_points
 from slam_backend.maps import _kernels as kernels
@@ -20,8 +23,8 @@ from slam_backend.maps.alignment import (
 )
 from slam_backend.maps.correspondences import look_alikes, num_alike
 from slam_backend.maps.landmark_map import LandmarkMap
+from slam_backend.maps.verification import recurs
 
-D = 32
 TURNED = np.array([4.0, -3.0, 2.0])
 
 
@@ -284,7 +287,7 @@ def test_mirrored_corridors_are_refused(method: str) -> None:
 
 
 def test_a_shared_cluster_makes_no_rival() -> None:
-    """Turning a small cluster by some degrees is uncertainty, not another place: nobody refuses it as ambiguous."""
+    """Turning a small cluster by some degrees is uncertainty, not another place: it is not refused as ambiguous."""
     rng = np.random.default_rng(11)
     for _ in range(10):
         a = landmark_map(rng, np.vstack([
@@ -435,7 +438,75 @@ def test_proposals_are_raw_and_need_two_candidates() -> None:
     assert off(propose_motion(a, b, "ransac", options=AlignmentOptions(min_inliers=3)), TURNED) < 1e-6
 
 
-def test_maps_that_are_not_finite_are_never_built() -> None:
-    """NaN is refused where a map is made, by name, so that no alignment meets it."""
-    with pytest.raises(ValueError, match="means: expected finite numbers"):
-        LandmarkMap([[np.nan, 0.0, 0.0]], [np.eye(3)], [[1.0, 0.0]])
+SHARED, OTHERS = 24, 80
+DOUBLE = np.array([9.0, -4.0, 1.2])  # where a constellation hangs a second time
+A_FROM_B = np.array([3.0, -7.0, 2.0])
+SIGMA = 0.03  # [m]
+
+
+def mapped(rng: np.random.Generator, points: np.ndarray, descriptors: np.ndarray) -> LandmarkMap:
+    """Return the map of a robot that has measured points with `SIGMA` and descriptors with a noise of 0.17."""
+    seen = blurred(rng, descriptors)
+    noise = SIGMA * rng.standard_normal(points.shape)
+    return LandmarkMap(points + noise, np.tile(SIGMA**2 * np.eye(3), (len(points), 1, 1)), seen)
+
+
+def maps_with_doubles(seed: int, doubles: int, scattered: bool = False) -> tuple[LandmarkMap, LandmarkMap]:
+    """Return two maps with 24 landmarks in common, of which so many have a double in map a.
+
+    Args:
+        seed: Of all draws.
+        doubles: How many have one; b has seen none of the doubles.
+        scattered: Each double hangs anywhere, at its own height; if not, all of them by one motion.
+    """
+    rng = np.random.default_rng([seed, 5])
+    size = [5.0, 4.0, 1.5]
+    points, shapes = rng.uniform(0.0, size, (SHARED, 3)), unit(rng, SHARED)
+    again = transform_points(DOUBLE, points[:doubles])
+    if scattered:
+        again[:, :2] = rng.uniform([6.0, -10.0], [16.0, 10.0], (doubles, 2))
+    own_a, own_b = (rng.uniform([-10.0, -12.0, 0.0], [0.0, 12.0, 1.5], (OTHERS, 3)) for _ in range(2))
+    map_a = mapped(
+        rng, np.concatenate([points, again, own_a]), np.concatenate([shapes, shapes[:doubles], unit(rng, OTHERS)])
+    )
+    map_b = mapped(rng, np.concatenate([points, own_b]), np.concatenate([shapes, unit(rng, OTHERS)]))
+    return map_a, map_b.moved(inverse(A_FROM_B))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_what_two_maps_share_must_not_occur_elsewhere_in_one_of_them(seed: int) -> None:
+    """Half of the shared landmarks hang a second time in one map, as a group: refused, from either side."""
+    map_a, map_b = maps_with_doubles(seed, doubles=12)
+    for pair in ((map_a, map_b), (map_b, map_a)):
+        found = align_maps(*pair)
+        assert (found.success, found.reason) == (False, "ambiguous")
+        assert found.ratio < AlignmentOptions().max_ratio  # the rival in the other map alone would not have refused it
+
+
+@pytest.mark.parametrize(("doubles", "scattered"), [(0, False), (4, False), (24, True)])
+@pytest.mark.parametrize("seed", range(5))
+def test_single_doubles_do_not_refuse_an_alignment(seed: int, doubles: int, scattered: bool) -> None:
+    """A sixth of the landmarks may recur as a group, and all of them each for itself: the motion is found."""
+    found = align_maps(*maps_with_doubles(seed, doubles, scattered))
+    assert found.success
+    np.testing.assert_allclose(found.transform, A_FROM_B, atol=0.1)
+
+
+def test_whether_a_constellation_recurs_is_the_same_in_any_frame() -> None:
+    """Moving the map changes nothing, and the double recurs as the original does."""
+    options, rows = AlignmentOptions(), np.arange(12)
+    map_a, _ = maps_with_doubles(7, doubles=12)
+    for landmarks in (map_a, map_a.moved(np.array([5.0, 2.0, -2.5]))):
+        assert recurs(landmarks, rows, SIGMA**2, options)
+        assert recurs(landmarks, rows + SHARED, SIGMA**2, options)
+        assert not recurs(landmarks, np.arange(12, SHARED), SIGMA**2, options)
+
+
+def test_a_map_in_which_all_looks_alike_tells_nothing() -> None:
+    """Among a hundred landmarks of one look at random places no constellation is said to recur."""
+    rng = np.random.default_rng(3)
+    points = rng.uniform(0.0, [20.0, 20.0, 1.5], (100, 3))
+    same = np.repeat(unit(rng, 1), 100, axis=0)
+    landmarks = LandmarkMap(points, np.tile(SIGMA**2 * np.eye(3), (100, 1, 1)), same)
+    for _ in range(5):
+        assert not recurs(landmarks, rng.choice(100, 20, replace=False), SIGMA**2, AlignmentOptions())

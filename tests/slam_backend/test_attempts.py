@@ -1,12 +1,16 @@
+"""When groups try to merge, and what an exchange costs."""
+
 import numpy as np
 import pytest
-from mapped_once import looks
-from simulated_team import SimulatedTeam
+from builders.filters import looks
+from builders.teams import SIZE, SimulatedTeam, driven
 
+from slam_backend.fastslam.reports import Findings, StepReport
 from slam_backend.maps.alignment import Alignment, AlignmentOptions
 from slam_backend.maps.landmark_map import LandmarkMap
+from slam_backend.team.communication import LANDMARK_BYTES, POSE_BYTES, ExchangeLedger
 from slam_backend.team.merge_scheduler import AttemptOptions, AttemptSchedule, PairKey, Straightening
-from slam_backend.team.team import TeamSlam
+from slam_backend.team.options import MergeOptions
 
 FIRST: PairKey = ((0,), (1, 3))
 SECOND: PairKey = ((0,), (2,))
@@ -81,7 +85,7 @@ def test_a_doubtful_pair_waits_as_long_as_that_helps() -> None:
 
 
 def test_what_a_pair_has_waited_counts_in_larger_groups() -> None:
-    """Robots that waited for each other do not begin anew in other company, others do; a snapshot knows it, too."""
+    """Robots that waited for each other go on waiting in other company, others begin; a snapshot knows it, too."""
     plan = schedule()
     assert plan.should_wait(((0,), (2,)), 4.0)
     other = schedule()
@@ -172,15 +176,10 @@ def test_a_schedule_goes_on_from_its_state() -> None:
     assert twin.choose({FIRST: pair_of([0, 1, 2, 3])}, 49) is None
 
 
-# ---------------------------------------------------------------------- in a team
-
-
 @pytest.mark.parametrize("every", [25, 10])
 def test_a_team_tries_at_most_one_pair_in_so_many_steps(every: int) -> None:
     """At most one attempt falls into each stretch of `every` steps, and its merge follows in the same step."""
-    simulation = SimulatedTeam(seed=1)
-    team = simulation.build(attempts=AttemptOptions(every=every))
-    simulation.run(team, 130)
+    _, team = driven(3, 1, 130, attempts=AttemptOptions(every=every))
     attempts = [event.step for event in team.events if event.kind == "attempt"]
     assert attempts
     assert len({step // every for step in attempts}) == len(attempts)
@@ -201,15 +200,6 @@ def test_refused_attempts_of_a_team_wait_and_need_new_candidates() -> None:
         assert gap >= wait
 
 
-def test_without_contact_nobody_tries() -> None:
-    """Groups none of whose robots are in contact do not try, however much their maps share."""
-    simulation = SimulatedTeam(seed=1)
-    team = simulation.build()
-    simulation.run(team, 110, np.eye(3, dtype=bool))
-    assert team.events == ()
-    assert team.groups == ((0,), (1,), (2,))
-
-
 def test_one_contact_between_two_groups_is_enough() -> None:
     """Only the pairs in contact try; a member in contact brings its whole group along."""
     simulation = SimulatedTeam(seed=1)
@@ -223,22 +213,6 @@ def test_one_contact_between_two_groups_is_enough() -> None:
     contacts[0, 2] = contacts[2, 0] = True
     simulation.run(team, 40, contacts)
     assert team.groups == ((0, 1, 2),)
-
-
-@pytest.mark.parametrize("name", ["every", "new_candidates", "longest_wait"])
-@pytest.mark.parametrize("value", [0, -1, 2.5, True, None])
-def test_attempt_options_are_whole_numbers_of_at_least_one(name: str, value: object) -> None:
-    """Each option names itself when it is refused."""
-    with pytest.raises(ValueError, match=rf"attempts\.{name}: expected an int >= 1, got .*Give a number of at least 1"):
-        AttemptOptions(**{name: value})  # type: ignore[arg-type]
-
-
-def test_a_lone_robot_never_tries() -> None:
-    """A team of one has no events."""
-    simulation = SimulatedTeam(num_robots=1, seed=1)
-    team: TeamSlam = simulation.build()
-    simulation.run(team, 55)
-    assert team.events == ()
 
 
 def test_a_pair_too_doubtful_to_take_waits_however_long() -> None:
@@ -270,3 +244,86 @@ def test_maps_with_too_many_pairs_for_geometry_alone_do_not_try() -> None:
     huge = LandmarkMap(means, np.tile(0.01 * np.eye(3), (101, 1, 1)), np.ones((101, 4)) / 2.0)
     assert plan.choose({FIRST: (huge, huge)}, 24) is None
     assert plan.choose({FIRST: (huge, huge), SECOND: pair_of([0, 1, 2, 3])}, 24) == SECOND
+
+
+LOOK = 4 * 13  # bytes of a descriptor of `looks`
+
+
+def counted_map(counts: dict[int, int]) -> LandmarkMap:
+    """A map of landmarks with given ids and counts."""
+    ids = np.array(list(counts))
+    n = len(ids)
+    return LandmarkMap(np.zeros((n, 3)), np.tile(np.eye(3), (n, 1, 1)), looks(ids), list(counts.values()), ids)
+
+
+def report_of(rows: tuple[int, ...], associations: list[list[int]], created: list[list[int]]) -> StepReport:
+    """A report of a joint step of the robots in some rows; what each robot's measurements became, row by row."""
+    findings = Findings.gathered(*([np.array(ids, np.int64) for ids in each] for each in (associations, created)))
+    named, made = (np.concatenate([each[row] for row in rows if row >= 0]) for each in (associations, created))
+    counts = np.sum(made >= 0), 0, np.sum(named >= 0), np.sum(named < 0)
+    return StepReport(findings, rows, *counts, ess=1.0, nis=3.0, resampled=False)
+
+
+def test_new_landmarks_are_sent_with_descriptors_and_changed_ones_without() -> None:
+    """A first exchange costs whole landmarks; a second only what is new, and what changed without its descriptor."""
+    ledger = ExchangeLedger(3)
+    ledger.record_maps(0, 2, counted_map({1: 4, 5: 2}), counted_map({7: 1}))
+    assert ledger.sent == [2 * (LANDMARK_BYTES + LOOK), 0, LANDMARK_BYTES + LOOK]
+    ledger.record_maps(0, 2, counted_map({1: 4, 5: 3, 6: 1}), counted_map({7: 1}))
+    assert ledger.sent == [3 * (LANDMARK_BYTES + LOOK) + LANDMARK_BYTES, 0, LANDMARK_BYTES + LOOK]
+
+
+def test_each_pair_of_robots_has_its_own_record_of_what_was_sent() -> None:
+    """Each pair of robots has its own record of what was sent."""
+    ledger = ExchangeLedger(3)
+    ledger.record_maps(0, 1, counted_map({1: 4}), counted_map({2: 1}))
+    ledger.record_maps(0, 2, counted_map({1: 4}), counted_map({2: 1}))
+    assert ledger.sent == [2 * (LANDMARK_BYTES + LOOK), LANDMARK_BYTES + LOOK, LANDMARK_BYTES + LOOK]
+
+
+def test_members_of_a_group_send_poses_and_the_landmarks_they_touched() -> None:
+    """Per step a robot sends its pose, each landmark it matched or made, and descriptors of those it made."""
+    ledger = ExchangeLedger(4)
+    ledger.record_step(report_of((1, 3), [[8], [4, -1, 9], [], [2]], [[8], [-1, -1, 9], [], [-1]]), 13)
+    sent = np.array([0, POSE_BYTES + 2 * LANDMARK_BYTES + LOOK, 0, POSE_BYTES + LANDMARK_BYTES])
+    np.testing.assert_array_equal(ledger.sent, sent)
+    ledger.record_step(report_of((1, 3), [[8], [4, 9], [], [2]], [[8], [-1, -1], [], [-1]]), 13)
+    sent += [0, POSE_BYTES + 2 * LANDMARK_BYTES, 0, POSE_BYTES + LANDMARK_BYTES]
+    np.testing.assert_array_equal(ledger.sent, sent)
+
+
+def test_a_robot_that_has_left_does_not_send() -> None:
+    """The joint filter goes on with those that hear each other."""
+    ledger = ExchangeLedger(3)
+    ledger.record_step(report_of((0, -1, 2), [[4], [7], [2]], [[4], [-1], [-1]]), 13)
+    assert ledger.sent == [POSE_BYTES + LANDMARK_BYTES + LOOK, 0, POSE_BYTES + LANDMARK_BYTES]
+
+
+def test_a_ledger_goes_on_from_its_state() -> None:
+    """A restored ledger counts on as the first one did, and shares nothing with it."""
+    ledger, twin = ExchangeLedger(2), ExchangeLedger(2)
+    ledger.record_maps(0, 1, counted_map({1: 4}), counted_map({2: 1}))
+    twin.set_state(ledger.get_state())
+    for one in (ledger, twin):
+        one.record_maps(0, 1, counted_map({1: 5}), counted_map({2: 1}))
+    assert twin.sent == ledger.sent == [2 * LANDMARK_BYTES + LOOK, LANDMARK_BYTES + LOOK]
+
+
+def test_robots_that_merge_send_maps_and_then_a_few_hundred_bytes_a_step() -> None:
+    """The first attempt costs both whole maps; a step of the joint filter a pose and what was seen in it."""
+    simulation = SimulatedTeam(num_robots=2, seed=1)
+    team = simulation.build(merging=MergeOptions(straighten=False))
+    for _ in range(110):
+        if team.events:
+            break
+        assert team.bytes_sent.tolist() == [0, 0]
+        simulation.run(team, 1)
+    sent = team.bytes_sent
+    assert (sent > 0).all()
+    np.testing.assert_array_equal(sent % (LANDMARK_BYTES + 4 * SIZE), 0)
+    assert team.groups == ((0, 1),)
+    simulation.run(team, 1)
+    largest = POSE_BYTES + 5 * (LANDMARK_BYTES + 4 * SIZE)
+    assert ((team.bytes_sent - sent >= POSE_BYTES) & (team.bytes_sent - sent <= largest)).all()
+    team.bytes_sent[:] = 0  # a copy
+    assert (team.bytes_sent > 0).all()

@@ -5,8 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from merged_pair import NEVER, links, merged_team
-from simulated_team import MOTION, SimulatedTeam
+from builders.teams import MOTION, NEVER, SimulatedTeam, links, merged_team
 
 from slam_backend.core.validation import FloatArray
 from slam_backend.fastslam.consistency import FALSE_ALARMS, LOW_ESS, NIS_BOUNDS, USUAL, ConsistencyTest

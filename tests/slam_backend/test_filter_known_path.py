@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from linear_world import CAMERA, measure, turn
-from stereo_world import EXACT_MOTION, StereoWorld
+from builders.linear_world import CAMERA, turn
+from builders.worlds import StereoWorld
 
 from slam_backend.core.validation import FloatArray
 from slam_backend.fastslam._kernels import YOUNG
@@ -163,27 +163,3 @@ def test_covariances_stay_positive_definite_whatever_the_noise(proposal: Any, ki
     assert np.isfinite(slam.weights).all()
     error = result.means[0] - landmark
     assert error @ np.linalg.solve(result.covariances[0], error) < 30.7  # chi^2_3 at 1 - 1e-6
-
-
-@PROPOSALS
-@pytest.mark.parametrize("num_robots", [1, 2])
-@pytest.mark.parametrize("sigma", [1e-6, 0.1])
-def test_no_noise_no_error_with_given_covariances(proposal: Any, num_robots: int, sigma: float) -> None:
-    """Exact odometry and exact points give exact poses and an exact map, however large the noise is said to be."""
-    rng = np.random.default_rng(1)
-    landmarks = rng.uniform([-5.0, -5.0, -1.0], [5.0, 5.0, 1.0], (7, 3))
-    starts = np.array([[0.0, 0.0, 0.0], [0.4, -0.3, 2.0]])[:num_robots]
-    slam = FastSlam(num_robots, 5, CAMERA, EXACT_MOTION, proposal, initial_poses=starts)
-    poses = starts.copy()
-    for _ in range(40):
-        poses = compose(poses, [0.25, 0.02, 0.3])
-        covariances = [measure(rng, pose, landmarks, sigma)[0].covariances for pose in poses]
-        points = [CAMERA.camera_from_robot((landmarks - [pose[0], pose[1], 0.0]) @ turn(pose[2])) for pose in poses]
-        frames = [Measurements(some, np.eye(7), noise) for some, noise in zip(points, covariances, strict=True)]
-        report = slam.step([[0.25, 0.02, 0.3]] * num_robots, frames, identities=[range(7)] * num_robots)
-        assert report.ess == pytest.approx(5.0)
-    result = slam.map()
-    np.testing.assert_allclose(result.means[np.argmax(result.descriptors, axis=0)], landmarks, atol=1e-9)
-    for robot in range(num_robots):
-        np.testing.assert_allclose(slam.pose(robot).mean, poses[robot], atol=1e-9)
-        assert np.abs(slam.pose(robot).covariance).max() < 1e-12

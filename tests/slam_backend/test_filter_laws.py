@@ -1,11 +1,12 @@
-"""Laws of the filter that hold exactly, whatever the noise draws."""
+"""Laws of the filter that hold exactly, whatever the noise draws, and readings at the edge of what it takes."""
 
 from typing import Any
 
 import numpy as np
 import pytest
+from builders.linear_world import measure
+from builders.worlds import EXACT_MOTION, StereoWorld
 from scipy import stats
-from stereo_world import EXACT_MOTION, StereoWorld
 
 from slam_backend.core.validation import FloatArray
 from slam_backend.fastslam.filter import FastSlam
@@ -53,21 +54,35 @@ def test_moving_the_start_moves_the_answer(proposal: Any) -> None:
 
 @PROPOSALS
 @pytest.mark.parametrize("num_robots", [1, 2])
-def test_no_noise_no_error(proposal: Any, num_robots: int) -> None:
-    """Exact odometry and exact measurements give exact poses and an exact map, associations unknown."""
+@pytest.mark.parametrize("sigma", [None, 1e-6, 0.1])
+def test_no_noise_no_error(proposal: Any, num_robots: int, sigma: float | None) -> None:
+    """Exact odometry and exact measurements give exact poses and an exact map, associations unknown.
+
+    However large the noise is said to be, by the camera or by covariances of the size `sigma` [m].
+    """
     world = StereoWorld(np.random.default_rng(1))
+
+    def seen(pose: FloatArray) -> Measurements:
+        exact = world.measure(pose, world.visible(pose), 0.0)
+        if sigma is None:
+            return exact
+        claimed, _ = measure(world.rng, pose, np.zeros((len(exact), 3)), sigma)
+        return Measurements(exact.points, exact.descriptors, claimed.covariances)
+
     starts = np.array([[0.0, 0.0, 0.0], [0.4, -0.3, 2.0]])[:num_robots]
     slam = FastSlam(num_robots, 5, world.camera, EXACT_MOTION, proposal, seed=0, initial_poses=starts, dead_zone=11.34)
     poses = starts.copy()
     for _ in range(60):
         poses = compose(poses, MOVE)
-        slam.step([MOVE] * num_robots, [world.measure(pose, world.visible(pose), 0.0) for pose in poses])
+        report = slam.step([MOVE] * num_robots, [seen(pose) for pose in poses])
+        assert report.ess == pytest.approx(5.0)
     result = slam.map()
     assert len(result) == len(world.landmarks)
     true = world.landmarks[np.argmax(result.descriptors @ world.descriptors.T, axis=1)]
     np.testing.assert_allclose(result.means, true, atol=1e-9)
     for robot in range(num_robots):
         np.testing.assert_allclose(slam.pose(robot).mean, poses[robot], atol=1e-9)
+        assert np.abs(slam.pose(robot).covariance).max() < 1e-12
 
 
 def seen_from(rng: np.random.Generator, landmark: FloatArray, pose: FloatArray, camera: StereoCamera) -> Measurements:
@@ -164,7 +179,7 @@ def test_what_k_robots_see_together_is_what_one_sees(proposal: Any) -> None:
 
 
 @PROPOSALS
-def test_points_without_appearance_may_be_told_by_names_or_by_place_alone(proposal: Any) -> None:
+def test_points_without_appearance_are_matched_by_names_or_by_place_alone(proposal: Any) -> None:
     """Descriptors of length 0 all look alike: a filter maps each point once, in bounded memory."""
     camera = StereoCamera()
     points = np.array([[0.0, 0.0, 2.0], [1.5, 0.2, 3.0]])
@@ -236,3 +251,112 @@ def test_weights_never_underflow(proposal: Any) -> None:
     assert np.isfinite(slam.state.path_log_weights).all()
     assert slam.weights.sum() == pytest.approx(1.0, abs=1e-12)
     assert 1.0 <= slam.step([None], [None]).ess <= 5.0
+
+
+FRAME = Measurements([[0.0, 0.0, 2.0], [0.5, 0.1, 3.0]], np.eye(2, 5))
+DRIVEN = [0.1, 0.0, 0.02]
+
+
+def assert_sound(slam: FastSlam) -> None:
+    """All that a filter tells is finite, weights sum to one, and covariances are positive definite."""
+    assert slam.weights.sum() == pytest.approx(1.0, abs=1e-9)
+    for robot in range(slam.num_robots):
+        assert np.isfinite(slam.particles(robot)[0]).all()
+        assert np.isfinite(slam.pose(robot).covariance).all()
+    for estimate in ("best", "mixture"):
+        result = slam.map(estimate)  # type: ignore[arg-type]
+        assert np.isfinite(result.means).all()
+        np.linalg.cholesky(result.covariances)  # raises where one is not positive definite
+
+
+@PROPOSALS
+@pytest.mark.parametrize("given", [False, True])
+def test_thousands_of_measurements_in_a_step(proposal: Any, given: bool) -> None:
+    """A frame of 3,000 points makes 3,000 landmarks, and the same frame again finds each of them."""
+    rng = np.random.default_rng(2)
+    looks = rng.normal(size=(3000, 64))
+    looks /= np.linalg.norm(looks, axis=1, keepdims=True)
+    points = rng.uniform([-4.0, -3.0, 1.0], [4.0, 3.0, 8.0], (3000, 3))
+    frame = Measurements(points, looks, np.array([1e-4 * np.eye(3)] * 3000) if given else None)
+    slam = FastSlam(2, 3, proposal=proposal)
+    first = slam.step([None, None], [frame, None], poses=[np.zeros(3), None])
+    assert (first.num_new, slam.map_size) == (3000, 3000)
+    again = slam.step([None, DRIVEN], [frame, frame], poses=[np.zeros(3), np.zeros(3)])
+    for found in again.associations:
+        np.testing.assert_array_equal(found, first.associations[0])
+    assert (again.num_new, slam.map_size) == (0, 3000)
+    assert_sound(slam)
+
+
+@PROPOSALS
+@pytest.mark.parametrize("named", [False, True])
+def test_a_landmark_at_the_camera_centre_is_one_like_others_with_given_covariances(proposal: Any, named: bool) -> None:
+    """Seen from ahead, from its very place and from beyond, it is the mean of what was measured."""
+    camera = StereoCamera(mount=(0.2, -0.1, 0.3))
+    rng = np.random.default_rng(3)
+    slam = FastSlam(1, 4, camera, proposal=proposal)
+    seen = []
+    for ahead in (2.0, 1.0, 0.0, 0.0, -0.5, -2.0):
+        point = np.array([0.0, 0.0, ahead]) + (0.05 * rng.standard_normal(3) if ahead else 0.0)
+        frame = Measurements([point], np.eye(1, 5), 0.0025 * np.eye(3)[None])
+        slam.step([None], [frame], identities=[[9]] if named else None, poses=[[-ahead, 0.0, 0.0]])
+        seen.append(camera.robot_from_camera(point) - [ahead, 0.0, 0.0])
+    result = slam.map()
+    assert len(result) == 1
+    np.testing.assert_allclose(result.means[0], np.mean(seen, axis=0), atol=1e-12)
+    np.testing.assert_allclose(result.covariances[0], 0.0025 / 6.0 * np.eye(3), atol=1e-15)
+    assert_sound(slam)
+
+
+@PROPOSALS
+def test_driving_through_a_landmark(proposal: Any) -> None:
+    """A robot with noisy odometry that passes through a landmark holds one landmark, near where it is."""
+    rng = np.random.default_rng(4)
+    slam = FastSlam(1, 50, proposal=proposal, seed=2)
+    for step in range(21):
+        point = np.array([0.0, 0.0, 1.0 - 0.1 * step]) + 0.02 * rng.standard_normal(3)
+        frame = Measurements([point], np.eye(1, 5), 4e-4 * np.eye(3)[None])
+        slam.step([[0.1, 0.0, 0.0] if step else None], [frame])
+        assert_sound(slam)
+    assert len(slam.map()) == 1
+    np.testing.assert_allclose(slam.map("mixture").means[0], [1.0, 0.0, 0.0], atol=0.1)
+
+
+@PROPOSALS
+def test_a_landmark_at_the_camera_centre_cannot_be_seen_by_the_camera(proposal: Any) -> None:
+    """What the camera model says of it is undefined: a stereo frame leaves it alone, even if the caller names it."""
+    slam = FastSlam(1, 4, proposal=proposal)
+    noise = 0.0025 * np.eye(3)[None]
+    slam.step([None], [Measurements(np.zeros((1, 3)), np.eye(1, 5), noise)], identities=[[9]])
+    before = slam.map()
+    for names in ([[9]], None):
+        slam.step([None], [Measurements([[0.0, 0.0, 2.0]], np.eye(1, 5))], identities=names)
+        assert_sound(slam)
+    after = slam.map()
+    at = int(np.flatnonzero(after.ids == before.ids[0])[0])  # type: ignore[index]
+    np.testing.assert_array_equal(after.means[at], before.means[0])
+    np.testing.assert_array_equal(after.covariances[at], before.covariances[0])
+
+
+@PROPOSALS
+@pytest.mark.parametrize(
+    ("point", "noise", "move"),
+    [
+        ([0.0, 0.0, 0.05], None, DRIVEN),
+        ([500.0, -300.0, 990.0], None, DRIVEN),
+        ([9000.0, 9000.0, 9000.0], 1e12, DRIVEN),
+        ([0.1, 0.2, 3.0], 1.1e-14, DRIVEN),
+        ([0.1, 0.2, 3.0], None, [100.0, -100.0, 0.0]),
+        ([0.1, 0.2, 3.0], None, [0.0, 0.0, 3000.0]),
+        ([0.1, 0.2, 3.0], 0.01, [100.0, -100.0, 3000.0]),
+    ],
+)
+def test_extreme_readings_do_no_harm(proposal: Any, point: Any, noise: float | None, move: Any) -> None:
+    """Far points, tiny and huge covariances and long jumps, among ordinary readings, leave the filter sound."""
+    covariances = None if noise is None else noise * np.eye(3)[None]
+    extreme = Measurements([point], np.eye(1, 5), covariances)
+    slam = FastSlam(2, 6, proposal=proposal, seed=3)
+    for step in range(40):
+        odd = step % 4 == 3
+        slam.step([move if odd else DRIVEN, DRIVEN], [extreme if odd else FRAME, FRAME if odd else extreme])
+        assert_sound(slam)

@@ -5,9 +5,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from filter_contents import dense
-from small_world import SmallWorld
-from stereo_world import EXACT_MOTION
+from builders.filters import dense
+from builders.worlds import EXACT_MOTION, SmallWorld
 
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.fastslam.existence import ExistenceModel

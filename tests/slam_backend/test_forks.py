@@ -1,16 +1,14 @@
 """Robots of a group lose contact, go on with forks of the joint filter, and return."""
 
 import copy
-import pickle
 from typing import Any
 
 import numpy as np
 import pytest
-from filter_contents import contents
-from merged_pair import NEVER, links, merged_team, true_alignment
-from same_bits import assert_same
+from builders.comparison import assert_same
+from builders.filters import contents
+from builders.teams import SIZE, SimulatedTeam, check_snapshot, driven, links, merged_team, true_alignment
 from scipy import stats
-from simulated_team import SIZE, SimulatedTeam
 
 from slam_backend.fastslam.existence import ExistenceModel
 from slam_backend.fastslam.reports import LandmarksCreated
@@ -161,7 +159,7 @@ def test_a_replay_has_the_distribution_of_unbroken_contact() -> None:
 
 
 def test_a_return_is_counted_to_the_byte() -> None:
-    """The returning robot sends its odometry and measurements, and is told of what has changed since it left."""
+    """The returning robot sends its odometry and measurements, and receives what has changed since it left."""
     simulation = SimulatedTeam(num_robots=2, seed=5)
     team = merged_team(simulation, merging=FINAL)
     before = dict(zip(team.map(0).ids.tolist(), team.map(0).counts.tolist(), strict=True))
@@ -182,7 +180,7 @@ def test_a_return_is_counted_to_the_byte() -> None:
 
 
 def test_a_robot_alone_sends_nothing() -> None:
-    """While nobody hears them, no byte is counted."""
+    """While no robot hears them, no byte is counted."""
     simulation = SimulatedTeam(num_robots=2, seed=5)
     team = merged_team(simulation)
     sent = team.bytes_sent
@@ -219,14 +217,12 @@ def test_parts_that_meet_away_from_the_joint_filter_join() -> None:
     assert simulation.position_errors(team).max() < 0.3
 
 
-def test_whoever_meets_another_group_can_merge_with_it() -> None:
+def test_a_robot_that_meets_another_group_can_merge_with_it() -> None:
     """A robot away from its group merges with a third; the one left behind hears of it when it returns.
 
     Meanwhile it knows of its old group only, in that group's frame.
     """
-    simulation = SimulatedTeam(seed=3)
-    team = simulation.build(attempts=NEVER, num_particles=13)
-    simulation.run(team, 30)
+    simulation, team = driven(3, 3, 30, num_particles=13)
     team.merge(1, 2, true_alignment(simulation, team, 1, 2))
     live(team, readings_of(simulation, 5), links(3))
     live(team, readings_of(simulation, 1), links(3, (0, 2)))
@@ -244,9 +240,7 @@ def test_whoever_meets_another_group_can_merge_with_it() -> None:
 
 def test_only_those_who_keep_the_joint_filter_merge() -> None:
     """A merge through a robot with an outdated fork is refused."""
-    simulation = SimulatedTeam(seed=3)
-    team = simulation.build(attempts=NEVER, num_particles=13)
-    simulation.run(team, 10)
+    simulation, team = driven(3, 3, 10, num_particles=13)
     team.merge(0, 1, true_alignment(simulation, team, 0, 1))
     live(team, readings_of(simulation, 1), links(3))
     assert team.keepers(1) == (0,)
@@ -265,10 +259,5 @@ def test_a_team_with_forks_goes_on_from_a_snapshot_bit_for_bit(steps_before: int
     plan = [links(3, (0, 1))] * 20 + [links(3)] * 20 + [None] * 20  # type: ignore[list-item]
     for contacts in plan[: steps_before - 20]:
         live(team, readings_of(simulation, 1), contacts)
-    restored = TeamSlam(3, seed=99)
-    restored.set_state(pickle.loads(pickle.dumps(team.get_state())))
-    for contacts in plan[steps_before - 20 :]:
-        read = readings_of(simulation, 1)
-        assert_same(live(restored, read, contacts), live(team, read, contacts))
+    check_snapshot(simulation, team, plan[steps_before - 20 :])
     assert branches(team) == {(0, 1, 2)}
-    assert_same(restored.get_state(), team.get_state())

@@ -4,11 +4,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from filter_contents import dense
+from builders.filters import dense, names_of
+from builders.teams import NEVER, links
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mapped_once import names_of
-from merged_pair import NEVER, links
 
 from slam_backend.fastslam.existence import ExistenceModel
 from slam_backend.fastslam.filter import FastSlam

@@ -1,14 +1,23 @@
+"""Maps, frames of measurements and the archives that hold them."""
+
+import copy
 import dataclasses
+import pickle
+import zipfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from builders.comparison import assert_same
+from builders.damage import Trap
 from hypothesis import given
 from hypothesis import strategies as st
 
+from slam_backend.core.array_files import UnreadableArchiveError, read_arrays
 from slam_backend.geometry import compose, inverse
 from slam_backend.maps.landmark_map import FIELDS, LandmarkMap, unchecked_map
+from slam_backend.models.measurements import Measurements, TeamMeasurements
 
 N, D = 5, 7
 
@@ -24,12 +33,6 @@ def fields(seed: int = 0) -> dict[str, Any]:
         "counts": rng.integers(1, 20, N),
         "ids": rng.permutation(30)[:N],
     }
-
-
-def assert_same(one: LandmarkMap, other: LandmarkMap) -> None:
-    """Every array of both maps agrees bit for bit."""
-    for name in FIELDS:
-        np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
 
 
 def test_arrays_are_read_only_copies() -> None:
@@ -128,7 +131,7 @@ def test_damaged_files_never_load_as_another_map(tmp_path: Path) -> None:
 
 
 def test_files_of_another_kind_are_refused(tmp_path: Path) -> None:
-    """Missing files, text, foreign archives and newer versions are each refused with one clear error."""
+    """Missing files, text, foreign archives, pickles and newer versions are each refused with one clear error."""
     with pytest.raises(ValueError, match=r"path: expected a file written by LandmarkMap.save, got no such file"):
         LandmarkMap.load(tmp_path / "missing.npz")
     text, array, foreign = tmp_path / "a.txt", tmp_path / "a.npy", tmp_path / "a.npz"
@@ -138,44 +141,148 @@ def test_files_of_another_kind_are_refused(tmp_path: Path) -> None:
     for path in (text, array, foreign):
         with pytest.raises(ValueError, match="got a broken file"):
             LandmarkMap.load(path)
+    proof = tmp_path / "proof"
+    forged = fields() | {"means": np.array([Trap(proof)], dtype=object), "format": np.array("vslam landmark map")}
+    np.savez(foreign, allow_pickle=True, **forged | {"version": np.array(1)})
+    with pytest.raises(ValueError, match="got a broken file"):
+        LandmarkMap.load(foreign)
+    assert not proof.exists()
     newer = fields() | {"format": np.array("vslam landmark map"), "version": np.array(2)}
     np.savez(foreign, **newer)
     with pytest.raises(ValueError, match="expected 'vslam landmark map' version 1, got 'vslam landmark map' version 2"):
         LandmarkMap.load(foreign)
 
 
-ASYMMETRIC = np.tile(np.array([[1.0, 0.5, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]), (N, 1, 1))
-
-
-@pytest.mark.parametrize(
-    ("name", "value", "message"),
-    [
-        ("means", np.zeros((N, 2)), r"means: expected an array of shape \(n, 3\), got shape \(5, 2\)"),
-        ("means", np.full((N, 3), np.nan), "means: expected finite numbers, got NaN or infinity at index"),
-        ("covariances", np.zeros((N, 2, 2)), r"covariances: expected an array of shape \(5, 3, 3\)"),
-        ("covariances", ASYMMETRIC, "covariances: expected symmetric matrices"),
-        ("covariances", np.tile(np.diag([1.0, 1.0, -0.1]), (N, 1, 1)), "expected positive semi-definite matrices"),
-        ("descriptors", np.zeros((N + 1, D)), "descriptors: expected an array of shape"),
-        ("counts", [1, 1, 0, 1, 1], "counts: expected integers >= 1"),
-        ("counts", [1, 1, 1.5, 1, 1], "counts: expected integers >= 1"),
-        ("counts", "many", "counts: expected an array of shape"),
-        ("ids", [0, 1, 2, 3, 3], "ids: expected unique ids, got a repeated id 3"),
-        ("ids", [0, 1, -1, 2, 3], "ids: expected integers >= 0"),
-    ],
-)
-def test_bad_input_gives_one_clear_error(name: str, value: Any, message: str) -> None:
-    """Each wrong field is refused by name, with what was expected and what came."""
-    with pytest.raises(ValueError, match=message):
-        LandmarkMap(**(fields() | {name: value}))
-
-
-@pytest.mark.parametrize("indices", [[5], [-1], [0, 0], [0.5], [[0]], np.ones(3, bool)])
-def test_bad_subsets_are_refused(indices: Any) -> None:
-    """Rows that do not exist, repeat or are no integers are refused."""
-    with pytest.raises(ValueError, match="indices: expected"):
-        LandmarkMap(**fields()).subset(indices)
-
-
 def test_rank_deficient_covariances_are_accepted() -> None:
     """A landmark whose height is known exactly has a singular covariance, which is no error."""
     assert len(LandmarkMap(np.zeros((1, 3)), [np.diag([1.0, 2.0, 0.0])], np.ones((1, D)))) == 1
+
+
+POINTS = [[0.0, 0.1, 2.0], [1.0, 0.0, 3.0]]
+LOOKS = np.eye(2, 5, dtype=np.float32)
+
+
+def test_frames_share_no_memory_and_cannot_be_written() -> None:
+    """The arrays are copies and read-only, so a caller cannot change what a filter has accepted."""
+    points = np.array(POINTS)
+    frame = Measurements(points, LOOKS, np.tile(np.eye(3), (2, 1, 1)))
+    points[:] = 9.0
+    np.testing.assert_array_equal(frame.points, POINTS)
+    for array in (frame.points, frame.descriptors, frame.covariances):
+        assert array is not None
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 0.0
+    assert (len(frame), frame.points.dtype, frame.descriptors.dtype) == (2, np.float64, np.float32)
+
+
+def test_copies_cannot_be_written_either() -> None:
+    """Be they deep or from a file, of a frame or of one cut out of a team's: what was found of them stays so."""
+    frame = Measurements(POINTS, LOOKS, np.tile(np.eye(3), (2, 1, 1)))
+    team = TeamMeasurements(np.array(POINTS), LOOKS.copy(), np.array([1, 2]))
+    for one in (frame, team.of_each()[1]):
+        for other in (copy.copy(one), copy.deepcopy(one), pickle.loads(pickle.dumps(one))):
+            assert getattr(other, "extent", None) == getattr(one, "extent", None)
+            for name in ("points", "descriptors", "covariances"):
+                array, own = getattr(one, name, None), getattr(other, name, None)
+                np.testing.assert_array_equal(own, array)
+                assert own is None or not own.flags.writeable
+
+
+def test_nothing_seen_is_a_frame_too() -> None:
+    """An empty frame has no rows and its descriptor size."""
+    frame = Measurements.empty(11)
+    assert (len(frame), frame.points.shape, frame.descriptors.shape) == (0, (0, 3), (0, 11))
+
+
+def test_an_extent_bounds_all_points() -> None:
+    """It is tight, of frames that were cut out of a team's as well; an empty one bounds nothing."""
+    rng = np.random.default_rng(100)
+    points, looks = rng.normal(0.0, 3.0, (7, 3)), np.zeros((7, 5), np.float32)
+    frame = Measurements(points, looks)
+    assert frame.extent == (points[:, 2].min(), np.abs(points).max())
+    assert copy.deepcopy(frame).extent == frame.extent
+    assert Measurements.empty().extent == (np.inf, 0.0)
+    for part in TeamMeasurements(points, looks, np.array([3, 3, 7])).of_each():
+        assert part.extent == (part.points[:, 2].min(initial=np.inf), np.abs(part.points).max(initial=0.0))
+
+
+def test_covariances_within_the_limits_are_taken_as_they_are() -> None:
+    """A micrometre beside a centimetre in any direction is no reason for an error, nor is a frame without points."""
+    root = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
+    covariance = root @ np.diag([2e-12, 1e-4, 3e-7]) @ root.T
+    covariance = 0.5 * (covariance + covariance.T)
+    frame = Measurements(POINTS, LOOKS, [covariance] * 2)
+    np.testing.assert_array_equal(frame.covariances, [covariance] * 2)
+    assert len(Measurements(np.empty((0, 3)), np.empty((0, 5)), np.empty((0, 3, 3)))) == 0
+
+
+def header(shape: str, descr: str = "<f8") -> bytes:
+    """Return the beginning of an array's file."""
+    text = f"{{'descr': '{descr}', 'fortran_order': False, 'shape': {shape}, }}".ljust(117) + "\n"
+    return b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text.encode()
+
+
+def archive(file: Path, content: bytes, compressed: bool = False) -> Path:
+    """Write an archive of one member."""
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED if compressed else zipfile.ZIP_STORED) as out:
+        out.writestr("a.npy", content)
+    return file
+
+
+def test_archives_come_back(tmp_path: Path) -> None:
+    """Plain and compressed archives of numbers and texts are read, all of them or some."""
+    arrays = {
+        "a": np.asfortranarray(np.arange(6.0).reshape(2, 3)),
+        "b": np.array("text"),
+        "c": np.zeros((0, 3), np.int8),
+    }
+    for save in (np.savez, np.savez_compressed):
+        save(tmp_path / "x.npz", **arrays)
+        found = read_arrays(tmp_path / "x.npz")
+        assert list(found) == ["a", "b", "c"]
+        for name, array in arrays.items():
+            np.testing.assert_array_equal(found[name], array)
+            assert (found[name].dtype, found[name].flags.writeable) == (array.dtype, True)
+        assert list(read_arrays(tmp_path / "x.npz", ["b", "d"])) == ["b"]
+
+
+def test_pickles_in_archives_are_not_run(tmp_path: Path) -> None:
+    """An array of objects would be a pickle."""
+    proof = tmp_path / "proof"
+    np.savez(tmp_path / "x.npz", allow_pickle=True, a=np.array([Trap(proof)], dtype=object))
+    with pytest.raises(UnreadableArchiveError, match=r"a\.npy holds object"):
+        read_arrays(tmp_path / "x.npz")
+    assert not proof.exists()
+
+
+@pytest.mark.parametrize(
+    ("content", "compressed", "says"),
+    [
+        (header("(1000000000000,)"), False, r"says that it has the shape \(1000000000000,\)"),
+        (header("(-5,)") + bytes(40), False, "says that it has the shape"),
+        (header("(3,)") + bytes(16), False, "says that|has 16 bytes of 24"),
+        (header("(3,)") + bytes(16), True, "says that|has 16 bytes of 24"),
+        (header("(1,)", "|V8") + bytes(8), False, "holds"),
+        (b"no array at all", False, "."),
+        (header("(__import__('os').getpid(),)") + bytes(8), False, "."),
+    ],
+)
+def test_forged_arrays_are_refused(content: bytes, compressed: bool, says: str, tmp_path: Path) -> None:
+    """What a header promises and the file does not hold is refused before there is room for it."""
+    with pytest.raises(UnreadableArchiveError, match=says):
+        read_arrays(archive(tmp_path / "x.npz", content, compressed))
+
+
+def test_archives_that_unpack_to_too_much_are_refused(tmp_path: Path) -> None:
+    """Of a member that would be gigabytes nothing is unpacked, whatever its size in the file."""
+    file = tmp_path / "bomb.npz"
+    with (
+        zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as out,
+        out.open("a.npy", "w", force_zip64=True) as member,
+    ):
+        member.write(header("(150000000,)"))
+        for _ in range(1200):
+            member.write(bytes(1_000_000))
+    assert file.stat().st_size < 10_000_000
+    with pytest.raises(UnreadableArchiveError, match="unpacks to more than 1024 MiB"):
+        read_arrays(file)

@@ -2,10 +2,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from filter_contents import arrays_of, contents, dense, load_landmarks
-from hypothesis import given
-from hypothesis import strategies as st
-from mapped_once import (
+from builders.comparison import assert_same
+from builders.filters import (
     A_FROM_B,
     LANDMARKS,
     MOVE,
@@ -13,14 +11,18 @@ from mapped_once import (
     NAMES_B,
     PAIRS,
     WIDE_MOTION,
-    common_landmarks,
+    arrays_of,
+    contents,
+    dense,
     frame_of,
     known_alignment,
+    load_landmarks,
     looks,
     map_once,
     names_of,
 )
-from same_bits import assert_same
+from hypothesis import given
+from hypothesis import strategies as st
 
 from slam_backend.core.packed_symmetric import UNPACK
 from slam_backend.core.validation import IntArray
@@ -70,23 +72,10 @@ def test_inverse_alignment_carries_the_covariance_through_the_numerical_jacobian
     np.testing.assert_array_equal(turned.inliers, [[5, 2], [1, 4]])
     np.testing.assert_allclose(turned.transform, inverse(alignment.transform))
     assert turned.ratio == alignment.ratio
-
-
-@given(st.floats(-20, 20), st.floats(-20, 20), st.floats(-3.1, 3.1))
-def test_turning_an_alignment_around_twice_changes_nothing(x: float, y: float, theta: float) -> None:
-    """The inverse of the inverse is the alignment itself."""
-    alignment = Alignment(True, "", x, y, theta, np.diag([0.1, 0.2, 0.03]), np.array([[2, 5]]), 0.0)
-    again = inverse_alignment(inverse_alignment(alignment))
-    np.testing.assert_allclose(again.transform, alignment.transform, atol=1e-12)
-    np.testing.assert_allclose(again.covariance, alignment.covariance, atol=1e-9)
+    np.testing.assert_allclose(inverse_alignment(turned).transform, alignment.transform, atol=1e-12)
 
 
 # ---------------------------------------------------------------------- what a merge gives
-
-
-def test_the_fixture_s_pairs_are_the_landmarks_in_common() -> None:
-    """The pairs written by hand name the five landmarks that both filters hold."""
-    np.testing.assert_array_equal(common_landmarks(*both()), PAIRS)
 
 
 @pytest.mark.parametrize("sigma", [1e-2, 1e-4, 1e-6])
@@ -104,7 +93,10 @@ def test_the_error_of_a_merge_vanishes_with_the_noise(sigma: float) -> None:
 
 
 def test_ids_of_a_stay_and_those_of_b_are_renamed_one_to_one() -> None:
-    """Each landmark of b gets one id of the joint map, its own or that of its partner in a; a's keep theirs."""
+    """Each landmark of b gets one id of the joint map, its own or that of its partner in a; a's keep theirs.
+
+    The joint map is the union, with counts added where both saw one; no id is given a second time.
+    """
     a, b = both()
     joint, renamed = merge_filters(a, b, known_alignment(), PAIRS, np.random.default_rng(1))
     names_a, names_b, names = names_of(a), names_of(b), names_of(joint)
@@ -112,6 +104,13 @@ def test_ids_of_a_stay_and_those_of_b_are_renamed_one_to_one() -> None:
     assert sorted(renamed[:, 0]) == sorted(names_b)
     assert len(np.unique(renamed[:, 1])) == len(renamed)
     assert [names[new] for new in renamed[:, 1].tolist()] == [names_b[old] for old in renamed[:, 0].tolist()]
+    merged = joint.map()
+    held = [names[landmark] for landmark in merged.ids.tolist()]
+    assert sorted(held) == list(range(9))
+    np.testing.assert_array_equal(merged.counts, np.where(np.isin(held, NAMES_A[:5]), 2, 1))
+    used = set(names) | set(renamed.ravel().tolist())
+    report = joint.step([None, None], [new_frame(), None], identities=[np.array([11]), None])
+    assert report.created[0][0] == max(used) + 1
 
 
 def test_a_landmark_keeps_the_caller_s_name_that_either_robot_was_given() -> None:
@@ -122,48 +121,20 @@ def test_a_landmark_keeps_the_caller_s_name_that_either_robot_was_given() -> Non
     assert names_of(joint)[2] == NAMES_A[2]
 
 
-def test_every_landmark_of_either_map_is_in_the_joint_map_exactly_once() -> None:
-    """The joint map holds the union of the landmarks, with counts added where both saw one."""
-    a, b = both()
-    joint, _ = merge_filters(a, b, known_alignment(), PAIRS, np.random.default_rng(1))
-    names = names_of(joint)
-    merged = joint.map()
-    assert sorted(names[landmark] for landmark in merged.ids.tolist()) == list(range(9))
-    common = np.isin([names[landmark] for landmark in merged.ids.tolist()], NAMES_A[:5])
-    np.testing.assert_array_equal(merged.counts, np.where(common, 2, 1))
-
-
-def test_ids_given_after_a_merge_were_never_used_before() -> None:
-    """A landmark that is created after the merge gets an id that neither map used."""
-    a, b = both()
-    joint, renamed = merge_filters(a, b, known_alignment(), PAIRS, np.random.default_rng(1))
-    used = set(names_of(joint)) | set(renamed.ravel().tolist())
-    report = joint.step([None, None], [new_frame(), None], identities=[np.array([11]), None])
-    assert report.created[0][0] == max(used) + 1
-
-
 @pytest.mark.parametrize("particles", [(7, 11), (11, 7)])
-def test_a_joint_filter_has_uniform_weights_and_as_many_particles_as_the_larger(particles: tuple[int, int]) -> None:
-    """Weights after a merge are uniform, and M is the larger of the two."""
-    a, b = both(particles=particles)
-    joint, _ = merge_filters(a, b, known_alignment(), PAIRS, np.random.default_rng(1))
-    assert joint.num_particles == 11
-    assert joint.options.num_particles == 11
-    np.testing.assert_allclose(joint.weights, 1 / 11)
+@pytest.mark.parametrize("wanted", [None, 3, 25])
+def test_a_joint_filter_has_as_many_particles_as_said_or_as_the_larger(
+    particles: tuple[int, int], wanted: int | None
+) -> None:
+    """Weights after a merge are uniform, whatever M."""
+    joint, _ = merge_filters(*both(particles=particles), known_alignment(), PAIRS, np.random.default_rng(1), wanted)
+    m = wanted or 11
+    assert joint.num_particles == joint.options.num_particles == m
+    np.testing.assert_allclose(joint.weights, 1 / m)
     ids, means, covariances, counts = dense(joint)
-    assert (means.shape, covariances.shape, counts.shape) == ((9, 3, 11), (9, 6, 11), (len(ids), 11))
+    assert (means.shape, covariances.shape, counts.shape) == ((9, 3, m), (9, 6, m), (len(ids), m))
     for robot in range(2):
-        assert joint.particles(robot)[0].shape == joint.particles_from_start(robot).shape == (11, 3)
-        assert joint.particles(robot)[1].shape == (11,)
-
-
-@pytest.mark.parametrize("wanted", [3, 25])
-def test_a_joint_filter_has_as_many_particles_as_said(wanted: int) -> None:
-    """A given number of particles holds, whether it is below or above those of both filters."""
-    joint, _ = merge_filters(*both(particles=(7, 11)), known_alignment(), PAIRS, np.random.default_rng(1), wanted)
-    assert joint.num_particles == joint.options.num_particles == wanted
-    np.testing.assert_allclose(joint.weights, 1 / wanted)
-    assert joint.particles(1)[0].shape == (wanted, 3)
+        assert joint.particles(robot)[0].shape == joint.particles_from_start(robot).shape == (m, 3)
 
 
 def test_a_joint_filter_shares_no_memory_with_the_old_ones() -> None:
@@ -186,7 +157,7 @@ def test_common_landmarks_are_fused_at_each_particle_s_own_motion() -> None:
     joint, _ = merge_filters(a, b, known_alignment(), PAIRS, np.random.default_rng(1))
     motions = joint.particles(1)[0]  # b stands at its start, so its poses are the motions a_from_b
     assert np.ptp(motions, axis=0).min() > 0.05
-    map_a, map_b = a.map(), b.map()  # nobody moved: the same in all particles
+    map_a, map_b = a.map(), b.map()  # no robot moved: the same in all particles
     _, joint_means, joint_covariances, _ = dense(joint)
     scale = joint_covariances[5, 5] / map_a.covariances[5, 2, 2]  # of a landmark that only a has
     for m, motion in enumerate(motions):
@@ -252,15 +223,6 @@ def test_a_filter_without_landmarks_joins_by_the_alignment_alone(empty_first: bo
     assert np.abs(joint.pose(1).mean - A_FROM_B).max() < 1e-4
     report = joint.step([None, None], [new_frame(), None])
     assert report.num_new == 1
-
-
-def test_the_same_stream_gives_the_same_merge() -> None:
-    """A merge is a function of its arguments and of the generator's state."""
-    results = []
-    for _ in range(2):
-        a, b = both()
-        results.append(merge_filters(a, b, known_alignment(), PAIRS, np.random.default_rng(5))[0])
-    assert_same(contents(results[0]), contents(results[1]))
 
 
 def test_what_lay_in_the_memory_of_new_rows_is_never_read(monkeypatch: pytest.MonkeyPatch) -> None:

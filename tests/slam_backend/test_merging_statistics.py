@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from mapped_once import (
+from builders.filters import (
     A_FROM_B,
     LANDMARKS,
     NAMES_A,
@@ -151,7 +151,7 @@ def test_contradicting_maps_are_widened_by_what_their_covariances_do_not_explain
 def test_what_maps_contradict_each_other_by_is_added_first_and_scales_only_beyond(sigma: float, claimed: float) -> None:
     """A landmark known thirty times worse is widened by the same variance, up to 2 x (5 cm / 2)^2, and not by its own.
 
-    The added variance solves chi^2(tau^2) = 12, found here by bracketing with the motion fitted anew by a general
+    The added variance solves chi^2(tau^2) = 12, found here by bracketing with the motion fitted again by a general
     optimiser; where tau^2 would exceed (5 cm)^2, chi^2 / 12 at that value scales all covariances.
     """
     rng = np.random.default_rng(5)

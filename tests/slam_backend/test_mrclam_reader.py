@@ -1,8 +1,8 @@
-import re
 from pathlib import Path
 
 import numpy as np
 import pytest
+from builders.logs import write_mrclam
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -13,22 +13,11 @@ from slam_backend.readers.conversions import HOLD, integrate_commands
 from slam_backend.readers.mrclam import MrclamLog, RobotLog, SightingNoise, load_mrclam, steps
 from slam_backend.trajectory import dead_reckoning
 
-FILES = {
-    "Barcodes.dat": "# Subject #    Barcode #\n  1  5\n  2  14\n  7  81\n  6  63\n  9  70\n",
-    "Landmark_Groundtruth.dat": "6  0.5  -4.0  0.1  0.2\n7  1.5  2.5  0.1  0.2\n9  -3.0  0.25  0.1  0.2\n",
-    "Robot2_Odometry.dat": "# t v w\n100.0 0.5 0.0\n101.0 0.5 0.2\n102.0 0.0 0.0\n",
-    "Robot2_Measurement.dat": "100.1 63 2.0 0.1\n100.1 5 1.0 0.0\n100.9 99 1.0 0.0\n101.5 70 3.0 -0.2\n",
-    "Robot2_Groundtruth.dat": "99.0 0 0 0.5\n103.0 1 0 0.5\n103.0 1 0 0.5\n",
-    "Robot4_Odometry.dat": "100.5 0.1 0.0\r\n101.5 0.1 0.0\r\n",
-    "Robot4_Measurement.dat": "",
-}
-
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     """A log of two robots and three landmarks."""
-    for name, text in FILES.items():
-        (tmp_path / name).write_text(text, newline="")
+    write_mrclam(tmp_path)
     return tmp_path
 
 
@@ -56,44 +45,6 @@ def test_duration_counts_from_the_earliest_command(folder: Path) -> None:
     assert log.robots[1].sightings[:, 1].tolist() == [6.0]
 
 
-@pytest.mark.parametrize(
-    ("name", "text", "message"),
-    [
-        ("Barcodes.dat", None, r"expected a folder with Barcodes\.dat, got no such file\. Check '.*Barcodes\.dat'"),
-        ("Robot2_Measurement.dat", None, r"got no such file\. Check '.*Robot2_Measurement\.dat'"),
-        ("Barcodes.dat", "# nothing\n", r"expected rows \(subject barcode\), got no rows\. .*Barcodes\.dat is empty"),
-        ("Barcodes.dat", "1 5\n\n6 6.5\n", r"with a whole barcode, got '6 6\.5'\. Correct line 3 of .*Barcodes\.dat"),
-        ("Robot2_Odometry.dat", "1 2\n", r"3 numbers \(time velocity angular_velocity\), got '1 2'\. .*line 1"),
-        ("Robot2_Odometry.dat", "1 2 3\n1 2 x\n", r"got '1 2 x'\. Correct line 2"),
-        ("Robot2_Odometry.dat", "1 2 3\n2 nan 0\n", r"with finite numbers, got '2 nan 0'\. Correct line 2"),
-        ("Robot2_Odometry.dat", "1 2 inf\n", r"with finite numbers, got '1 2 inf'"),
-        (
-            "Robot2_Odometry.dat",
-            "2 0 0\n3 0 0\n1 0 0\n",
-            r"a time at most 1 s before that of a line above, got '1 0 0'\. .*3",
-        ),
-        (
-            "Robot2_Measurement.dat",
-            "9.0 63 2.0 0.1\n9.1 63 2.0 0.1\n",
-            r"since its first odometry .* from 9\.000 to 9\.1",
-        ),
-        ("Robot2_Odometry.dat", "1_0 0 0\n", r"got '1_0 0 0'"),
-        ("Robot2_Measurement.dat", "1 63 0.0 0.1\n", r"with a range > 0, got '1 63 0\.0 0\.1'"),
-        ("Robot2_Measurement.dat", "\x00\x01binary", r"expected 4 numbers \(time barcode range bearing\)"),
-        ("Robot2_Groundtruth.dat", "1 0 0\n", r"expected 4 numbers \(time x y theta\)"),
-        ("Landmark_Groundtruth.dat", "6 0 0 0 0\n", r"a position of each landmark, got no position of subject 7"),
-    ],
-)
-def test_a_damaged_log_is_refused_with_file_and_line(folder: Path, name: str, text: str | None, message: str) -> None:
-    """Each damage gets one error that names the file, the line, and what was expected there."""
-    if text is None:
-        (folder / name).unlink()
-    else:
-        (folder / name).write_text(text)
-    with pytest.raises(ValueError, match=message):
-        load_mrclam(folder)
-
-
 def test_rows_a_little_back_in_time_are_sorted(folder: Path) -> None:
     """Rows of all files are put in order of time, those of one time as in the file, and one line says which."""
     swapped = "100.0 0.5 0.0\n101.0 0.5 0.2\n100.9 0.4 0.1\n101.0 0.0 0.3\n"
@@ -111,15 +62,6 @@ def test_rows_a_little_back_in_time_are_sorted(folder: Path) -> None:
         "Sorted by time: Robot2_Odometry.dat (1 row, up to 0.100 s back), Robot2_Measurement.dat (2 rows, up to 0.100 s"
         " back), Robot2_Groundtruth.dat (1 row, up to 0.100 s back).",
     )
-
-
-def test_a_jump_back_is_measured_from_the_latest_row_above(folder: Path) -> None:
-    """Small steps back that add up to more than a second are damage."""
-    (folder / "Robot2_Odometry.dat").write_text("100.0 0 0\n102.0 0 0\n101.4 0 0\n100.9 0 0\n")
-    with pytest.raises(
-        ValueError, match=r"a time at most 1 s before that of a line above, got '100\.9 0 0'\. .*line 4"
-    ):
-        load_mrclam(folder)
 
 
 def test_a_log_without_truth_is_read(folder: Path) -> None:
@@ -142,47 +84,6 @@ def test_readings_after_the_odometry_are_pointed_out(folder: Path) -> None:
         "Robot 2: no overlap of its sightings",
         "Robot 2: no overlap of its true poses",
     ]
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"robots": (2, 6)}, r"robots: expected different numbers from 1 to 5, got \(2, 6\)"),
-        ({"robots": (2, 2)}, r"robots: expected different numbers"),
-        ({"robots": ()}, r"robots: expected different numbers"),
-        ({"robots": (3,)}, r"got no such file\. Check '.*Robot3_Odometry\.dat'"),
-        ({"duration": 0.0}, r"duration: expected a finite number > 0, got 0\.0"),
-        ({"duration": float("nan")}, r"duration: expected a finite number > 0, got nan"),
-    ],
-)
-def test_bad_arguments_are_named(folder: Path, arguments: dict[str, object], message: str) -> None:
-    """An argument that makes no sense is refused by name."""
-    with pytest.raises(ValueError, match=message):
-        load_mrclam(folder, **arguments)  # type: ignore[arg-type]
-
-
-def test_a_missing_folder_is_named(tmp_path: Path) -> None:
-    """No folder, and a folder without any robot, are told apart."""
-    with pytest.raises(ValueError, match=re.escape(f"got no such folder. Check {str(tmp_path / 'none')!r}")):
-        load_mrclam(tmp_path / "none")
-    with pytest.raises(ValueError, match=r"got no odometry of any robot\. Check '.*Robot1_Odometry\.dat'"):
-        load_mrclam(tmp_path)
-
-
-@given(st.binary(max_size=60))
-def test_any_bytes_give_a_log_or_the_projects_error(tmp_path_factory: pytest.TempPathFactory, noise: bytes) -> None:
-    """Whatever stands in a file, the parser returns finite rows in order or refuses in the project's own form."""
-    folder = tmp_path_factory.mktemp("log")
-    for name, text in FILES.items():
-        (folder / name).write_text(text, newline="")
-    (folder / "Robot2_Odometry.dat").write_bytes(b"1.0 0.5 0.25\n" + noise)
-    try:
-        commands = load_mrclam(folder).robots[0].commands
-    except ValueError as error:
-        assert str(error).startswith("path: expected 3 numbers")  # noqa: PT017   # either outcome is lawful
-    else:
-        assert np.isfinite(commands).all()
-        assert (np.diff(commands[:, 0]) >= 0.0).all()
 
 
 rows = st.lists(
@@ -219,14 +120,6 @@ def test_arcs_are_those_of_many_small_steps(drawn: list[tuple[float, float, floa
     euler = [np.sum(v * np.cos(heading)), np.sum(v * np.sin(heading)), np.sum(w)]
     error = between(integrate_commands(commands, [time])[0], euler)
     np.testing.assert_allclose(error, 0.0, atol=2e-2)  # at each command one small step is cut anywhere
-
-
-def test_a_stale_command_no_longer_moves_the_robot() -> None:
-    """After `HOLD` seconds without a new command the robot stands; before the first it stands too."""
-    commands = [[10.0, 1.0, 0.0], [20.0, 2.0, 0.0]]
-    poses = integrate_commands(commands, [5.0, 10.0, 11.0, 15.0, 20.5, 99.0])
-    assert poses[:, 0].tolist() == [0.0, 0.0, 1.0, 1.5, 2.5, 4.5]
-    assert not poses[:, 1:].any()
 
 
 def _log(sightings: list[tuple[float, int, float, float]], commands: list[list[float]]) -> MrclamLog:
@@ -284,23 +177,6 @@ def test_of_two_sightings_of_one_landmark_in_a_step_the_first_counts() -> None:
     frame = steps(log, dt=0.2).robots[0].measurements[0]
     assert frame is not None
     assert frame.points[:, 2].tolist() == [1.0, 2.0]
-
-
-@pytest.mark.parametrize(
-    ("dt", "message"),
-    [(0.0, "dt: expected a finite number > 0"), (1e-9, r"dt: expected at most 1,000,000 steps, got .*Take longer")],
-)
-def test_bad_steps_are_refused(dt: float, message: str) -> None:
-    """Steps of no length, or too many of them, are refused."""
-    with pytest.raises(ValueError, match=message):
-        steps(_log([], [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]), dt)
-
-
-@pytest.mark.parametrize("name", ["range_floor", "bearing", "height"])
-def test_every_direction_needs_noise(name: str) -> None:
-    """A direction without noise would make a covariance singular."""
-    with pytest.raises(ValueError, match=rf"sensor\.{name}: expected a finite number > 0, got 0\.0"):
-        SightingNoise(**{name: 0.0})
 
 
 @pytest.mark.slow

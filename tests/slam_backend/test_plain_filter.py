@@ -1,14 +1,12 @@
 """Laws of the plain filter that need no other filter to be checked."""
 
-from typing import Any
-
 import numpy as np
 import pytest
+from builders.worlds import StereoWorld
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy import stats
-from stereo_world import StereoWorld
 
 from slam_backend.core.validation import FloatArray
 from slam_backend.fastslam.options import FilterOptions
@@ -19,7 +17,6 @@ from slam_backend.models.odometry import OdometryModel
 from slam_backend.reference import PlainFastSlam
 from slam_backend.reference.fastslam2 import pose_given, refine
 from slam_backend.reference.measurement_model import Frame, Landmark
-from slam_backend.reference.particles import settled
 from slam_backend.reference.pose_gaussian import PoseBelief, WhitenedPose, lower_root, turn_about_vertical
 
 CAMERA = StereoCamera(mount=(0.3, -0.2, 0.5))
@@ -197,17 +194,6 @@ def test_an_update_adds_the_information_of_the_measurement(is_given: bool) -> No
         assert landmark.count == 3
 
 
-@given(ancestors=st.integers(1, 12).flatmap(lambda m: arrays(np.int64, m, elements=st.integers(0, m - 1))))
-def test_settling_keeps_every_survivor_in_its_place(ancestors: Any) -> None:
-    """Who is drawn stays; the other places are filled by ascending parent; everybody has as many copies as drawn."""
-    parents = settled(ancestors)
-    np.testing.assert_array_equal(np.sort(parents), np.sort(ancestors))
-    survivors = np.unique(ancestors)
-    np.testing.assert_array_equal(parents[survivors], survivors)
-    filled = np.delete(parents, survivors)
-    np.testing.assert_array_equal(filled, np.sort(filled))
-
-
 def blind_walk(seed: int, num_particles: int) -> tuple[PlainFastSlam, StereoWorld, FloatArray]:
     """Return a filter whose robot saw landmarks at the start and then walked a full circle blind; its true pose."""
     world = StereoWorld(np.random.default_rng(100))
@@ -260,7 +246,7 @@ def test_a_sighting_corrects_what_was_walked_blind_as_one_gaussian() -> None:
     np.testing.assert_allclose(estimates[0].covariance, estimates[1].covariance, rtol=1e-9, atol=1e-15)
 
 
-def test_a_told_pose_ends_blindness() -> None:
+def test_a_given_pose_ends_blindness() -> None:
     """A pose that the caller gives is known exactly, whatever was walked blind before, and so is what follows it."""
     slam, _, pose = blind_walk(100, 3)
     slam.step([None], [None], poses=[pose])
@@ -270,25 +256,3 @@ def test_a_told_pose_ends_blindness() -> None:
     slam.step([MOVE], [None])
     expected = PoseBelief.known(pose).moved(MOVE, slam.options.motion.sigmas(MOVE))
     np.testing.assert_allclose(slam.pose().covariance, expected.covariance, rtol=1e-9, atol=1e-15)
-
-
-def test_copies_of_a_particle_share_no_landmark() -> None:
-    """After resampling at every step no two particles hold the same object."""
-    world = StereoWorld(np.random.default_rng(100))
-    options = FilterOptions(num_particles=9, camera=world.camera, resample_threshold=1.0, resampling="multinomial")
-    slam, pose = PlainFastSlam(1, options, 100), np.zeros(3)
-    for _ in range(4):
-        pose = compose(pose, MOVE)
-        assert slam.step([MOVE], [world.measure(pose, world.visible(pose))]).resampled
-        held = [id(landmark) for particle in slam.particles for landmark in particle.landmarks.values()]
-        assert len(set(held)) == len(held) > 9
-
-
-def test_bad_input_is_refused_as_by_the_compiled_filter() -> None:
-    """The plain filter speaks of bad arguments in the same form."""
-    with pytest.raises(ValueError, match="num_robots: expected an int >= 1, got 0"):
-        PlainFastSlam(0, FilterOptions())
-    with pytest.raises(ValueError, match="odometry: expected a sequence with one entry per robot"):
-        PlainFastSlam(2, FilterOptions()).step([None], [None, None])
-    with pytest.raises(ValueError, match="estimate: expected one of 'best', 'mixture'"):
-        PlainFastSlam(1, FilterOptions()).map("worst")  # type: ignore[arg-type]

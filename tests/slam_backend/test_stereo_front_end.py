@@ -1,11 +1,14 @@
+"""From images of two eyes to points: corners, disparities, descriptors and motions."""
+
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
-from box_pairs import draw_boxes
+from builders.images import draw_boxes, paint
 from scipy.ndimage import map_coordinates
+from scipy.spatial.transform import Rotation
 
 from slam_backend.core.compilation import watch_compilation
 from slam_backend.frontend import (
@@ -14,10 +17,14 @@ from slam_backend.frontend import (
     FrontEndOptions,
     StereoFrontEnd,
     harris_corners,
+    spread_order,
     usurf_descriptors,
 )
 from slam_backend.frontend._matching_kernels import match_rows, refine
+from slam_backend.frontend.odometry import camera_motion, match_frames
+from slam_backend.geometry3d import fit_rigid, ransac_rigid, rotation_angle
 from slam_backend.models.camera import StereoCamera
+from slam_backend.models.measurements import Measurements
 
 CAMERA = StereoCamera(focal_px=300.0, baseline=0.1, width=320, height=240, max_range=8.0)
 DISPARITY = 17.3
@@ -129,43 +136,6 @@ def test_swapped_images_are_told(pair: tuple[np.ndarray, np.ndarray]) -> None:
         StereoFrontEnd(CAMERA).measure(pair[1], pair[0])
 
 
-@pytest.mark.parametrize(
-    ("image", "message"),
-    [
-        (np.zeros((240, 320, 3), np.uint8), "right: expected a grey image"),
-        (np.zeros((240, 320)), "right: expected an image of dtype uint8, got an array of dtype float64"),
-        (np.zeros((320, 240), np.uint8), r"right: expected an image of 320 x 240 px, got shape \(320, 240\)"),
-    ],
-)
-def test_bad_images_are_named(pair: tuple[np.ndarray, np.ndarray], image: np.ndarray, message: str) -> None:
-    """Colour, floats and wrong sizes are refused, and the error says which image it was."""
-    with pytest.raises(ValueError, match=message):
-        StereoFrontEnd(CAMERA).measure(pair[0], image)
-
-
-def test_there_is_no_measuring_without_a_calibration() -> None:
-    """Without a camera there are no points, and the error says where to get one."""
-    with pytest.raises(ValueError, match=r"camera: expected a StereoCamera, got None. .*calibration"):
-        StereoFrontEnd(None)  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"descriptor": "surf"}, "front_end.descriptor: expected one of 'usurf', 'sift', 'orb'"),
-        ({"corners": 100}, "front_end.corners: expected CornerOptions"),
-        ({"patch_half": 16}, "front_end.patch_half: expected an int <= 15, got 16"),
-        ({"window": 0.0}, "front_end.window: expected a finite number >= 1e-06"),
-        ({"least_correlation": 1.5}, "front_end.least_correlation: .* <= 1"),
-        ({"max_measurements": 0}, "front_end.max_measurements: expected an int >= 1"),
-    ],
-)
-def test_impossible_options_are_refused(change: dict[str, Any], message: str) -> None:
-    """The error names the option."""
-    with pytest.raises(ValueError, match=message):
-        FrontEndOptions(**change)
-
-
 def test_read_only_images_need_no_other_kernels(pair: tuple[np.ndarray, np.ndarray]) -> None:
     """Images that cannot be written are measured by the kernels that are there, and stay as they are."""
     eye = StereoFrontEnd(CAMERA)
@@ -243,3 +213,198 @@ def test_real_disparities_are_found(data_dir: Path) -> None:
     assert len(errors) > 250
     assert (errors < 2.0).mean() > 0.98
     assert np.median(errors) < 0.5
+
+
+def test_corners_follow_motions_by_fractions_of_a_pixel() -> None:
+    """Corners of boxes are found to a tenth of a pixel, but for an offset that all have and that lies inside."""
+    rng = np.random.default_rng(1)
+    grid = np.stack(np.meshgrid(np.arange(30.0, 270.0, 50.0), np.arange(30.0, 200.0, 50.0)), axis=-1).reshape(-1, 2)
+    true = grid + rng.uniform(-0.5, 0.5, grid.shape)
+    image = paint(320, 240, np.column_stack([true, true + 25.3]), np.full(len(true), 220.0))
+    found = harris_corners(image, CornerOptions(most=400)).points
+    apart = np.hypot(*(found[:, None] - true[None]).transpose(2, 0, 1))
+    errors = found[apart.argmin(axis=0)] - true
+    assert errors.std(axis=0).max() < 0.1
+    assert (np.abs(errors.mean(axis=0) - 0.85) < 0.1).all()
+
+
+def test_noise_and_flat_images_have_no_corners() -> None:
+    """Camera noise of two grey levels is no corner, nor is an empty, grey or saturated image."""
+    noise = np.random.default_rng(2).normal(128.0, 2.0, (120, 160))
+    for image in (np.rint(noise).astype(np.uint8), *(np.full((120, 160), level, np.uint8) for level in (0, 90, 255))):
+        assert len(harris_corners(image).points) == 0
+
+
+def test_corners_keep_their_distances() -> None:
+    """No two corners lie within the spacing of each other, none within the border, and responses are positive."""
+    image = np.random.default_rng(3).integers(0, 256, (97, 131), dtype=np.uint8)
+    options = CornerOptions(most=1000, spacing=5, border=9)
+    points, responses = harris_corners(image, options)
+    apart = np.abs(points[:, None] - points[None]).max(axis=2) + 100.0 * np.eye(len(points))
+    assert len(points) > 50
+    assert apart.min() > 4.0  # pixels are more than 5 apart, peaks within them less than 1 off each
+    assert points.min() >= 8.0
+    assert points[:, 0].max() < 131 - 8
+    assert points[:, 1].max() < 97 - 8
+    assert responses.min() > 0.0
+
+
+def test_equal_neighbours_give_one_corner() -> None:
+    """Of peaks that are exactly alike and within the spacing, the first one counts."""
+    image = np.zeros((60, 60), dtype=np.uint8)
+    image[28:32, 20:24] = image[28:32, 24:28] = 200  # mirrored halves of one bar
+    points = harris_corners(image, CornerOptions(spacing=8)).points
+    assert len(points) == 1
+
+
+def test_the_order_is_that_of_ranks_within_cells() -> None:
+    """`spread_order` sorts by rank within the own cell, then by quality; here checked the long way."""
+    rng = np.random.default_rng(4)
+    points, quality = rng.uniform(-50.0, 200.0, (70, 2)), rng.permutation(70).astype(float)
+    order = spread_order(points, quality, 40.0)
+    cells = [tuple(cell) for cell in np.floor(points / 40.0).astype(int)]
+    ranks = [sum(cells[j] == cells[i] and quality[j] > quality[i] for j in range(70)) for i in range(70)]
+    assert order.tolist() == sorted(range(70), key=lambda i: (ranks[i], -quality[i]))
+    assert spread_order(np.empty((0, 2)), np.empty(0), 40.0).tolist() == []
+
+
+def _motion(seed: int) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    return Rotation.random(rng=rng).as_matrix(), rng.normal(size=3)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_exact_pairs_give_the_exact_motion(seed: int) -> None:
+    """Without noise the motion is found whatever the weights, also from points of a plane; it is never a reflection."""
+    rng = np.random.default_rng(seed)
+    turn, shift = _motion(seed)
+    for flat in (1.0, 0.0):
+        b = rng.normal(size=(7, 3)) * [1.0, 2.0, flat]
+        found_turn, found_shift = fit_rigid(b @ turn.T + shift, b, rng.uniform(0.5, 2.0, 7))
+        np.testing.assert_allclose(found_turn, turn, atol=1e-12)
+        np.testing.assert_allclose(found_shift, shift, atol=1e-12)
+        assert np.linalg.det(found_turn) == pytest.approx(1.0)
+
+
+def test_it_agrees_with_scipy_on_noisy_points() -> None:
+    """About their weighted means, the rotation is that of scipy's `Rotation.align_vectors`."""
+    rng = np.random.default_rng(6)
+    turn, shift = _motion(6)
+    b, weights = rng.normal(size=(20, 3)), rng.uniform(0.2, 3.0, 20)
+    a = b @ turn.T + shift + 0.1 * rng.normal(size=(20, 3))
+    found, _ = fit_rigid(a, b, weights)
+    means = [np.average(points, axis=0, weights=weights) for points in (a, b)]
+    oracle = Rotation.align_vectors(a - means[0], b - means[1], weights)[0].as_matrix()
+    np.testing.assert_allclose(found, oracle, atol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_consensus_leaves_wrong_pairs_out(seed: int) -> None:
+    """With six of ten pairs wrong, the right ones are found, and the motion to their noise."""
+    rng = np.random.default_rng(seed)
+    turn, shift = _motion(seed)
+    b = rng.uniform(-5.0, 5.0, (100, 3))
+    a = b @ turn.T + shift + 0.01 * rng.normal(size=(100, 3))
+    a[40:] = rng.uniform(-5.0, 5.0, (60, 3))
+    fit = ransac_rigid(a, b, 0.06, rng)
+    assert fit is not None
+    assert fit.inliers[:40].sum() >= 39
+    assert fit.inliers[40:].sum() <= 1
+    assert np.linalg.norm(fit.translation - shift) < 0.01
+    assert rotation_angle(fit.rotation.T @ turn) < 0.003
+    assert 0.01 < fit.rms < 0.025
+    again = ransac_rigid(a, b, np.full(100, 0.06), np.random.default_rng(9))
+    assert again is not None
+    np.testing.assert_array_equal(again.inliers, fit.inliers)
+
+
+def test_unrelated_and_too_few_points_have_no_motion() -> None:
+    """Two pairs fix nothing, nor do triangles of different sides."""
+    rng = np.random.default_rng(1)
+    assert ransac_rigid(np.zeros((2, 3)), np.zeros((2, 3)), 0.1, rng) is None
+    a = np.diag([1.0, 2.0, 3.0])
+    assert ransac_rigid(a, 4.0 * a, 0.1, rng, iterations=5) is None
+
+
+def test_angles_of_rotations() -> None:
+    """The angle is exact where the trace alone would lose it."""
+    for angle in (0.0, 1e-9, 0.3, 3.1):
+        turn = Rotation.from_rotvec([0.0, 0.6 * angle, 0.8 * angle]).as_matrix()
+        assert rotation_angle(turn) == pytest.approx(angle, rel=1e-9, abs=1e-15)
+
+
+WIDE_CAMERA = StereoCamera(focal_px=300.0, baseline=0.2, sigma_px=0.3, sigma_disparity_px=0.2)
+
+
+def _frames(seed: int, noise: float, wrong: int = 0) -> tuple[Measurements, Measurements, np.ndarray, np.ndarray]:
+    """Return two frames of 60 points and the motion between; the last `wrong` ones are elsewhere in the second one."""
+    rng = np.random.default_rng(seed)
+    turn, shift = Rotation.from_rotvec([0.02, 0.15, -0.01]).as_matrix(), np.array([0.1, -0.03, 0.4])
+    a = np.column_stack([rng.uniform(-2.0, 2.0, (60, 2)), rng.uniform(2.0, 7.0, 60)])
+    b = (a - shift) @ turn
+    b[60 - wrong :] += rng.uniform(0.5, 1.0, (wrong, 3))
+    sigmas = noise * np.array([WIDE_CAMERA.sigma_px, WIDE_CAMERA.sigma_px, WIDE_CAMERA.sigma_disparity_px])
+    seen = [
+        WIDE_CAMERA.triangulate(WIDE_CAMERA.project(points) + sigmas * rng.standard_normal((60, 3)))
+        for points in (a, b)
+    ]
+    looks = rng.standard_normal((60, 32))
+    looks /= np.linalg.norm(looks, axis=1, keepdims=True)
+    order = rng.permutation(60)
+    return Measurements(seen[0], looks), Measurements(seen[1][order], looks[order]), turn, shift
+
+
+def test_without_noise_the_motion_is_exact() -> None:
+    """Points in another order, a quarter of them elsewhere: the motion comes out to rounding."""
+    earlier, later, turn, shift = _frames(1, 0.0, wrong=15)
+    motion = camera_motion(earlier, later, WIDE_CAMERA, 0.5, np.random.default_rng(0))
+    assert motion is not None
+    np.testing.assert_allclose(motion.rotation, turn, atol=1e-6)
+    np.testing.assert_allclose(motion.translation, shift, atol=1e-6)
+    np.testing.assert_array_equal(np.sort(motion.pairs[motion.inliers, 0]), np.arange(45))
+    heading = np.arctan2(-turn[0, 2], turn[2, 2])
+    np.testing.assert_allclose(motion.planar, [0.4, -0.1, heading], atol=1e-6)
+    assert motion.planar[2] == pytest.approx(-0.15, abs=0.01)  # Y points down: a turn about it is one to the right
+
+
+def test_reprojection_beats_points() -> None:
+    """Weighing pixels and disparities by their noise, the motion is better than that of equally weighed points."""
+    ours, theirs = [], []
+    for seed in range(12):
+        earlier, later, _, shift = _frames(seed, 1.0, wrong=10)
+        motion = camera_motion(earlier, later, WIDE_CAMERA, 0.5, np.random.default_rng(seed))
+        assert motion is not None
+        pairs = motion.pairs[motion.inliers]
+        _, plain = fit_rigid(earlier.points[pairs[:, 0]], later.points[pairs[:, 1]])
+        ours.append(np.linalg.norm(motion.translation - shift))
+        theirs.append(np.linalg.norm(plain - shift))
+    assert np.mean(ours) < 0.02
+    assert np.mean(ours) < 0.7 * np.mean(theirs)
+
+
+def test_frames_that_share_nothing_have_no_motion() -> None:
+    """Unrelated descriptors, empty frames and fewer than six pairs that agree give None."""
+    earlier, later, _, _ = _frames(3, 1.0)
+    assert camera_motion(earlier, later, WIDE_CAMERA, 0.01, np.random.default_rng(0)) is not None
+    other = Measurements(later.points, np.roll(later.descriptors, 1, axis=1))
+    assert len(match_frames(earlier, other, 0.5)) == 0
+    assert camera_motion(earlier, other, WIDE_CAMERA, 0.5, np.random.default_rng(0)) is None
+    nothing = Measurements.empty(32)
+    assert camera_motion(nothing, later, WIDE_CAMERA, 0.5, np.random.default_rng(0)) is None
+    few = Measurements(earlier.points[:5], earlier.descriptors[:5])
+    assert camera_motion(few, later, WIDE_CAMERA, 0.5, np.random.default_rng(0)) is None
+
+
+def test_partners_are_each_others_nearest() -> None:
+    """A pair counts if it is mutual and within the gate; checked against all distances."""
+    rng = np.random.default_rng(4)
+    a, b = (Measurements(rng.normal(size=(n, 3)), rng.normal(size=(n, 6))) for n in (20, 17))
+    apart = np.linalg.norm(a.descriptors[:, None] - b.descriptors[None], axis=2)
+    gate = float(np.median(apart.min(axis=1)))
+    expected = [
+        (i, int(apart[i].argmin()))
+        for i in range(20)
+        if apart[i].min() <= gate and apart[:, apart[i].argmin()].argmin() == i
+    ]
+    assert 2 < len(expected) < 20
+    assert match_frames(a, b, gate).tolist() == [list(pair) for pair in expected]

@@ -1,39 +1,230 @@
-"""An attempt of filters that smooth in slices takes some steps: their maps are straight before they align once more."""
+"""Attempts to merge: both maps are straightened and align once more, and pairs that are not sure merge on trial."""
 
 import copy
-import pickle
+import math
+from typing import Any
 
 import numpy as np
 import pytest
-from merged_pair import links
-from same_bits import assert_same
-from simulated_team import SimulatedTeam
+from builders.comparison import assert_same
+from builders.filters import contents
+from builders.teams import NEVER, SimulatedTeam, check_snapshot, driven, false_alignment, links
 
-from slam_backend.maps.alignment import align_maps
+from slam_backend.fastslam.filter import FastSlam
+from slam_backend.geometry import between, compose
+from slam_backend.maps.alignment import RIVAL_ANGLE, RIVAL_DISTANCE, AlignmentOptions, align_maps
+from slam_backend.maps.landmark_map import LandmarkMap
+from slam_backend.smoother.graph import mean_pose
 from slam_backend.smoother.options import SmoothingOptions
+from slam_backend.team import group_merging as group_changes
+from slam_backend.team import merge_attempt as trying
+from slam_backend.team.branches import restored_filter
+from slam_backend.team.communication import LANDMARK_BYTES
+from slam_backend.team.filter_merging.merging import merge_filters, motion_covariance, paired
+from slam_backend.team.group_merging import MergePlan, doubt_about
+from slam_backend.team.groups import Group
 from slam_backend.team.merge_attempt import MOST_STEPS
 from slam_backend.team.merge_scheduler import AttemptOptions
+from slam_backend.team.options import MergeOptions
 from slam_backend.team.team import TeamSlam
 
 STEPS = 80
-AT_LAST = AttemptOptions(every=STEPS)  # the first attempt comes with the last step
+AT_LAST = AttemptOptions(every=STEPS)  # the only attempt comes with the last step
+AS_IT_IS = MergeOptions(straighten=False)
+
+
+def bent_team(seed: int, attempts: AttemptOptions, **options: object) -> tuple[SimulatedTeam, TeamSlam]:
+    """Return two robots with few particles, whose maps are bent, after `STEPS` steps."""
+    return driven(2, seed, STEPS, attempts=attempts, num_particles=8, **options)
+
+
+def both_maps(team: TeamSlam) -> tuple[LandmarkMap, LandmarkMap]:
+    """Return the maps that an attempt compares."""
+    return team.map(0, "mixture"), team.map(1, "mixture")
+
+
+def straightened(slam: FastSlam) -> FastSlam:
+    """Return a copy that is straightened."""
+    copied = restored_filter(slam.get_state())
+    assert copied.rejuvenate().reason == ""
+    return copied
+
+
+def test_a_filter_that_never_rejuvenates_by_itself_can_be_rejuvenated() -> None:
+    """It finds the map that another one finds, which keeps a smoother, but for where it begins to seek."""
+    maps = []
+    for every in (None, 1000):
+        slam = bent_team(111, NEVER, rejuvenate_every=every)[1]._find(0)[0].filter
+        before = slam.map()
+        assert slam.rejuvenate().reason == ""
+        assert (slam.state.rejuvenation is None) == (every is None)
+        after = slam.map()
+        moved = after.means[np.isin(after.ids, before.ids)] - before.means[np.isin(before.ids, after.ids)]
+        assert np.abs(moved).max() > 0.01
+        maps.append(after)
+    assert_same(maps[0].ids, maps[1].ids)
+    np.testing.assert_allclose(maps[0].means, maps[1].means, atol=1e-3)
+
+
+def test_a_merge_is_that_of_straightened_maps() -> None:
+    """What is merged, and by which motion, is what both filters are after a rejuvenation."""
+    _, alone = bent_team(112, NEVER)
+    _, team = bent_team(112, AT_LAST)
+    sides = [straightened(alone._find(robot)[0].filter) for robot in range(2)]
+    rng = alone._rng
+    bent = align_maps(*both_maps(alone), rng=rng)
+    found = align_maps(sides[0].map("mixture"), sides[1].map("mixture"), rng=rng)
+    assert [event.kind for event in team.events] == ["attempt", "merge"]
+    assert_same(team.events[0].bent, bent)
+    assert_same(team.events[1].alignment, found)
+    assert_same(team.merged_maps(team.events[1]), tuple(side.map() for side in sides))
+    watch = team._find(0)[0].watches[0]
+    for side, of_side, before in zip(watch.sides, sides, watch.before, strict=True):
+        assert_same(side.trunk["filter"]["poses"], of_side.get_state()["poses"])
+        assert len(before) == len(of_side.map())
+
+
+@pytest.mark.slow
+def test_straight_maps_are_merged_more_truly() -> None:
+    """Over twelve pairs of bent maps the motions by which they are merged are off by less than 0.8 of the distance."""
+    errors = []
+    for merging in (AS_IT_IS, MergeOptions()):
+        found = []
+        for seed in range(120, 132):
+            simulation, team = bent_team(seed, AT_LAST, merging=merging)
+            off = team.events[-1].alignment.transform - simulation.true_motion(0, 1)
+            found.append(np.hypot(*off[:2]))
+        errors.append(np.array(found))
+    both = np.isfinite(errors[0]) & np.isfinite(errors[1])
+    assert np.count_nonzero(both) >= 10
+    assert np.sqrt(np.mean(errors[1][both] ** 2)) < 0.8 * np.sqrt(np.mean(errors[0][both] ** 2))
+
+
+def test_maps_that_no_longer_fit_are_not_merged() -> None:
+    """Where only the bent maps are believed the attempt is refused, with the reason of the second alignment."""
+    sigmas = []
+    for merging in (AS_IT_IS, MergeOptions()):
+        covariance = bent_team(113, AT_LAST, merging=merging)[1].events[-1].alignment.covariance
+        sigmas.append(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1]))
+    assert sigmas[0] < sigmas[1]
+    strict = AlignmentOptions(max_sigma_position=float(np.mean(sigmas)))
+    _, team = bent_team(113, AT_LAST, alignment=strict)
+    event = team.events[0]
+    assert (event.kind, event.alignment.reason) == ("attempt", "too uncertain")
+    assert event.bent is not None
+    assert event.bent.success
+    assert len(team.events) == 1
+    assert team.groups == ((0,), (1,))
+    assert not team._schedule.may_try(((0,), (1,)), STEPS)
+
+
+@pytest.mark.parametrize("every", [4, 2])
+def test_maps_that_agree_on_less_once_straight_are_not_merged(every: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A smoother that has lost its way is not believed: the attempt is refused, and the filters are as they were."""
+    _, alone = bent_team(112, NEVER)
+    original = trying.straightened
+
+    def lost(a: Group, b: Group) -> tuple[LandmarkMap, LandmarkMap]:
+        maps = original(a, b)
+        assert maps is not None
+        return maps[0].subset(np.flatnonzero(np.arange(len(maps[0])) % every)), maps[1]
+
+    monkeypatch.setattr(trying, "straightened", lost)
+    _, team = bent_team(112, AT_LAST)
+    event = team.events[0]
+    assert (len(team.events), event.alignment.reason) == (1, "too few inliers")
+    assert event.bent is not None
+    for robot in range(2):
+        assert_same(contents(team._find(robot)[0].filter), contents(alone._find(robot)[0].filter))
+
+
+def test_what_cannot_be_bent_is_merged_as_it_is() -> None:
+    """Poses that are given as exact leave nothing to smooth: the merge is that without `straighten`, bit for bit."""
+    states = []
+    for merging in (AS_IT_IS, MergeOptions()):
+        simulation = SimulatedTeam(num_robots=2, seed=114)
+        team = simulation.build(attempts=AT_LAST, num_particles=3, merging=merging)
+        for _ in range(STEPS):
+            odometry, frames = simulation.read()
+            poses = [between(start, pose) for start, pose in zip(simulation.starts, simulation.poses, strict=True)]
+            team.step(odometry, frames, poses=poses)
+        assert len(team.groups) == 1
+        assert team.events[0].bent is None
+        states.append(team.get_state() | {"merging": None})
+    assert_same(states[0], states[1])
+
+
+def test_straightened_maps_are_sent_once_more() -> None:
+    """Both speakers send all their landmarks again, without descriptors."""
+    sent = []
+    for merging in (AS_IT_IS, MergeOptions()):
+        _, team = bent_team(112, AT_LAST, merging=merging)
+        sent.append(team.bytes_sent)
+    again = [len(before) * LANDMARK_BYTES for before in team._find(0)[0].watches[0].before]
+    assert (sent[1] - sent[0]).tolist() == again
+
+
+def test_the_spread_of_motions_is_that_of_the_particles_that_a_merge_makes() -> None:
+    """It is the scatter of where the joint filter's particles let the other robot start, told before the merge."""
+    _, team = bent_team(112, NEVER)
+    a, b = (team._find(robot)[0].filter for robot in range(2))
+    alignment = align_maps(*both_maps(team), rng=np.random.default_rng(1))
+    pairs = np.column_stack([a.map().ids[alignment.inliers[:, 0]], b.map().ids[alignment.inliers[:, 1]]])
+    motion = paired(a, b, alignment, pairs, np.random.default_rng(2)).motion
+    foretold = motion_covariance(motion, alignment)
+    joint, _ = merge_filters(a, b, alignment, pairs, np.random.default_rng(2))
+    starts = joint.state.starts[1, :, : joint.num_particles].T
+    np.testing.assert_allclose(foretold, np.cov(starts.T, bias=True), atol=1e-12)
+
+
+def test_a_pair_too_uncertain_to_merge_waits_and_merges_later() -> None:
+    """Where particles differ in the motion by more than is sure the attempt is refused, until waiting helps no more."""
+    rhythm = AttemptOptions(every=20)
+    _, team = bent_team(112, rhythm, merging=MergeOptions(sure=0.0))
+    assert [event.kind for event in team.events] == ["attempt", "merge"]
+    simulation, team = bent_team(112, rhythm, merging=MergeOptions(sure=1e4))  # 0.05 mm
+    assert team.events[0].alignment.reason == "too uncertain"
+    simulation.run(team, STEPS)
+    *attempts, merge = team.events
+    reasons = [event.alignment.reason for event in attempts]
+    assert reasons.count("too uncertain") == len(reasons) - 1 >= 1
+    assert reasons[-1] == ""
+    assert merge.kind == "merge"
+    assert len(team.groups) == 1
+
+
+@pytest.mark.parametrize("how", [{}, {"merged_particles": 5}])
+def test_being_sure_leaves_no_trace(how: dict[str, Any]) -> None:
+    """Whether particles agree is only looked at: the merge is bit for bit that of a team which does not ask."""
+    states = [bent_team(112, AT_LAST, merging=MergeOptions(sure=sure, **how))[1].get_state() for sure in (0.0, 1e-6)]
+    assert_same(*({"filter": state["groups"], "rng": state["rng"]} for state in states))
+
+
+def test_maps_of_a_merge_that_is_not_watched_are_not_at_hand() -> None:
+    """Where merges are final, or nothing was merged, asking for the maps that were joined is refused."""
+    _, team = bent_team(112, AT_LAST, merging=MergeOptions(watch_steps=0))
+    for event in team.events:
+        with pytest.raises(ValueError, match=r"merge: expected a merge still watched, got 'the (attempt|merge) of"):
+            team.merged_maps(event)
+
+
 SOON = 40  # a few slices of each filter, every fourth step one
 
 
-def trying(seed: int) -> tuple[SimulatedTeam, TeamSlam]:
+def attempt_begun(seed: int) -> tuple[SimulatedTeam, TeamSlam]:
     """Return two robots in the step in which their maps, as their filters bent them, have just been found to fit."""
-    simulation = SimulatedTeam(num_robots=2, seed=seed)
     smoothing = SmoothingOptions(slice_steps=20)
-    team = simulation.build(attempts=AT_LAST, num_particles=8, rejuvenate_every=1000, smoothing=smoothing)
-    simulation.run(team, STEPS)
+    simulation, team = driven(
+        2, seed, STEPS, attempts=AT_LAST, num_particles=8, rejuvenate_every=1000, smoothing=smoothing
+    )
     assert team._schedule.straightening is not None
     assert team.events == ()
     return simulation, team
 
 
 def test_an_attempt_goes_on_when_both_maps_are_straight() -> None:
-    """In the step after the second filter has drawn its particles anew the maps align again, and merge by that."""
-    simulation, team = trying(112)
+    """In the step after the second filter has drawn new particles the maps align again, and merge by that."""
+    simulation, team = attempt_begun(112)
     bent = team._schedule.straightening
     assert bent is not None
     drawn: dict[int, int] = {}
@@ -55,21 +246,16 @@ def test_an_attempt_goes_on_when_both_maps_are_straight() -> None:
 
 def test_an_attempt_goes_on_from_a_snapshot() -> None:
     """A team restored between two slices does the same, bit for bit, as the one that went on."""
-    simulation, team = trying(115)
+    simulation, team = attempt_begun(115)
     simulation.run(team, 1)
-    state = pickle.loads(pickle.dumps(team.get_state()))
-    restored, readings = TeamSlam(2, seed=99), copy.deepcopy(simulation)
-    restored.set_state(state)
-    for report in simulation.run(team, SOON):
-        assert_same(restored.step(*readings.read()), report)
-    assert [event.kind for event in restored.events] == ["attempt", "merge"]
-    assert_same(restored.get_state(), team.get_state())
+    check_snapshot(simulation, team, [None] * SOON)
+    assert [event.kind for event in team.events] == ["attempt", "merge"]
 
 
 @pytest.mark.parametrize("apart", [MOST_STEPS // 2, MOST_STEPS])
 def test_an_attempt_outlives_contact_lost_for_a_while(apart: int) -> None:
     """Maps are straightened without contact; they align in the first step with it, unless that comes too late."""
-    simulation, team = trying(112)
+    simulation, team = attempt_begun(112)
     simulation.run(team, apart, links(2))
     assert team.events == ()
     assert (team._schedule.straightening is None) == (apart == MOST_STEPS)
@@ -80,8 +266,8 @@ def test_an_attempt_outlives_contact_lost_for_a_while(apart: int) -> None:
 
 
 def test_an_attempt_waits_for_straight_maps_no_longer_than_it_may() -> None:
-    """Filters that read nothing do not smooth: their maps are taken as they are, and nobody else waits for ever."""
-    _, team = trying(112)
+    """Filters that read nothing do not smooth: their maps are taken as they are, and no other robot waits for ever."""
+    _, team = attempt_begun(112)
     for _ in range(MOST_STEPS + 1):
         assert team.events == ()
         team.step([None, None], [None, None])
@@ -100,3 +286,101 @@ def test_only_a_smoother_that_works_in_slices_can_be_waited_for(every: int | Non
     assert not team._find(0)[0].filter.smooths_in_slices
     simulation.run(team, STEPS)
     assert [event.step for event in team.events] == [STEPS - 1] * 2
+
+
+FEW_STEPS = 60
+NEVER_SURE = 1e4  # deviations: 0.05 mm
+
+
+def planned(team: TeamSlam) -> MergePlan:
+    """Return the plan of a merge of both robots, with its particles paired."""
+    first, second = team._groups
+    found = align_maps(team.map(0, "mixture"), team.map(1, "mixture"))
+    return MergePlan.of(first, second, found).paired(MergeOptions(), np.random.default_rng(1))
+
+
+def test_a_trial_leaves_both_filters_as_they_are() -> None:
+    """It makes a joint filter of its own, and tells the motion and the doubt that this one has."""
+    _, team = driven(2, 112, FEW_STEPS, num_particles=8)
+    plan = planned(team)
+    before = [contents(slam) for slam in plan.filters]
+    trial = plan.on_trial(MergeOptions(), AlignmentOptions(), np.random.default_rng(2))
+    assert trial is not None
+    for slam, kept in zip(plan.filters, before, strict=True):
+        assert_same(contents(slam), kept)
+    tried, doubt = trial
+    assert tried.joint is not None
+    joint = tried.joint[0]
+    np.testing.assert_allclose(tried.alignment.transform, mean_pose(joint.state.starts[1, :, : joint.num_particles]))
+    assert_same(tried.alignment.inliers, plan.alignment.inliers)
+    assert 0.0 < doubt < 1.0
+
+
+def test_a_trial_whose_merge_would_be_undone_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where more landmarks have moved among each other than a merge may move, the doubt has no bound."""
+    _, team = driven(2, 112, FEW_STEPS, num_particles=8)
+    plan = planned(team)
+    for share, bounded in ((0.2, True), (0.21, False)):
+        monkeypatch.setattr(group_changes, "moved_share", lambda *_, share=share: share)
+        trial = plan.on_trial(MergeOptions(), AlignmentOptions(), np.random.default_rng(2))
+        assert trial is not None
+        assert np.isfinite(trial[1]) == bounded
+
+
+def test_a_refused_trial_leaves_no_trace() -> None:
+    """Groups and random streams are bit for bit those of a team that makes no trials."""
+    at_last = AttemptOptions(every=FEW_STEPS)
+    states = [
+        driven(
+            2,
+            112,
+            FEW_STEPS,
+            attempts=at_last,
+            num_particles=8,
+            merging=MergeOptions(sure=NEVER_SURE, least_sure=least),
+        )[1].get_state()
+        for least in (0.0, NEVER_SURE)
+    ]
+    for state in states:
+        assert [event.alignment.reason for event in state["events"]] == ["too uncertain"]
+    assert_same(*({"groups": state["groups"], "rng": state["rng"]} for state in states))
+
+
+def test_a_pair_merges_by_the_motion_of_its_trial_when_two_agree() -> None:
+    """The first trial waits; a later one is taken as it is: where the joint filter lets b start is what is reported."""
+    simulation = SimulatedTeam(num_robots=2, seed=112)
+    merging = MergeOptions(sure=NEVER_SURE, least_sure=1.0)
+    team = simulation.build(attempts=AttemptOptions(every=20), num_particles=8, merging=merging)
+    while len(team.groups) > 1 and team._step < 400:
+        simulation.run(team, 1)
+    *refused, last, merge = team.events
+    assert [event.kind for event in (last, merge)] == ["attempt", "merge"]
+    assert {event.alignment.missed for event in refused} <= {"paths", "repeat", ""}
+    assert any(event.alignment.missed == "paths" for event in refused)
+    assert merge.alignment is last.alignment
+    joint = team._groups[0].trunk.filter
+    starts = joint.state.starts[1, :, : joint.num_particles]
+    np.testing.assert_allclose(merge.alignment.transform, mean_pose(starts), atol=1e-12)
+
+
+def test_what_held_frames_leave_open_is_doubted_as_well() -> None:
+    """The doubt is that of the motion between the groups' starts: by the particles, and by draws of both frames."""
+    simulation, team = driven(2, 3, 60, num_particles=13)
+    alignment = false_alignment(simulation, team, np.zeros(3))
+    a, b = (group.trunk.filter for group in team._groups)
+    plan = MergePlan.of(*team._groups, alignment).paired(MergeOptions(), team._rng)
+    assert plan.pairing is not None
+    covariance = motion_covariance(plan.pairing.motion, alignment)
+    before = doubt_about(plan)
+
+    rng = np.random.default_rng(0)
+    frames = [np.diag([3e-2, 1e-2, 9e-3]), np.diag([1e-2, 5e-2, 4e-3])]
+    moved_a, moved_b = (rng.multivariate_normal(np.zeros(3), frame, size=100_000) for frame in frames)
+    covariance += np.cov(compose(compose(moved_a, alignment.transform), moved_b).T)
+    position, heading = math.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1]), math.sqrt(covariance[2, 2])
+
+    for slam, frame in zip((a, b), frames, strict=True):
+        slam.state.gauge_covariance[:] = frame
+    after = doubt_about(plan)
+    np.testing.assert_allclose(after, max(position / RIVAL_DISTANCE, heading / RIVAL_ANGLE), rtol=0.03)
+    assert after > 1.5 * before

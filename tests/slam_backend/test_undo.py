@@ -1,15 +1,13 @@
 """Merges are watched, and undone when the joint map contradicts them."""
 
 import copy
-import pickle
 from typing import Any
 
 import numpy as np
 import pytest
-from filter_contents import contents
-from merged_pair import NEVER, false_alignment, links, true_alignment
-from same_bits import assert_same
-from simulated_team import SimulatedTeam
+from builders.comparison import assert_same
+from builders.filters import contents
+from builders.teams import NEVER, SimulatedTeam, check_snapshot, driven, false_alignment, links, true_alignment
 
 from slam_backend.fastslam.reports import MapDropped, MergeUndone, TeamReport
 from slam_backend.geometry import inverse
@@ -40,14 +38,6 @@ def kinds(team: TeamSlam) -> list[str]:
     return [event.kind for event in team.events if event.kind != "attempt"]
 
 
-def pair_of(seed: int, steps: int = 80, **options: Any) -> tuple[SimulatedTeam, TeamSlam]:
-    """Return two robots that have driven for a while and do not try to merge by themselves."""
-    simulation = SimulatedTeam(num_robots=2, seed=seed)
-    team = simulation.build(**({"attempts": NEVER} | options))
-    simulation.run(team, steps)
-    return simulation, team
-
-
 # ---------------------------------------------------------------------- a false merge is found and taken back
 
 
@@ -55,7 +45,7 @@ def pair_of(seed: int, steps: int = 80, **options: Any) -> tuple[SimulatedTeam, 
 @pytest.mark.parametrize("seed", [101, 102])
 def test_a_forced_false_merge_is_found_and_undone(offset: Any, seed: int) -> None:
     """Within 100 steps the team finds out, and both robots know their own places again."""
-    simulation, team = pair_of(seed)
+    simulation, team = driven(2, seed)
     wrong = false_alignment(simulation, team, offset)
     team.merge(0, 1, wrong)
     reports = run_until_undone(simulation, team, 100)
@@ -68,8 +58,8 @@ def test_a_forced_false_merge_is_found_and_undone(offset: Any, seed: int) -> Non
 
 def test_after_an_undo_it_is_as_if_the_merge_had_never_been() -> None:
     """Filters, their random streams and logs are bit for bit those of a team that never merged, and stay so."""
-    simulation, team = pair_of(101)
-    other, twin = pair_of(101)
+    simulation, team = driven(2, 101)
+    other, twin = driven(2, 101)
     team.merge(0, 1, false_alignment(simulation, team, FAR))
     for report in run_until_undone(simulation, team):
         last = report
@@ -89,9 +79,7 @@ def test_after_an_undo_it_is_as_if_the_merge_had_never_been() -> None:
 
 def test_a_merge_on_top_of_a_false_one_goes_with_it() -> None:
     """Of two merges in the window the first was false: both are undone, the last first; the false pair is barred."""
-    simulation = SimulatedTeam(num_robots=3, seed=104)
-    team = simulation.build(attempts=NEVER)
-    simulation.run(team, 80)
+    simulation, team = driven(3, 104)
     other, twin = copy.deepcopy(simulation), simulation.build(attempts=NEVER)
     SimulatedTeam(num_robots=3, seed=104).run(twin, 80)
     team.merge(0, 1, false_alignment(simulation, team, FAR))
@@ -113,9 +101,7 @@ def test_a_merge_on_top_of_a_false_one_goes_with_it() -> None:
 
 def test_a_false_merge_on_top_of_a_right_one_goes_alone() -> None:
     """The last merge of a group is undone, and the earlier one, which was right, stays in force."""
-    simulation = SimulatedTeam(num_robots=3, seed=104)
-    team = simulation.build(attempts=NEVER)
-    simulation.run(team, 80)
+    simulation, team = driven(3, 104)
     team.merge(1, 2, align_maps(team.map(1, "mixture"), team.map(2, "mixture")))
     simulation.run(team, 5)
     team.merge(0, 1, false_alignment(simulation, team, FAR))
@@ -147,7 +133,7 @@ def test_a_pair_whose_merge_was_undone_is_barred_for_a_while() -> None:
 
 def test_doubts_wait_until_both_sides_are_in_contact() -> None:
     """Robots that part right after a false merge keep its snapshot, and undo it when they meet again."""
-    simulation, team = pair_of(101)
+    simulation, team = driven(2, 101)
     team.merge(0, 1, false_alignment(simulation, team, FAR))
     simulation.run(team, 260, links(2))
     assert kinds(team) == ["merge"]
@@ -159,9 +145,7 @@ def test_doubts_wait_until_both_sides_are_in_contact() -> None:
 
 def test_a_robot_that_was_away_hears_of_the_undo_on_its_return() -> None:
     """Until then it goes by its fork of the false map; then its readings are taken in by its old group's filter."""
-    simulation = SimulatedTeam(num_robots=3, seed=106)
-    team = simulation.build(attempts=NEVER)
-    simulation.run(team, 80)
+    simulation, team = driven(3, 106)
     team.merge(0, 1, align_maps(team.map(0, "mixture"), team.map(1, "mixture")))
     team.merge(0, 2, false_alignment_of_group(simulation, team))
     while kinds(team)[-1] != "undo":
@@ -187,7 +171,7 @@ def false_alignment_of_group(simulation: SimulatedTeam, team: TeamSlam) -> Any:
 
 def test_a_right_merge_is_never_in_doubt_and_then_forgotten() -> None:
     """After the window nothing of what it took to undo it is left: no snapshot, no readings, no number of a map."""
-    simulation, team = pair_of(110, merging=MergeOptions(watch_steps=40))
+    simulation, team = driven(2, 110, merging=MergeOptions(watch_steps=40))
     team.merge(0, 1, align_maps(team.map(0, "mixture"), team.map(1, "mixture")))
     reports = simulation.run(team, 39)
     assert len(team._find(0)[0].watches) == 1
@@ -206,7 +190,7 @@ def test_right_merges_are_not_undone() -> None:
     The rate of false alarms is then below 10 % with a confidence of 95 %; docs/merging.md counts far more.
     """
     for seed in range(200, 230):
-        simulation, team = pair_of(seed, steps=70, num_particles=20)
+        simulation, team = driven(2, seed, steps=70, num_particles=20)
         alignment = align_maps(team.map(0, "mixture"), team.map(1, "mixture"))
         if alignment.success:
             team.merge(0, 1, alignment)
@@ -216,7 +200,7 @@ def test_right_merges_are_not_undone() -> None:
 
 def test_merges_can_be_final() -> None:
     """With `watch_steps=0` nothing is kept and nothing undone."""
-    simulation, team = pair_of(101, merging=MergeOptions(watch_steps=0))
+    simulation, team = driven(2, 101, merging=MergeOptions(watch_steps=0))
     team.merge(0, 1, false_alignment(simulation, team, FAR))
     simulation.run(team, 60)
     assert kinds(team) == ["merge"]
@@ -245,21 +229,14 @@ def test_only_what_moves_among_the_others_has_moved() -> None:
 
 def test_a_team_goes_on_from_a_snapshot_bit_for_bit_through_an_undo() -> None:
     """A team restored while two merges are in doubt, one of them false, does the same as the one that went on."""
-    simulation = SimulatedTeam(num_robots=3, seed=104)
-    team = simulation.build(attempts=NEVER)
-    simulation.run(team, 80)
+    simulation, team = driven(3, 104)
     team.merge(0, 1, false_alignment(simulation, team, FAR))
     team.merge(0, 2, true_alignment(simulation, team, 0, 2))
     simulation.run(team, 4)
-    state = pickle.loads(pickle.dumps(team.get_state()))
-    kept, restored = copy.deepcopy(state), TeamSlam(3, seed=99)
-    restored.set_state(state)
-    readings = copy.deepcopy(simulation)
-    for report in run_until_undone(simulation, team) + simulation.run(team, 5):
-        assert_same(restored.step(*readings.read()), report)
+    twin = copy.deepcopy((simulation, team))
+    until = len(run_until_undone(*twin))
+    check_snapshot(simulation, team, [None] * (until + 5))
     assert kinds(team) == ["merge", "merge", "undo", "undo"]
-    assert_same(restored.get_state(), team.get_state())
-    assert_same(state, kept)
 
 
 # ---------------------------------------------------------------------- an undo takes its time
@@ -291,8 +268,8 @@ def taken_in(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 def test_an_undo_takes_in_few_steps_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
     """Twenty in a tick, of both sides together, while the joint filter is in force; then all is as if never merged."""
     steps = taken_in(monkeypatch)
-    simulation, team = pair_of(101, merging=UNWATCHED)
-    other, twin = pair_of(101, merging=UNWATCHED)
+    simulation, team = driven(2, 101, merging=UNWATCHED)
+    other, twin = driven(2, 101, merging=UNWATCHED)
     team.merge(0, 1, false_alignment(simulation, team, FAR))
     simulation.run(team, 30)
     other.run(twin, 30)
@@ -310,20 +287,15 @@ def test_an_undo_takes_in_few_steps_at_a_time(monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_an_undo_waits_for_contact_and_goes_on_from_a_snapshot() -> None:
-    """Sides that lose contact while an undo is under way stay as they are until they meet; a restored team likewise."""
-    simulation, team = pair_of(101, merging=UNWATCHED)
+    """Sides out of contact during an undo stay as they are until they meet; a restored team does the same."""
+    simulation, team = driven(2, 101, merging=UNWATCHED)
     team.merge(0, 1, false_alignment(simulation, team, FAR))
     simulation.run(team, 30)
     doubted(team)
     simulation.run(team, 1)
-    state, restored, again = pickle.loads(pickle.dumps(team.get_state())), TeamSlam(2), copy.deepcopy(simulation)
-    restored.set_state(state)
-    for cut in (True, False):
-        for _ in range(20 if cut else 8):
-            contacts = links(2) if cut else None
-            assert_same(restored.step(*again.read(), contacts), team.step(*simulation.read(), contacts))
-        assert kinds(team) == (["merge"] if cut else ["merge", "undo"])
-    assert_same(restored.get_state(), team.get_state())
+    reports = check_snapshot(simulation, team, [links(2)] * 20 + [None] * 8)
+    assert [i >= 20 for i, report in enumerate(reports) if report.events] == [True]
+    assert kinds(team) == ["merge", "undo"]
     assert simulation.position_errors(team).max() < 0.4
 
 
@@ -347,7 +319,7 @@ def test_a_group_in_doubt_does_not_merge() -> None:
 
 def test_a_doubt_ends_with_the_watch_of_the_filter_that_goes_on() -> None:
     """A joint filter that does not watch the merge any more does not take it back."""
-    simulation, team = pair_of(101, merging=UNWATCHED)
+    simulation, team = driven(2, 101, merging=UNWATCHED)
     team.merge(0, 1, false_alignment(simulation, team, FAR))
     simulation.run(team, 30)
     doubted(team)

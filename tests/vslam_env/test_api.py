@@ -3,48 +3,18 @@ from collections.abc import Callable
 from typing import Any
 
 import gymnasium
+import numpy as np
 import pettingzoo
 import pytest
+from builders.environments import room, small_env
 from gymnasium.utils.env_checker import check_env as gymnasium_check_env
-from small_env import room, small_env
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
 from vslam_env import ExplorationEnv, vslam_v0
+from vslam_env.solo import SoloExplorationEnv
 
 # pettingzoo.test imports connect_four in a way that pettingzoo itself deprecates
 pytestmark = pytest.mark.filterwarnings("ignore:The old environment creation API:DeprecationWarning")
-
-
-@pytest.mark.parametrize("action_type", ["continuous", "discrete", "goal"])
-@pytest.mark.parametrize("observation_type", ["dict", "flat"])
-def test_parallel_api(action_type: str, observation_type: str) -> None:
-    """PettingZoo's own test of parallel environments passes, with warnings as errors."""
-    from pettingzoo.test import parallel_api_test
-
-    parallel_api_test(small_env(action_type=action_type, observation_type=observation_type), num_cycles=12)
-
-
-@pytest.mark.parametrize("action_type", ["continuous", "discrete"])
-def test_aec_api(action_type: str) -> None:
-    """PettingZoo's own test of turn-based environments passes, with warnings as errors."""
-    from pettingzoo.test import api_test
-
-    api_test(
-        vslam_v0.env(
-            world=room(), num_robots=2, num_particles=20, max_cycles=8, action_type=action_type, observation_type="flat"
-        ),
-        num_cycles=20,
-    )
-
-
-@pytest.mark.filterwarnings("ignore:Observation is not a NumPy array")
-@pytest.mark.filterwarnings("ignore:Observation space for each agent probably should be")
-def test_aec_api_with_named_observations() -> None:
-    """The same holds for named observations and masked goals; the test only remarks that they are dicts."""
-    from pettingzoo.test import api_test
-
-    env = vslam_v0.env(world=room(), num_robots=2, num_particles=20, max_cycles=5, action_type="goal")
-    api_test(env, num_cycles=10)
 
 
 @pytest.mark.parametrize("action_type", ["continuous", "goal"])
@@ -104,3 +74,43 @@ def test_turn_based_environments_take_the_same_arguments(make: Callable[..., Any
     parameters = inspect.signature(make).parameters
     assert parameters == inspect.signature(vslam_v0.parallel_env).parameters
     assert make(room(), 2).possible_agents == ["robot_0", "robot_1"]
+
+
+def test_solo_is_the_parallel_environment_of_one_robot() -> None:
+    """The same seed and actions give the same observations, rewards and infos as the parallel environment."""
+    options = {"world": room(), "num_particles": 20, "max_cycles": 8}
+    solo = SoloExplorationEnv(**options)
+    team = vslam_v0.parallel_env(num_robots=1, **options)
+    observation, info = solo.reset(seed=4)
+    observations, infos = team.reset(seed=4)
+    ended = False
+    while not ended:
+        assert all(np.array_equal(observation[name], observations["robot_0"][name]) for name in observation)
+        assert info == infos["robot_0"]
+        action = np.array([0.5, 0.3], np.float32)
+        observation, reward, terminated, truncated, info = solo.step(action)
+        observations, rewards, _, truncations, infos = team.step({"robot_0": action})
+        assert reward == rewards["robot_0"]
+        assert (terminated, truncated) == (False, truncations["robot_0"])
+        ended = truncated
+    assert team.agents == []
+    assert (solo.config.num_robots, solo.events) == (1, ())
+    assert solo.belief() is solo.parallel.belief("robot_0")
+
+
+def test_action_masks() -> None:
+    """The masks are those of the observation, under the name that masked learners ask for."""
+    env = SoloExplorationEnv(world=room(), num_particles=20, action_type="goal")
+    observation, _ = env.reset(seed=4)
+    assert env.action_masks().dtype == np.bool_
+    assert np.array_equal(env.action_masks(), observation["action_mask"])
+
+
+def test_registered_name() -> None:
+    """Gymnasium makes it by name; pictures come through the wrappers."""
+    env = gymnasium.make("vslam_env/SoloExploration-v0", world=room(), num_particles=20, render_mode="rgb_array")
+    env.reset(seed=0)
+    frame = env.render()
+    assert isinstance(frame, np.ndarray)
+    assert frame.shape == (720, 960, 3)
+    env.close()

@@ -1,16 +1,17 @@
+"""Errors of maps and poses, and how much of the floor is seen."""
+
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from scored import scored, standing_at
-from small_env import MEETING, small_env, turning
+from builders.environments import MEETING, scored, small_env, standing_at, turning
 
 from slam_backend.core.validation import IntArray
 from slam_backend.fastslam.reports import Findings, LandmarksCreated, MapCopied, MapDropped, Renaming, TeamReport
 from slam_backend.geometry import compose, inverse, transform_points, wrap_angle
 from slam_backend.maps.landmark_map import LandmarkMap, TeamOutlines
-from slam_backend.metrics import gospa, map_error, map_rmse
-from vslam_env.evaluation.coverage import Coverage, CoverageMeter
+from slam_backend.metrics import map_error, map_rmse
+from vslam_env.evaluation.coverage import SEERS, Coverage, CoverageMeter
 from vslam_env.evaluation.map_scores import ClaimLedger
 from vslam_env.navigation import FREE, SeenGrid, TeamGrids, cell_of
 
@@ -129,45 +130,6 @@ def test_a_fused_false_landmark_stays_false() -> None:
     assert ledger.claims(0, _ids(2)).tolist() == [-1]
 
 
-def test_score_of_a_small_map() -> None:
-    """E is the number that one counts by hand: two held, one false, two missed."""
-    ledger = _ledger()
-    means = TRUTHS[[0, 1, 3]] + np.array([[0.3, 0.0, 0.0], [0.0, 0.0, 0.4], [0.0, 0.0, 0.0]])
-    score = _score(ledger, 0, _map(means, _ids(0, 1, 2)), STAY)
-    assert np.isclose(score.map_errors, np.sqrt((0.3**2 + 0.4**2 + 0.5 * (2 + 1)) / 4))
-    assert np.isclose(score.map_rmses, np.sqrt((0.3**2 + 0.4**2) / 2))
-    assert (score.map_recalls, score.map_precisions) == (0.5, 2 / 3)
-
-
-def test_score_of_nothing() -> None:
-    """An empty map misses everything; its RMSE is the cutoff."""
-    score = _score(_ledger(), 0, LandmarkMap.empty(2), STAY)
-    assert np.isclose(score.map_errors, np.sqrt(0.5))
-    assert (score.map_rmses, score.map_recalls, score.map_precisions) == (1.0, 0.0, 0.0)
-
-
-def test_duplicates_false_points_and_wrong_merges_cost() -> None:
-    """Each raises E: a second claimant, a false landmark, and a map that lies where it should not."""
-    ledger = _ledger()
-    ledger.record(_report((_ids(3, 4), _ids())), [_ids(0, -1), _ids()])
-    means = np.vstack([TRUTHS[[0, 1]], [[0.1, 0.0, 0.0], [4.0, 4.0, 0.0]]])
-    right = _score(ledger, 0, _map(means[:2], _ids(0, 1)), STAY).map_errors
-    duplicate = _score(ledger, 0, _map(means[:3], _ids(0, 1, 3)), STAY).map_errors
-    false = _score(ledger, 0, _map(means[[0, 1, 3]], _ids(0, 1, 4)), STAY).map_errors
-    wrong = _score(ledger, 0, _map(means[:2], _ids(0, 1)), np.array([1.0, 0.2, 0.1])).map_errors
-    assert right < min(duplicate, false, wrong)
-    assert np.isclose(duplicate, false)
-
-
-def test_error_agrees_with_gospa_where_landmarks_are_apart() -> None:
-    """Without duplicates and with true landmarks over 2 c apart, E equals GOSPA with its optimal assignment."""
-    ledger = _ledger()
-    rng = np.random.default_rng(3)
-    means = TRUTHS[[0, 1]] + rng.normal(0.0, 0.2, (2, 3))
-    score = _score(ledger, 0, _map(means, _ids(0, 1)), STAY)
-    assert np.isclose(score.map_errors, gospa(means, TRUTHS[COUNTABLE], cutoff=1.0).error)
-
-
 def test_scores_agree_with_the_metrics() -> None:
     """The compiled score is that of `map_error` and `map_rmse`, whatever is claimed, twice or not at all."""
     rng = np.random.default_rng(3)
@@ -187,6 +149,9 @@ def test_scores_agree_with_the_metrics() -> None:
         assert np.isclose(score.map_errors, map_error(placed, claims, ledger.true_positions, 0.8))
         assert np.isclose(score.map_rmses, matched.rmse if len(matched.matched) else 0.8)
         assert np.allclose((score.map_recalls, score.map_precisions), (matched.recall, matched.precision))
+        nothing = _score(ledger, 0, LandmarkMap.empty(2), STAY)
+        assert np.isclose(nothing.map_errors, 0.8 * np.sqrt(0.5))
+        assert (nothing.map_rmses, nothing.map_recalls, nothing.map_precisions) == (0.8, 0.0, 0.0)
         errors = np.linalg.norm(placed[matched.matched[:, 0]] - ledger.true_positions[matched.matched[:, 1]], axis=1)
         assert np.isclose(score.placed_recalls, np.count_nonzero(errors < 0.5) / len(ledger.true_positions))
 
@@ -219,23 +184,6 @@ def test_infos_agree_with_the_own_start_frame() -> None:
                 score = _score(ledger, robot, placed, STAY)
                 assert np.isclose(infos[agent]["map_error"], score.map_errors)
     assert any(event.kind == "merge" for event in env.events)
-
-
-def test_coverage_of_known_floor() -> None:
-    """Coverage is the share of floor cells that are free in some robot's grid, laid at its true start pose."""
-    centres = np.array([[x, y] for x in (1.0, 2.0, 3.0) for y in (1.0, 2.0)])
-    starts = np.array([[1.0, 1.0, 0.0], [3.0, 2.0, np.pi / 2]])
-    coverage = Coverage(CoverageMeter(centres, starts))
-    team = TeamGrids(2)
-    grids = team.grids
-    assert coverage.update(team, starts, np.empty(len(starts))) == 0.0
-    grids[0].clear_disc(STAY)
-    assert np.isclose(coverage.update(team, starts, np.empty(len(starts))), 1 / 6)
-    grids[1].clear_disc(STAY)
-    grids[1].clear_disc([0.0, 1.0, 0.0])  # one metre to the left of a robot that looks up: (2, 2)
-    row, col = cell_of([0.0, 1.0])
-    assert grids[1].cells[row, col] == FREE
-    assert np.isclose(coverage.update(team, starts, np.empty(len(starts))), 3 / 6)
 
 
 def _plain_share(centres: np.ndarray, starts: np.ndarray, grids: list[SeenGrid]) -> float:
@@ -275,3 +223,49 @@ def test_coverage_is_a_union() -> None:
     assert shares[-1] > 0.1
     assert min(np.diff(shares)) < 0.0  # walls were seen where floor had been, and a grid was restored
     assert Coverage(meter).update(team, starts, np.empty(3)) == shares[-1]
+
+
+SQUARES = np.stack(np.meshgrid(np.arange(0.1, 8.0, 0.2), np.arange(0.1, 4.0, 0.2)), -1).reshape(-1, 2)
+
+
+def test_finds_are_those_of_a_plain_count() -> None:
+    """However grids change, each cell counts once for the nearest robot, as a look at all cells every time says."""
+    rng = np.random.default_rng(2)
+    starts = rng.uniform(0.0, 6.0, (3, 3))
+    coverage, team = Coverage(CoverageMeter(SQUARES, starts)), TeamGrids(3)
+    ever, found, angles = np.zeros(len(SQUARES), np.bool_), np.zeros(3), np.linspace(-0.6, 0.6, 32)
+    for turn in range(60):
+        for grid in team.grids:
+            pose = np.append(rng.uniform(-3.0, 3.0, 2), rng.uniform(-3.0, 3.0))
+            grid.paint_scan(pose, rng.uniform(0.5, 3.0, 32), angles)
+        if turn == 30:
+            coverage.set_state(coverage.get_state())
+        positions = rng.uniform(0.0, 8.0, (3, 2))
+        said = np.empty(3)
+        share = coverage.update(team, positions, said)
+        fresh = (coverage._floor[SEERS] > 0) & ~ever
+        nearest = np.hypot(*np.moveaxis(SQUARES[:, None] - positions, -1, 0)).argmin(axis=1)
+        found += np.bincount(nearest[fresh], minlength=3) / len(SQUARES)
+        ever |= fresh
+        np.testing.assert_allclose(said, found)
+        assert share == np.mean(coverage._floor[SEERS] > 0)
+    assert ever.mean() > 0.3
+
+
+def test_parts_sum_up_and_snapshots_keep_them() -> None:
+    """Own coverage is never negative, sums over the robots to all that was covered, and goes on after a restore."""
+    weights = {"own_coverage": 1.0, "coverage": 1.0}
+    env, fresh = (small_env(max_cycles=60, reward=weights) for _ in range(2))
+    env.reset(seed=4)
+    actions = {agent: np.array([0.8, 0.3 - 0.4 * robot], np.float32) for robot, agent in enumerate(env.agents)}
+    own, risen = [], []
+    for step in range(60):
+        if step == 30:
+            fresh.set_state(env.get_state())
+        infos = env.step(actions)[4]
+        own.append([info["reward/own_coverage"] for info in infos.values()])
+        risen.append(infos["robot_0"]["reward/coverage"])
+    assert np.min(own) >= 0.0
+    assert np.sum(risen) <= np.sum(own) < 1.05 * np.sum(risen)  # cells at its rim are lost and seen again
+    later = [[info["reward/own_coverage"] for info in fresh.step(actions)[4].values()] for _ in range(30)]
+    np.testing.assert_array_equal(later, own[30:])

@@ -1,7 +1,10 @@
+"""Frontiers, and the candidates that they make."""
+
 import numpy as np
 import pytest
-from navigation_rooms import ANGLES, building, clearance, drive, in_start_frame, scan
-from python_entry import python_entry
+from builders.environments import ANGLES, building, clearance, drive, in_start_frame, scan
+from builders.kernels import python_entry
+from scipy.optimize import linear_sum_assignment
 
 from slam_backend.core.validation import FloatArray
 from slam_backend.geometry import inverse, transform_points
@@ -19,8 +22,10 @@ from vslam_env.navigation import (
     plan_path,
 )
 from vslam_env.navigation._grid_kernels import known_bounds
+from vslam_env.navigation._planning_kernels import SAME_GOAL, weigh_pairs
 from vslam_env.navigation._planning_kernels.costmap import OUTSIDE, PAD, known_box
 from vslam_env.navigation._planning_kernels.frontiers import _unseen_edges
+from vslam_env.navigation.candidate_slots import NUM_SLOTS, _of_least_total
 
 _unseen_edges, known_box = map(python_entry, (_unseen_edges, known_box))
 
@@ -194,25 +199,6 @@ def test_restored_slots_go_on_bit_by_bit() -> None:
         assert np.array_equal(value, again.get_state()[name], equal_nan=True)
 
 
-CELLS = room((1.0,))
-BAD_CALLS = [
-    (lambda: CandidateSlots().update(CELLS, (0, 0)), r"pose: expected an array of shape \(3,\)"),
-    (lambda: CandidateSlots().update(CELLS, (0, 0, np.nan)), "pose: expected finite numbers"),
-    (lambda: CandidateSlots().update(CELLS[1:], (0, 0, 0)), "cells: expected an array"),
-    (lambda: CandidateSlots().update(CELLS, (0, 0, 0), [1.0, 2.0]), r"teammates: expected finite .* shape \(k, 2\)"),
-    (lambda: CandidateSlots().features((0, 0, 0), [[np.nan, 2.0]]), "teammates: expected finite numbers"),
-    (lambda: find_frontiers(CELLS, (0, np.inf)), "start_xy: expected finite numbers"),
-    (lambda: find_frontiers(CELLS, (0, 0), ignored=np.zeros(3, bool)), "ignored: expected an array of shape"),
-]
-
-
-@pytest.mark.parametrize(("call", "message"), BAD_CALLS)
-def test_bad_input_is_refused(call, message) -> None:
-    """Each wrong argument raises one error that names it."""
-    with pytest.raises(ValueError, match=message):
-        call()
-
-
 def explore(seed: int, start: FloatArray, max_ticks: int = 2000) -> tuple[SeenGrid, CandidateSlots, FloatArray]:
     """Drive an ideal robot to the nearest candidate until none is left; return grid, slots and true path (n, 3)."""
     rng = np.random.default_rng(seed)
@@ -271,3 +257,31 @@ def test_frontiers_are_made_of_unknown_cells_beside_free_ones(corner: tuple[int,
     edges = _unseen_edges(known_box(cells, bounds), ignored, bounds[0] - PAD, bounds[1] - PAD)
     found = np.argwhere(edges) + bounds[:2] - PAD
     assert found.tolist() == np.argwhere((cells == UNKNOWN) & beside & ~ignored).tolist()
+
+
+weigh_pairs = python_entry(weigh_pairs)
+
+
+def test_pairs_that_are_clear_are_those_of_the_least_total() -> None:
+    """Whatever lies how close together; what is not clear is left to the search over all pairs."""
+    rng = np.random.default_rng(11)
+    found = {True: 0, False: 0}
+    for _ in range(400):
+        goals, places = rng.uniform(0.0, 12.0, (NUM_SLOTS, 5)), rng.uniform(0.0, 12.0, (rng.integers(0, 20), 5))
+        again = rng.random(len(places)) < 0.3
+        places[again, :2] = goals[rng.integers(0, NUM_SLOTS, again.sum()), :2] + rng.normal(0.0, 0.3, (again.sum(), 2))
+        goals[rng.random(NUM_SLOTS) < 0.5] = np.nan
+        costs = np.empty((NUM_SLOTS, len(places)))
+        is_clear = weigh_pairs(goals, places, costs)
+        apart = np.linalg.norm(goals[:, None, :2] - places[None, :, :2], axis=2)
+        expected = np.where(apart < SAME_GOAL, apart, SAME_GOAL)  # NaN is no less
+        np.testing.assert_allclose(costs, expected, rtol=1e-15)
+        slots, sources = linear_sum_assignment(expected)
+        near = expected[slots, sources] < SAME_GOAL
+        chosen = costs if is_clear else _of_least_total(costs)
+        kept = np.argwhere(chosen < SAME_GOAL)
+        np.testing.assert_array_equal(kept, np.column_stack([slots, sources])[near])
+        is_alone = [(expected < SAME_GOAL).sum(axis=axis).max(initial=0) <= 1 for axis in (0, 1)]
+        assert is_clear == all(is_alone)
+        found[is_clear] += 1
+    assert min(found.values()) > 40

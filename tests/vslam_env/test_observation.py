@@ -1,16 +1,23 @@
+"""Observations: rebuilt from readings alone, and as their page says."""
+
+import ast
 import dataclasses
+import inspect
+from functools import reduce
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from small_env import MEETING, small_env, turning, wander
+from builders.environments import MEETING, small_env, turning, wander
 
 from slam_backend.geometry import between, inverse, transform_points
-from vslam_env import ExplorationEnv
+from vslam_env import EnvConfig, ExplorationEnv, preset_config, vslam_v0
 from vslam_env.belief.observation import flatten, observe
 from vslam_env.belief.readings import Readings, TeamReadings
 from vslam_env.belief.team_belief import Belief, TeamBelief
 from vslam_env.navigation import CELL, FREE, GRID_SIZE, OCCUPIED, UNKNOWN, cell_of
+from vslam_env.reward import TERMS
 
 KEYS = ["pose", "pose_std", "map_stats", "local_grid", "scan", "candidates", "teammates", "teammates_mask"]
 
@@ -51,28 +58,8 @@ def test_observations_are_rebuilt_from_readings_alone(action_type: str, steps: i
                 assert value.tobytes() == expected[name].tobytes(), (tick, agent, name)
 
 
-def test_scans_and_bumps_of_another_length_are_refused_before_anything_changes() -> None:
-    """Beliefs that refused readings go on with right ones as if they had never been given the wrong ones."""
-    env = small_env()
-    readings, _ = _record(env, 3)
-    episode = env.episode
-    whole, refusing = (TeamBelief(env.config.belief, 2, episode.belief_seed, episode.body) for _ in range(2))
-    for now in map(TeamReadings.gathered, readings):
-        short = now._replace(scans=now.scans[:, 1:])
-        with pytest.raises(ValueError, match=r"readings.scans: .* shape \(2, 32\), got shape \(2, 31\)"):
-            refusing.step(short)
-        with pytest.raises(ValueError, match=r"readings.scans: .* shape \(2, 32\), got shape \(1, 32\)"):
-            refusing.step(now.of_each()[:1])
-        with pytest.raises(ValueError, match=r"readings: expected those of each robot"):
-            refusing.step([])
-        with pytest.raises(ValueError, match=r"readings.bumps: expected an array of shape \(2,\), got shape \(1,\)"):
-            refusing.step(now._replace(bumps=now.bumps[:1]))
-        whole.step(now), refusing.step(now)
-        np.testing.assert_array_equal(refusing.poses, whole.poses)
-
-
 def test_readings_of_a_team_are_those_of_its_robots() -> None:
-    """Readings that are taken apart and gathered again are what they were; what does not fit together is refused."""
+    """Readings that are taken apart and gathered again are what they were."""
     env = small_env(comm_loss=0.5, oracle_pose=True, oracle_association=True)
     readings, _ = _record(env, 3)
     for now in readings:
@@ -80,93 +67,6 @@ def test_readings_of_a_team_are_those_of_its_robots() -> None:
         for one, other in zip(now, again, strict=True):
             for field, value, same in zip(Readings._fields, one, other, strict=True):
                 np.testing.assert_array_equal(value, same, err_msg=field)
-    first, second = readings[-1]
-    with pytest.raises(ValueError, match=r"readings\[1\].scan: .* shape \(32,\), got shape \(31,\)"):
-        TeamReadings.gathered([first, second._replace(scan=second.scan[1:])])
-    with pytest.raises(ValueError, match=r"readings\[0\].heard: expected an array, got None"):
-        TeamReadings.gathered([first._replace(heard=None), second])
-
-
-@pytest.mark.parametrize(
-    ("name", "value", "message"),
-    [
-        ("odometry", np.zeros(2), r"readings\[1\]\.odometry: expected an array of shape \(3,\), got shape \(2,\)"),
-        (
-            "odometry",
-            "ahead",
-            r"readings\[1\]\.odometry: expected an array of shape \(3,\) of real numbers",
-        ),
-        ("odometry", [0.0, np.nan, 0.0], r"readings\[1\]\.odometry: expected finite numbers, got NaN"),
-        ("measurements", None, r"readings\[1\]\.measurements: expected an array, got None"),
-        ("scan", "far", r"readings\[1\]\.scan: expected an array of shape \(32,\) of real numbers, got 'far'"),
-        ("bump", np.zeros(2, np.bool_), r"readings\[1\]\.bump: expected an array of shape \(\), got shape \(2,\)"),
-        ("pose", np.zeros(2), r"readings\[1\]\.pose: expected an array of shape \(3,\), got shape \(2,\)"),
-        ("heard", np.ones(3, np.bool_), r"readings\[1\]\.heard: expected an array of shape \(2,\), got shape \(3,\)"),
-        ("heard", np.ones(2, np.int64), r"contacts: expected a symmetric array of bools, got"),
-    ],
-)
-def test_readings_that_make_no_sense_are_refused(name: str, value: Any, message: str) -> None:
-    """The error names the reading and its robot, and the beliefs are as before."""
-    env = small_env(comm_loss=0.5, oracle_pose=True)
-    readings, _ = _record(env, 2)
-    episode = env.episode
-    whole, refusing = (TeamBelief(env.config.belief, 2, episode.belief_seed, episode.body) for _ in range(2))
-    whole.step(readings[0]), refusing.step(readings[0])
-    first, second = readings[1]
-    with pytest.raises(ValueError, match=message):
-        refusing.step([first, second._replace(**{name: value})])
-    whole.step(readings[1]), refusing.step(readings[1])
-    np.testing.assert_array_equal(refusing.poses, whole.poses)
-
-
-@pytest.mark.parametrize("observation_type", ["dict", "flat"])
-@pytest.mark.parametrize("action_type", ["continuous", "discrete", "goal"])
-def test_observations_are_inside_their_spaces(action_type: str, observation_type: str) -> None:
-    """Every observation is in its space, dtype included, from the reset on."""
-    env = small_env(action_type=action_type, observation_type=observation_type, num_robots=3, max_cycles=25)
-    observations, _ = env.reset(seed=1)
-    rng = np.random.default_rng(0)
-    while env.agents:
-        for agent, observation in observations.items():
-            assert env.observation_space(agent).contains(observation)
-        observations = env.step(wander(env, rng))[0]
-
-
-def test_keys_shapes_and_types() -> None:
-    """Observations have the documented names, shapes and types, and a mask exactly where actions are goals."""
-    observation = small_env(action_type="goal").reset(seed=1)[0]["robot_1"]
-    assert list(observation) == [*KEYS, "action_mask"]
-    shapes = {name: value.shape for name, value in observation.items()}
-    assert shapes == {
-        "pose": (3,),
-        "pose_std": (3,),
-        "map_stats": (6,),
-        "local_grid": (3, 48, 48),
-        "scan": (32,),
-        "candidates": (16, 5),
-        "teammates": (7, 5),
-        "teammates_mask": (7,),
-        "action_mask": (17,),
-    }
-    types = {"local_grid": np.uint8, "teammates_mask": np.int8, "action_mask": np.int8}
-    assert all(value.dtype == types.get(name, np.float32) for name, value in observation.items())
-    assert list(small_env().reset(seed=1)[0]["robot_1"]) == KEYS
-
-
-def test_consecutive_observations_share_no_memory() -> None:
-    """What an agent does to an observation changes neither the next one nor what the robot believes."""
-    env = small_env(action_type="goal")
-    before, _ = env.reset(seed=3)
-    after = env.step(dict.fromkeys(env.agents, 0))[0]
-    for agent in before:
-        for name in before[agent]:
-            for other in after.values():
-                assert not np.shares_memory(before[agent][name], other[name])
-    pose, scan = env.belief("robot_0").pose.copy(), env.readings[0].scan.copy()
-    for value in after["robot_0"].values():
-        value[:] = 1
-    assert np.array_equal(env.belief("robot_0").pose, pose)
-    assert np.array_equal(env.readings[0].scan, scan)
 
 
 def test_every_kind_of_element_varies() -> None:
@@ -178,24 +78,6 @@ def test_every_kind_of_element_varies() -> None:
         if name in ("pose", "pose_std", "map_stats", "scan"):
             assert changing.all(), name
         assert changing.any(), name
-
-
-def test_local_grid_is_ego_centred() -> None:
-    """A wall ahead is above the middle of the local grid; turning by 90 degrees to the right moves it to the left."""
-    env = small_env(num_robots=1)
-    observations, _ = env.reset(seed=0, options={"start_poses": [[8.0, 3.0, 0.0]]})  # 3 m from the wall on the right
-    occupied = observations["robot_0"]["local_grid"][1]
-    rows = np.flatnonzero(occupied[:, 23:25].any(axis=1))
-    assert len(rows)
-    assert np.abs(rows - (23.5 - 3.0 / 0.2)).min() <= 1.5
-    assert (rows < 24).all()
-
-    for _ in range(11):  # a quarter turn in 1.1 s, at no more than 1.5 rad/s
-        observations = env.step({"robot_0": np.array([0.0, -(np.pi / 2 / 1.1) / 1.5])})[0]
-    occupied = observations["robot_0"]["local_grid"][1]
-    columns = np.flatnonzero(occupied[23:25, :24].any(axis=0))
-    assert len(columns)
-    assert np.abs(columns - (23.5 - 3.0 / 0.2)).min() <= 2.0
 
 
 def _plain_local_grid(belief: Belief) -> np.ndarray:
@@ -252,7 +134,7 @@ def test_flat_is_the_dict_in_order() -> None:
 
 
 def test_teammates_appear_with_the_merge() -> None:
-    """Before a merge nobody is there; after it the teammate stands where it truly is, to within the maps' errors."""
+    """Before a merge there is no teammate; after it the mate stands where it truly is, to within the errors of maps."""
     env = small_env(max_cycles=400)
     _, observations = _record(env, 300)
     merged = next(event.step for event in env.events if event.kind == "merge")
@@ -292,3 +174,126 @@ def test_numbers_follow_from_the_belief() -> None:
                 rows[mate.robot - (mate.robot > belief.robot)] = x, y, np.cos(theta), np.sin(theta), sigma
             np.testing.assert_allclose(observation["teammates"], rows, rtol=1e-5, atol=1e-6)
     assert len(env.belief("robot_0").teammates) == 1
+
+
+PAGE = (Path(__file__).parents[2] / "docs" / "observations.md").read_text(encoding="utf-8")
+
+
+def tables() -> dict[str, list[dict[str, str]]]:
+    """Return the page's tables by the name of their first column: per row the cells by column, marks of code kept."""
+    found: dict[str, list[dict[str, str]]] = {}
+    lines = PAGE.splitlines()
+    begins = [i for i in range(len(lines) - 1) if lines[i].startswith("|") and lines[i + 1].startswith("|---")]
+    for begin in begins:
+        columns = cells_of(lines[begin])
+        rows = []
+        for line in lines[begin + 2 :]:
+            if not line.startswith("|"):
+                break
+            rows.append(dict(zip(columns, cells_of(line), strict=True)))
+        name = columns[0].strip("`") + (" by preset" if "easy" in columns else "")
+        assert name not in found, f"two tables begin with the column {name}"
+        found[name] = rows
+    return found
+
+
+def cells_of(line: str) -> list[str]:
+    """Return the cells of a table's line."""
+    return [cell.strip() for cell in line.strip().strip("|").split("|")]
+
+
+TABLES = tables()
+
+
+def by_name(table: str) -> dict[str, dict[str, str]]:
+    """Return the rows of a table by what stands between the first marks of code in their first cells."""
+    rows = TABLES[table]
+    named = {next(iter(row.values())).split("`")[1]: row for row in rows}
+    assert len(named) == len(rows)
+    return named
+
+
+def test_observations_are_as_the_page_says() -> None:
+    """Names, shapes, dtypes and scalar ranges of the table are those of the spaces, in both directions."""
+    rows = by_name("key")
+    space: Any = small_env(action_type="goal").observation_space("robot_0")
+    assert rows.keys() == space.spaces.keys()
+    for name, row in rows.items():
+        box = space[name]
+        assert ast.literal_eval(row["shape"]) == box.shape, name
+        assert np.dtype(row["dtype"]) == box.dtype, name
+        if " to " in row["range"] and "," not in row["range"]:
+            low, high = map(float, row["range"].split(" to "))
+            assert (box.low == low).all(), name
+            assert (box.high == high).all(), name
+
+
+def test_the_flat_vector_is_as_long_as_the_page_says() -> None:
+    """The page names the shape of the flat observation."""
+    space = small_env(observation_type="flat").observation_space("robot_0")
+    assert f"float32 vector {space.shape}" in PAGE
+
+
+def test_infos_are_as_the_page_says() -> None:
+    """The table names each key of an info with its type, and no other."""
+    rows = by_name("info")
+    env = small_env(reward={"map_error": 1.0, "collisions": 0.5})
+    for infos in (env.reset(seed=0)[1], env.step({agent: np.zeros(2) for agent in env.agents})[4]):
+        types = {"reward/<term>" if key.startswith("reward/") else key: type(v) for key, v in infos["robot_0"].items()}
+        assert {name: row["type"] for name, row in rows.items()} == {key: t.__name__ for key, t in types.items()}
+
+
+def test_arguments_are_as_the_page_says() -> None:
+    """The table names every argument of `parallel_env` in order, and what it is in the standard preset."""
+    rows = by_name("argument")
+    assert list(rows) == list(inspect.signature(vslam_v0.parallel_env).parameters)
+    standard = EnvConfig()
+    for name, row in rows.items():
+        value = standard.belief.filter.num_particles if name == "num_particles" else getattr(standard, name, None)
+        assert ast.literal_eval(row["standard"].strip("`")) == value, name
+
+
+def test_fields_are_as_the_page_says() -> None:
+    """Each field of the configuration stands on the page: as an argument, or in the table of those that are none."""
+    rows = by_name("setting")
+    arguments = inspect.signature(vslam_v0.parallel_env).parameters
+    fields = [field.name for field in dataclasses.fields(EnvConfig) if field.name not in arguments]
+    assert list(rows) == fields
+    for name, row in rows.items():
+        value, said = getattr(EnvConfig(), name), row["standard"].strip("`")
+        assert said == (type(value).__name__ if dataclasses.is_dataclass(value) else repr(value)), name
+
+
+@pytest.mark.parametrize("preset", ["easy", "standard", "hard"])
+def test_presets_are_as_the_page_says(preset: str) -> None:
+    """The numbers of the table are those of the presets, to three digits."""
+    config = preset_config(preset)
+    for name, row in by_name("field by preset").items():
+        assert float(row[preset]) == pytest.approx(reduce(getattr, name.split("."), config), rel=5e-3), name
+
+
+def test_reward_terms_and_actions_are_as_the_page_says() -> None:
+    """The page names the terms that a reward can have, and the space of each type of action."""
+    assert by_name("term").keys() == TERMS.keys()
+    for name, row in by_name("action_type").items():
+        assert repr(small_env(action_type=name).action_space("robot_0")).replace(".0", "") == row["space"].strip("`")
+
+
+def test_options_are_as_the_page_says() -> None:
+    """The options of a reset that the page names are those that its docstring names, and they are obeyed."""
+    rows = by_name("option")
+    documented = inspect.getdoc(small_env().reset)
+    assert documented is not None
+    assert all(f'`"{name}"`' in documented for name in rows)
+    env = small_env()
+    starts = np.array([[2.0, 2.0, 0.0], [8.0, 3.0, 1.0]])
+    options = {"world_seed": 5, "start_poses": starts}
+    assert options.keys() == rows.keys()
+    env.reset(seed=1, options=options)
+    looks = env.world.landmarks
+    assert looks is not None
+    np.testing.assert_allclose(env.true_start_poses, starts)
+    env.reset(seed=2, options=options)
+    again = env.world.landmarks
+    assert again is not None
+    np.testing.assert_array_equal(again.positions, looks.positions)

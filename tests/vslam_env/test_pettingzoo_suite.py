@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from builders.environments import MEETING, room
 from pettingzoo.utils.conversions import aec_to_parallel
-from small_env import MEETING, room
 
 from vslam_env import World, vslam_v0
 
@@ -39,6 +39,7 @@ TABLE: dict[str, dict[str, Any]] = {
     "ends by recall": {"stop_at_recall": 0.01},
     "shared rewards": {"reward": {"map_error": 1.0, "coverage": 0.5, "collisions": 0.1}, "shared_reward": True},
     "a family": {"world": "fig5"},
+    "rendered eyes": {"sensor": "stereo"},
 }
 
 

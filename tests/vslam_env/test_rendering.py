@@ -8,8 +8,8 @@ from hypothesis.extra.numpy import arrays
 
 from vslam_env.rendering import MergeFlash, RobotView, Scene, draw_frame
 from vslam_env.rendering.canvas import CHI_SQUARE_95, Viewport, dots, ellipse_outlines, veils
-from vslam_env.rendering.merge_effect import FLASH_TICKS, caption
-from vslam_env.rendering.palette import ROBOTS, robot_colour
+from vslam_env.rendering.merge_effect import FLASH_TICKS
+from vslam_env.rendering.palette import robot_colour
 
 WALLS = np.array([[0.0, 0.0, 13.0, 0.0], [13.0, 0.0, 13.0, 11.0], [4.0, 11.0, 4.0, 6.0]])
 
@@ -137,12 +137,6 @@ def test_a_flash_fades_and_ends() -> None:
     assert traces[3:] == [0.0, 0.0]
 
 
-def test_captions_name_the_robots() -> None:
-    """One robot is named in the singular, several in the plural."""
-    assert caption(MergeFlash(0, (1,), (2,))) == "robot 1 + robot 2: maps merged"
-    assert caption(MergeFlash(0, (0, 3), (2,))) == "robots 0, 3 + robot 2: maps merged"
-
-
 def test_only_the_grouping_counts_not_its_labels() -> None:
     """Renaming groups changes nothing; joining two robots does."""
     apart, renamed, joined = (
@@ -181,24 +175,3 @@ def test_dots_are_as_large_as_asked_for() -> None:
         dots(image, np.array([[20.3, 19.6]]), radius, (0, 0, 0))
         ink = (255.0 - image[..., 0]).sum() / 255.0
         assert ink == pytest.approx(np.pi * radius**2, rel=0.3)
-
-
-def test_colours_are_told_apart() -> None:
-    """Eight robots have eight colours, and a ninth one begins anew."""
-    assert len(set(ROBOTS)) == 8
-    assert robot_colour(8) == robot_colour(0)
-
-
-@pytest.mark.parametrize(
-    ("size", "message"),
-    [
-        ((960,), r"size: expected a pair \(width, height\), got \(960,\)"),
-        (960, r"size: expected a pair \(width, height\), got 960"),
-        ((100, 720), r"size\[0\]: expected an int >= 160, got 100"),
-        ((960, 7.5), r"size\[1\]: expected an int >= 120, got 7.5"),
-    ],
-)
-def test_bad_sizes_are_named(size: object, message: str) -> None:
-    """A size that is no pair of large enough integers is refused."""
-    with pytest.raises(ValueError, match=message):
-        draw_frame(make_scene(PAIR), size)  # type: ignore[arg-type]

@@ -3,9 +3,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from digests import digest
-from scored import scored, standing_at
-from small_env import MEETING, small_env, turning, wander
+from builders.comparison import digest
+from builders.environments import MEETING, scored, small_env, standing_at, turning, wander
 
 from agents import make_policy
 from slam_backend.fastslam.reports import Findings, LandmarksCreated, TeamReport
@@ -227,19 +226,6 @@ def test_the_running_cost_charges_every_tick() -> None:
         for agent, cost in expected.items():
             assert infos[agent]["reward/running_cost"] == pytest.approx(cost, abs=1e-12)
     assert any(event.kind == "merge" for event in many.events)
-
-
-def test_snapshots_hold_the_running_cost() -> None:
-    """An environment that is set to a state charges the same bytes from there on."""
-    env = small_env(reward={RUNNING_COST: 1.0}, decision_ticks=3)
-    env.reset(seed=5)
-    for _ in range(4):
-        env.step(turning(env.agents))
-    twin = small_env(reward={RUNNING_COST: 1.0}, decision_ticks=3)
-    twin.set_state(env.get_state())
-    for _ in range(4):
-        assert env.step(turning(env.agents))[1] == twin.step(turning(twin.agents))[1]
-        assert env.episode.standing().error_integrals.tolist() == twin.episode.standing().error_integrals.tolist()
 
 
 def test_idling_costs_its_time() -> None:

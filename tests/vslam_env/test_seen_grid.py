@@ -1,12 +1,25 @@
+"""Grids of what robots have seen: painted scan by scan, or for a whole team at once."""
+
 import numpy as np
 import pytest
+from builders.environments import ANGLES, MAX_RANGE, scan
+from builders.painted_plainly import painted_plainly
 from hypothesis import given
 from hypothesis import strategies as st
-from navigation_rooms import ANGLES, MAX_RANGE, scan
-from painted_plainly import painted_plainly
 
 from slam_backend.geometry import transform_points
-from vslam_env.navigation import CELL, FREE, GRID_SIZE, OCCUPIED, UNKNOWN, SeenGrid, TeamGrids, cell_of, centre_of
+from vslam_env.navigation import (
+    CELL,
+    FREE,
+    GRID_SIZE,
+    OCCUPIED,
+    UNKNOWN,
+    SeenGrid,
+    TeamGrids,
+    cell_of,
+    centre_of,
+    ray_directions,
+)
 
 ALL_CENTRES = centre_of(np.stack(np.meshgrid(np.arange(GRID_SIZE), np.arange(GRID_SIZE), indexing="ij"), axis=-1))
 
@@ -61,17 +74,6 @@ def test_a_wall_is_marked_without_holes(distance: float) -> None:
     assert (np.stack(near) == OCCUPIED).any(axis=0).all()
 
 
-def test_turning_the_robot_turns_what_it_saw() -> None:
-    """A scan seen a quarter turn to the left paints the grid turned a quarter."""
-    ahead, left = SeenGrid(), SeenGrid()
-    ranges = np.linspace(2.13, 6.71, 32)
-    ahead.paint_scan((0.0, 0.0, 0.03), ranges, ANGLES)
-    left.paint_scan((0.0, 0.0, 0.03 + np.pi / 2), ranges, ANGLES)
-    turned = np.rot90(ahead.cells, k=-1)  # rows grow upwards, so left is clockwise for numpy
-    assert (turned == left.cells).all()
-    assert (ahead.cells != left.cells).any()
-
-
 @pytest.mark.parametrize(("seed", "fan"), [(1, ANGLES), (2, np.linspace(-1.5, 1.5, 40)), (3, np.array([-0.3, 0.4]))])
 def test_a_scan_is_painted_as_it_is_defined(seed: int, fan: np.ndarray) -> None:
     """Scans of walls, gaps and nothing, wherever the robot stands and looks, change the evidence as the plain form."""
@@ -94,7 +96,7 @@ def test_a_scan_is_painted_as_it_is_defined(seed: int, fan: np.ndarray) -> None:
 
 
 def test_a_grid_tells_which_verdicts_changed() -> None:
-    """All that changed since it was asked last is told, and after a restore that anything may have changed."""
+    """It reports all that changed since the last question, and after a restore that anything may have changed."""
     rng = np.random.default_rng(4)
     team = TeamGrids(1)
     (grid,), (changes,) = team.grids, team.changes
@@ -267,41 +269,33 @@ def test_copies_are_independent_and_views_follow() -> None:
         view.cells[0, 0] = FREE
 
 
-def test_a_restored_grid_goes_on_bit_by_bit() -> None:
-    """After set_state, the same scans lead to the same cells and evidence."""
-    grid, again = SeenGrid(), SeenGrid()
-    grid.paint_scan((0.0, 0.0, 0.3), wall_ranges(3.3), ANGLES)
-    state = grid.get_state()
-    again.set_state(state)
-    assert (again.cells == grid.cells).all()
-    for each in (grid, again):
-        each.paint_scan((0.4, 0.0, 0.2), wall_ranges(2.9), ANGLES)
-    assert (again.cells == grid.cells).all()
-    assert (again.get_state()["evidence"] == grid.get_state()["evidence"]).all()
-    assert (state["evidence"] != grid.get_state()["evidence"]).any()
+RADIUS = 0.2
+HARDWARE = ray_directions(ANGLES), MAX_RANGE, RADIUS
 
 
-GOOD_POSE, GOOD_RANGES = (0.0, 0.0, 0.0), np.full(32, 2.0)
-BAD_CALLS = [
-    (lambda g: g.paint_scan((0.0, 0.0), GOOD_RANGES, ANGLES), r"pose: expected an array of shape \(3,\)"),
-    (lambda g: g.paint_scan((np.nan, 0.0, 0.0), GOOD_RANGES, ANGLES), "pose: expected finite numbers"),
-    (lambda g: g.paint_scan(GOOD_POSE, GOOD_RANGES[:5], ANGLES), r"ranges: expected an array of shape \(n,\)"),
-    (lambda g: g.paint_scan(GOOD_POSE, -GOOD_RANGES, ANGLES), "ranges: expected distances >= 0"),
-    (lambda g: g.paint_scan(GOOD_POSE, GOOD_RANGES * np.nan, ANGLES), "ranges: expected distances >= 0"),
-    (lambda g: g.paint_scan(GOOD_POSE, GOOD_RANGES, ANGLES[::-1]), "angles: expected ascending"),
-    (lambda g: g.paint_scan(GOOD_POSE, GOOD_RANGES, ANGLES * 5), "angles: expected ascending"),
-    (lambda g: g.paint_scan(GOOD_POSE, GOOD_RANGES, ANGLES * np.nan), "angles: expected ascending"),
-    (lambda g: g.clear_disc((np.inf, 0.0, 0.0)), "pose: expected finite numbers"),
-    (lambda g: g.clear_disc(GOOD_POSE, radius=0.0), "radius: expected a finite number > 0"),
-    (lambda g: g.absorb(SeenGrid(), (0.0, np.nan, 0.0)), "self_from_other: expected finite numbers"),
-    (lambda g: g.set_state({"evidence": np.zeros((2, 3))}), "evidence: expected an array of shape"),
-]
-
-
-@pytest.mark.parametrize(("call", "message"), BAD_CALLS)
-def test_bad_input_is_refused_and_changes_nothing(call, message) -> None:
-    """Each wrong argument raises one error that names it, and the grid stays as it was."""
-    grid = SeenGrid()
-    with pytest.raises(ValueError, match=message):
-        call(grid)
-    assert not grid.cells.any()
+def test_readings_are_painted_as_their_parts() -> None:
+    """Each grid holds, and tells as changed, what scan, disc and bump leave one after the other, in ascending order."""
+    rng = np.random.default_rng(4)
+    team, apart = TeamGrids(3), [TeamGrids(1) for _ in range(3)]
+    parts = [single.grids[0] for single in apart]
+    for one in (team, *apart):
+        one.changes[:, 0] = 0
+    for _ in range(30):
+        shared = rng.integers(0, 2, (3, 3))
+        poses = rng.uniform(-1.0, 1.0, (3, 3, 3)) * [9.0, 9.0, 3.0]
+        scans, bumps = rng.uniform(0.3, 9.0, (3, 32)), rng.random(3) < 0.4
+        team.paint_readings(shared, poses, scans, bumps, *HARDWARE)
+        for owner, robot in np.argwhere(shared):
+            pose = poses[owner, robot]
+            parts[owner].paint_scan(pose, scans[robot], ANGLES)
+            parts[owner].clear_disc(pose, RADIUS)
+            if bumps[robot]:
+                parts[owner].bump(pose, RADIUS)
+        for robot, (whole, part) in enumerate(zip(team.grids, parts, strict=True)):
+            assert (whole.get_state()["evidence"] == part.get_state()["evidence"]).all()
+            assert (whole.cells == part.cells).all()
+            assert (team.cells[robot] == part.cells).all()
+            count = 1 + apart[robot].changes[0, 0]
+            assert count > 0
+            assert (team.changes[robot, :count] == apart[robot].changes[0, :count]).all()
+            team.changes[robot, 0] = apart[robot].changes[0, 0] = 0

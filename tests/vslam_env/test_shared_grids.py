@@ -2,8 +2,7 @@
 
 import numpy as np
 import pytest
-from navigation_rooms import ANGLES, MAX_RANGE, building, cast
-from small_env import MEETING, small_env, turning
+from builders.environments import ANGLES, MAX_RANGE, MEETING, building, cast, small_env, turning
 
 from slam_backend.fastslam.relative_poses import Standpoints
 from slam_backend.fastslam.reports import Findings, MergeUndone, Renaming, TeamReport
@@ -66,7 +65,7 @@ def parted(rng: np.random.Generator) -> Mates:
 
 @pytest.mark.parametrize("seed", range(100, 104))
 def test_robots_that_return_hold_what_those_hold_that_never_parted(seed: int) -> None:
-    """But for the order of what was painted: each scan went into each grid once, whoever told whom of it."""
+    """But for the order of what was painted: each scan went into each grid once, by whichever way it came."""
     rng, lossy, steady = np.random.default_rng(seed), Drive(seed), Drive(seed)
     for drive, patterns in ((steady, [ALL] * 150), (lossy, [ALL] + [parted(rng) for _ in range(148)] + [ALL])):
         for mates in patterns:
@@ -89,7 +88,7 @@ def test_meeting_again_without_having_read_anything_new_changes_nothing() -> Non
     assert (drive.cells() == before).all()
 
 
-def test_whoever_was_away_for_long_is_told_in_one_piece_and_nothing_is_kept_for_longer() -> None:
+def test_a_robot_long_away_receives_one_piece_and_nothing_is_kept_for_longer() -> None:
     """What is kept of the time apart is bounded; after it they absorb each other's grids."""
     drive = Drive(100)
     drive.on(ALL)
@@ -118,8 +117,8 @@ def test_restored_grids_know_what_was_missed() -> None:
         assert (drive.grids[robot].cells == other[robot].cells).all()
 
 
-def test_what_is_told_is_told_once() -> None:
-    """Of two that hold the same, one tells it; what is known is noted, not told; others hand on what they were told."""
+def test_what_was_sent_is_not_sent_again() -> None:
+    """Of two that hold the same, one sends it; what is known is noted, not sent; others hand on what they received."""
     shared = np.array([[1, 1, 0], [1, 1, 0], [0, 0, 1]])
     strokes = Strokes(7, shared, np.zeros((3, 3, 3)), np.ones((3, 2)), np.zeros(3, np.bool_))
     motion = np.array([1.0, 2.0, 0.5])
@@ -142,7 +141,7 @@ PAIR, WITHOUT = ((0, 2), (1,), (0, 2)), ((0, 1), (0, 1), (2,))
 
 
 def test_nothing_of_an_undone_merge_reaches_who_was_away() -> None:
-    """Whoever was away when a merge was made and undone is told what its mates scanned, as if it had never been."""
+    """A robot away when a merge was made and undone receives what its mates scanned, as if it had never been."""
     drives = Drive(100), Drive(100)
     for drive, was_merged in zip(drives, (True, False), strict=True):
         for mates in [PAIR] * 5 + [NONE] * 5:
@@ -155,7 +154,7 @@ def test_nothing_of_an_undone_merge_reaches_who_was_away() -> None:
     assert (drives[0].cells() == drives[1].cells()).all()
 
 
-def test_what_was_told_within_a_side_outlives_an_undo() -> None:
+def test_what_was_sent_within_a_side_outlives_an_undo() -> None:
     """What robots of a side told each other of the time before the merge is painted again after its undo."""
     drives = Drive(101), Drive(101)
     for drive, was_merged in zip(drives, (True, False), strict=True):

@@ -1,15 +1,36 @@
-"""Worlds are checked when they are built, and can be named in several ways."""
+"""Worlds: walls, landmarks, families, and the space where robots fit."""
 
 import json
+import os
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
+from builders.environments import WALLS, room, small_env
 
-from vslam_env.world import FreeSpace, LandmarkConfig, Landmarks, World, make_world, place_landmarks
+from slam_backend.models.camera import StereoCamera
+from vslam_env import EnvConfig, vslam_v0
+from vslam_env.sensors import LandmarkSensor, LandmarkSensorConfig
+from vslam_env.simulation.scenario import draw_setting
+from vslam_env.world import (
+    SPLITS,
+    WORLD_FAMILIES,
+    FreeSpace,
+    LandmarkConfig,
+    Landmarks,
+    World,
+    draw_world_seed,
+    make_world,
+    place_landmarks,
+    save_walls_json,
+)
+from vslam_env.world._kernels.clearance import distances_to_walls
 from vslam_env.world.landmarks import CORNER, draw_descriptors
+from vslam_env.world.loaders.splits import files_of_split
 
 ROOM = [[0, 0, 5, 0], [5, 0, 5, 3], [5, 3, 0, 3], [0, 3, 0, 0]]
 
@@ -36,33 +57,6 @@ def test_world_is_frozen_and_knows_its_bounds() -> None:
             array[0, 0] = 1.0
 
 
-@pytest.mark.parametrize(
-    ("build", "message"),
-    [
-        (lambda: World("w", []), r"world\.walls: expected"),
-        (lambda: World("w", [[0, 0, 1]]), r"world\.walls: expected an array of shape \(n, 4\), got shape \(1, 3\)"),
-        (lambda: World("w", [[0, 0, 1, np.nan]]), r"world\.walls: expected finite numbers, got NaN"),
-        (lambda: World("w", [*ROOM, [1, 1, 1, 1]]), r"world\.walls\[4\]: expected a wall longer than 0\.001 m"),
-        (lambda: World("w", [[0, 0, 5000, 0]]), r"world\.walls: expected an extent of at most 200 m, .* 5000 m"),
-        (lambda: World(3, ROOM), r"world\.name: expected a string, got 3"),
-        (lambda: World("w", ROOM, start_poses=[[1, 2]]), r"world\.start_poses: expected an array of shape \(n, 3\)"),
-        (lambda: World("w", ROOM, landmarks(walls=[0, 9])), r"world\.landmarks\.walls: expected wall indices 0 to 3"),
-        (lambda: World("w", ROOM, "many"), r"world\.landmarks: expected Landmarks or None"),
-        (lambda: landmarks(normals=[[0, 1], [0, 2]]), r"landmarks\.normals: expected unit vectors, got a length of 2"),
-        (lambda: landmarks(descriptors=np.zeros((2, 7))), r"landmarks\.descriptors: expected unit vectors"),
-        (lambda: landmarks(walls=[0]), r"landmarks\.walls: expected an array of shape \(2,\)"),
-        (lambda: LandmarkConfig(density=0.0), r"landmarks\.density: expected a finite number > 0"),
-        (lambda: LandmarkConfig(min_height=1.0, max_height=0.0), r"landmarks\.max_height: expected .* >= 1"),
-        (lambda: LandmarkConfig(distinctness=1.5), r"landmarks\.distinctness"),
-        (lambda: LandmarkConfig(repeated=-0.1), r"landmarks\.repeated"),
-    ],
-)
-def test_bad_worlds_are_refused(build: Callable[[], object], message: str) -> None:
-    """A world that makes no sense is refused in one sentence that names the argument."""
-    with pytest.raises(ValueError, match=message):
-        build()
-
-
 def test_make_world_takes_names_worlds_functions_and_paths(tmp_path: Path) -> None:
     """A family name, a World, a function and a path or folder of paths all give a World."""
     rng = np.random.default_rng(3)
@@ -76,37 +70,6 @@ def test_make_world_takes_names_worlds_functions_and_paths(tmp_path: Path) -> No
         np.testing.assert_array_equal(loaded.walls, ROOM)
         np.testing.assert_array_equal(loaded.start_poses, [[1, 1, 0.5]])
         assert loaded.name == "hall"
-
-
-@pytest.mark.parametrize(
-    ("world", "message"),
-    [
-        ("ofice", r"world: expected one of 'office', .*'fig5', or a path .*, got 'ofice'"),
-        ("missing.png", r"world: expected a file, got 'missing\.png'"),
-        ("missing.json", r"world: expected a file, got 'missing\.json'"),
-        (lambda rng: [ROOM], r"world: expected a function that returns a World"),
-        (7, r"world: expected a name, a path, a World or a function, got 7"),
-    ],
-)
-def test_unknown_worlds_are_refused(world: Any, message: str) -> None:
-    """What is no world is refused with the list of what would be one."""
-    with pytest.raises(ValueError, match=message):
-        make_world(world, np.random.default_rng(0))
-
-
-@pytest.mark.parametrize("text", ["{", "[1, 2]", '{"wals": []}', '{"walls": [], "extra": 1}', '{"walls": "x"}'])
-def test_bad_json_is_refused(tmp_path: Path, text: str) -> None:
-    """A malformed file of walls gives one clear error."""
-    path = tmp_path / "bad.json"
-    path.write_text(text)
-    with pytest.raises(ValueError, match=r"^world.*: expected .*, got .*\. .*metres"):
-        make_world(path, np.random.default_rng(0))
-
-
-def test_an_empty_folder_is_refused(tmp_path: Path) -> None:
-    """A folder without plans says what to put there."""
-    with pytest.raises(ValueError, match="expected a folder with floor plans"):
-        make_world(tmp_path, np.random.default_rng(0))
 
 
 @pytest.mark.parametrize("family", ["office", "fig5", "maze", "loops", "hall"])
@@ -161,9 +124,209 @@ def test_a_share_of_descriptors_is_repeated() -> None:
     assert abs(1.0 - len(np.unique(vectors, axis=0)) / 500 - 0.4) < 0.09
 
 
-def test_unknown_keys_of_json_worlds_are_named(tmp_path: Path) -> None:
-    """A key that means nothing, perhaps misspelt, is refused by its name."""
-    path = tmp_path / "room.json"
-    path.write_text(json.dumps({"walls": ROOM, "start_pose": [[1, 1, 0]]}), encoding="utf-8")
-    with pytest.raises(ValueError, match=r"world: expected no other keys in .*, got 'start_pose'"):
-        make_world(path, np.random.default_rng(0))
+FAMILIES = sorted(WORLD_FAMILIES)
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_all_floor_hangs_together(family: str) -> None:
+    """In 15 buildings of a family the reachable part is nearly all floor in which a robot fits."""
+    for seed in range(15):
+        world = make_world(family, np.random.default_rng(seed))
+        space = FreeSpace(world)
+        alone = FreeSpace(world, 0.05)  # a robot so small that it fits almost wherever there is floor
+        x_min, y_min, x_max, y_max = world.bounds
+        assert len(space.free_area_cells) == len(alone.free_area_cells)
+        assert 0.04 * len(space.free_area_cells) > 0.35 * (x_max - x_min) * (y_max - y_min)
+        assert space.reachable.sum() > 0.4 * space.open_space.sum()
+        assert 10 <= len(world.walls) <= 100
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_starts_are_free_reachable_and_apart(family: str) -> None:
+    """Three robots start 5 m apart, or 7 m if that is asked, off the walls, in the same part, sharing no view."""
+    for seed, apart in ((0, 5.0), (1, 7.0), (2, 5.0)):
+        config = EnvConfig(world=family, min_start_distance=apart)
+        setting = draw_setting(config, family, np.random.SeedSequence(seed))
+        starts = setting.true_starts
+        gaps = np.linalg.norm(starts[:, None, :2] - starts[:, :2], axis=2)[~np.eye(3, dtype=bool)]
+        assert gaps.min() >= apart
+        FreeSpace(setting.world).check_starts(starts, 3)
+        assert setting.sensor.visible(starts).sum(axis=0).max() <= 1
+
+
+@pytest.mark.parametrize("family", ["maze", "loops"])
+def test_there_are_ways_round(family: str) -> None:
+    """Free floor has a hole in most mazes, and in all loops one around each block: walls that touch no outer wall."""
+    with_loops = 0
+    for seed in range(10):
+        open_space = FreeSpace(make_world(family, np.random.default_rng(seed))).open_space
+        parts = cv2.connectedComponents((~open_space).astype(np.uint8), connectivity=8)[0] - 1  # the outside is one
+        with_loops += parts >= 2
+        if family == "loops":
+            assert parts >= 5
+    assert with_loops >= 7
+
+
+def test_a_hall_hides_something_from_everywhere() -> None:
+    """Pillars stand apart: each is passed on all sides by a robot, as the free floor goes around it."""
+    world = make_world("hall", np.random.default_rng(5))
+    pillars = world.walls[4:].reshape(-1, 4, 4)
+    middles = pillars[:, :, :2].mean(axis=1)
+    gaps = np.linalg.norm(middles[:, None] - middles, axis=2)[~np.eye(len(middles), dtype=bool)]
+    assert len(pillars) >= 8
+    assert gaps.min() > 1.4
+
+
+def test_splits_do_not_meet() -> None:
+    """The seeds of the splits are apart, and each draw stays in its own range."""
+    ranges = sorted(SPLITS.values())
+    assert all(end <= begin for (_, end), (begin, _) in pairwise(ranges))
+    rng = np.random.default_rng(2)
+    for split, (first, end) in SPLITS.items():
+        drawn = [draw_world_seed(split, rng) for _ in range(200)]
+        assert first <= min(drawn) <= max(drawn) < end
+        assert len(set(drawn)) > 150
+
+
+def test_a_split_environment_draws_from_its_seeds() -> None:
+    """The buildings of a split are those of world seeds in its range; a world seed that is given is obeyed."""
+    seen: list[int] = []
+
+    def watched(rng: np.random.Generator) -> World:
+        seen.append(int(rng.integers(2**40)))
+        return room()
+
+    env = small_env(world=watched, world_split="validation")
+    env.reset(seed=4)
+    env.reset(seed=4)
+    first, end = SPLITS["validation"]
+    possible = {
+        int(np.random.default_rng(np.random.SeedSequence(seed).spawn(2)[0]).integers(2**40)): seed
+        for seed in range(first, end)
+    }
+    assert seen[0] == seen[1]
+    assert seen[0] in possible
+    env.reset(seed=5)
+    assert seen[2] in possible
+    assert seen[2] != seen[0]
+    env.reset(seed=5, options={"world_seed": 3})
+    assert seen[3] not in possible
+
+
+def test_files_take_turns(tmp_path: Path) -> None:
+    """Of twelve files the first and the eleventh are for tests, the second and the twelfth for validation."""
+    files = [tmp_path / f"{index:02d}.json" for index in range(12)]
+    for file in files:
+        save_walls_json(World(file.stem, WALLS), file)
+    split = {name: files_of_split(files, name) for name in SPLITS}
+    assert split["test"] == [files[0], files[10]]
+    assert split["validation"] == [files[1], files[11]]
+    assert split["train"] == files[2:10]
+    names = {make_world(tmp_path, np.random.default_rng(seed), "test").name for seed in range(20)}
+    assert names == {"00", "10"}
+
+
+@pytest.mark.parametrize(
+    ("act", "says"),
+    [
+        (lambda path: small_env(world_split="test"), "world_split: expected None for a world of which there is one"),
+        (lambda path: vslam_v0.parallel_env(world_split="exam"), "world_split: expected .*'train'.*, got 'exam'"),
+        (lambda path: small_env(world=path, world_split="train").reset(), "world_split: expected files for 'train'"),
+    ],
+)
+def test_bad_splits_are_refused(act: Callable[[Path], object], says: str, tmp_path: Path) -> None:
+    """A split of what cannot be split, or that does not exist, is refused."""
+    save_walls_json(room(), tmp_path / "room.json")
+    with pytest.raises(ValueError, match=says):
+        act(tmp_path)
+
+
+def test_a_file_is_read_again_when_it_changes(tmp_path: Path) -> None:
+    """A world that is loaded twice is read once, unless its file was written in between."""
+    path, rng = tmp_path / "room.json", np.random.default_rng(0)
+    save_walls_json(World("room", WALLS), path)
+    first = make_world(path, rng)
+    assert make_world(path, rng) is first
+    save_walls_json(World("room", 2.0 * WALLS), path)
+    os.utime(path, ns=(1, 1))
+    np.testing.assert_array_equal(make_world(path, rng).walls, 2.0 * WALLS)
+
+
+# A 6 x 3 m hall with a 1 m door in the wall x = 4, a closed closet in a corner, and a wall outside.
+HALL = [
+    [0, 0, 6, 0],
+    [6, 0, 6, 3],
+    [6, 3, 0, 3],
+    [0, 3, 0, 0],
+    [4, 0, 4, 1],
+    [4, 2, 4, 3],
+    [0, 1.5, 1, 1.5],
+    [1, 1.5, 1, 3],
+    [7, 0, 8, 1],
+]
+
+
+def test_free_space_is_what_the_walls_enclose() -> None:
+    """The hall counts on both sides of its door; the closet and the outside do not."""
+    free = FreeSpace(World("hall", HALL))
+    inside = free.contains(np.array([[2.0, 1.0], [5.0, 2.5], [0.5, 2.5], [6.5, 1.0], [-9.0, 1.0], [9.0, 99.0]]))
+    assert inside.tolist() == [True, True, False, False, False, False]
+    area = 0.04 * len(free.free_area_cells)
+    assert 0.85 * 16.5 < area < 16.5
+    assert distances_to_walls(free.free_area_cells, np.array(HALL, dtype=float)).min() > 0.1
+
+
+def test_a_narrow_door_keeps_large_robots_out() -> None:
+    """What a robot reaches depends on its radius: through a door of 1 m goes a disc of 0.3 m, none of 0.6 m."""
+    cells = [FreeSpace(World("hall", HALL), radius).reachable for radius in (0.3, 0.6)]
+    columns = [np.flatnonzero(mask.any(axis=0)) * 0.1 - 0.3 for mask in cells]
+    assert columns[0].max() > 5.5
+    assert columns[1].max() < 4.0
+
+
+def test_start_poses_of_the_world_choose_the_part() -> None:
+    """With start poses given, the part that holds them counts, not the largest."""
+    free = FreeSpace(World("hall", HALL, start_poses=[[0.5, 2.2, 0.0]]))
+    assert free.contains(np.array([[0.5, 2.5], [2.0, 1.0]])).tolist() == [True, False]
+
+
+@pytest.mark.parametrize(
+    ("starts", "message"),
+    [
+        ([[2, 1, 0], [9, 1, 0]], r"start_poses\[1\]: expected a place that robots can reach"),
+        ([[2, 1, 0], [0.5, 2.2, 0]], r"start_poses\[1\]: expected a place that robots can reach"),
+        ([[2, 0.1, 0], [5, 1, 0]], r"start_poses\[0\]: expected a place at least 0\.2 m .* got a distance of 0\.100 m"),
+        ([[2, 1, 0], [2.3, 1, 0]], r"start_poses\[1\]: expected .* got a distance of 0\.300 m to robot 0"),
+        ([[2, 1, 0]], r"start_poses: expected an array of shape \(2, 3\), got shape \(1, 3\)"),
+        ([[2, 1, 0], [2, np.nan, 0]], r"start_poses: expected finite numbers"),
+    ],
+)
+def test_bad_starts_are_refused(starts: Any, message: str) -> None:
+    """A start inside a wall, cut off, on top of another or of the wrong shape is refused; the robot is named."""
+    with pytest.raises(ValueError, match=message):
+        FreeSpace(World("hall", HALL)).check_starts(starts, 2)
+
+
+def test_landmarks_out_of_every_view_do_not_count() -> None:
+    """A landmark in the closet, on an outer face, or too high up to be in any view is not counted; others are."""
+    positions = [[2.0, 3.0, 0.0], [0.5, 3.0, 0.0], [2.0, 3.0, 0.0], [2.0, 3.0, 4.0], [5.0, 0.0, 0.5]]
+    normals = [[0, -1], [0, -1], [0, 1], [0, -1], [0, 1]]
+    marks = Landmarks(positions, normals, [2, 2, 2, 2, 0], np.eye(5, 9))
+    free = FreeSpace(World("hall", HALL, marks))
+    assert free.visible_landmarks(marks, StereoCamera()).tolist() == [True, False, False, False, True]
+
+
+def test_what_a_robot_sees_can_be_seen() -> None:
+    """Whatever a camera sees from a reachable place is among the landmarks that count."""
+    rng = np.random.default_rng(5)
+    world = make_world("office", rng)
+    free = FreeSpace(world)
+    marks = place_landmarks(world, rng, None, free)
+    countable = free.visible_landmarks(marks, StereoCamera())
+    sensor = LandmarkSensor(LandmarkSensorConfig(), world.walls, marks)
+    seen = np.zeros(len(marks), dtype=bool)
+    for _ in range(150):
+        seen |= sensor.visible(free.draw_starts(2, rng, 1.0)[:1])[0]
+    assert seen.sum() > 100
+    assert countable.mean() > 0.9
+    assert (seen & ~countable).sum() == 0

@@ -4,8 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from python_entry import python_entry
-from small_problems import TIGHT, camera_of, graph_of, small_run
+from builders.kernels import python_entry
+from builders.runs import TIGHT, camera_of, graph_of, small_run
 
 from slam_backend.core.validation import FloatArray
 from slam_backend.fastslam.run_log import RobotLog
@@ -123,7 +123,7 @@ def test_the_solution_is_the_dense_one(posed, damping):
 
 
 def test_what_is_not_positive_definite_has_no_factor(posed):
-    """A node of negative information anywhere is told."""
+    """A node of negative information is reported wherever it stands."""
     system = posed.mode.system
     assert system is not None
     for node in (0, len(system.blocks) - 1):

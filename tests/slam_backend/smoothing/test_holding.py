@@ -2,8 +2,8 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from python_entry import python_entry
-from small_problems import small_run
+from builders.kernels import python_entry
+from builders.runs import small_run
 
 from slam_backend.core.validation import FloatArray
 from slam_backend.fastslam._kernels import add_share
@@ -264,13 +264,3 @@ def test_without_it_the_frame_wanders_between_two_draws(monkeypatch: pytest.Monk
     held = thrown()
     monkeypatch.setattr(rejuvenation, "holding", lambda *arguments: None)
     assert held < 0.6 * thrown()
-
-
-def test_a_motion_and_its_inverse_leave_landmarks_where_they_were():
-    """Moving there and back is the identity."""
-    rng = np.random.default_rng(6)
-    values, motions = random_maps(4, 64, rng), rng.normal(size=(64, 3))
-    tiles = laned(values)
-    move_tiles(tiles, motions)
-    move_tiles(tiles, inverse(motions))
-    np.testing.assert_allclose(unlaned(tiles, 64), values, atol=1e-10)

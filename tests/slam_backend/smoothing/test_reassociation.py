@@ -1,7 +1,11 @@
-"""What was refused is taken up where several measurements agree on a landmark's place, and else is not."""
+"""Landmarks of a smoothed run that are one, or are not."""
 
 import numpy as np
 import pytest
+from builders.runs import TIGHT, camera_of, graph_of, logs_of, small_run
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial import cKDTree
 
 from slam_backend.fastslam.filter import FastSlam
 from slam_backend.fastslam.options import FilterOptions
@@ -9,9 +13,13 @@ from slam_backend.fastslam.run_log import RobotLog
 from slam_backend.geometry import inverse, transform_points
 from slam_backend.models.camera import StereoCamera
 from slam_backend.models.measurements import Measurements
-from slam_backend.smoother.graph_building import Guesses
+from slam_backend.smoother.duplicates import alike_pairs, find_duplicates, without_duplicates
+from slam_backend.smoother.graph import PathGraph
+from slam_backend.smoother.graph_building import Guesses, extended
 from slam_backend.smoother.log_arrays import REJECTED
+from slam_backend.smoother.optimizer import find_mode
 from slam_backend.smoother.reassociation import NO_ONE, Known, Refused, find_only, taken_up
+from slam_backend.smoother.sampling import draw_paths
 
 OPTIONS = FilterOptions(camera=StereoCamera(sigma_px=0.2, sigma_disparity_px=0.1, mount=(0.1, 0.0, 0.9)))
 POSES = {4: np.array([0.0, 0.0, 0.3]), 5: np.array([0.4, 0.1, 0.2]), 7: np.array([0.9, 0.1, -0.1])}
@@ -138,10 +146,78 @@ def error_of_one_first_seen_far_off(every):
 
 
 def test_a_landmark_that_blocks_itself_is_put_right():
-    """All but its first sighting are refused and it stays off for ever; or until particles are drawn anew."""
+    """All but its first sighting are refused and it stays off for ever; or until new particles are drawn."""
     off, refused = error_of_one_first_seen_far_off(None)
     assert off > 0.5
     assert refused == 13
     off, refused = error_of_one_first_seen_far_off(5)
     assert off < 0.05
     assert refused <= 5
+
+
+NEW_NAME = 1000
+
+
+def renamed_run():
+    """Return a run's graph in which the landmark seen most is called otherwise from some step on, and its two names."""
+    run = small_run()
+    every = np.concatenate([names[0] for names in run.names])
+    often = int(np.bincount(every).argmax())
+    when = [step for step in range(run.num_steps) if often in run.names[step][0]]
+    log = RobotLog()
+    for row in logs_of(run)[0]:
+        ids = np.where((row.ids == often) & (row.step >= when[len(when) // 2]), NEW_NAME, row.ids)
+        log.append(row.step, row.motion if row.kind else None, points=row.points, ids=ids)
+    start = PathGraph.at_starts(run.true_paths[:, 0])
+    mount = np.array(run.spec.noise.camera.mount)
+    return run, extended(start, [log.arrays()], run.spec.noise.motion, mount), often
+
+
+def looks(graph, alike=()):
+    """Return descriptors (l, l), all different but for the landmarks of these names."""
+    table = np.eye(len(graph.landmark_ids), dtype=np.float32)
+    for name in alike:
+        table[graph.landmark_ids == name] = table[np.flatnonzero(graph.landmark_ids == alike[0])[0]]
+    return table
+
+
+def found(run, graph, descriptors):
+    """Return what is found to be double on a graph."""
+    mode = find_mode(graph, camera_of(run), TIGHT)
+    return find_duplicates(graph, mode, draw_paths(graph, mode, 40, np.random.default_rng(1)), descriptors, 0.45)
+
+
+def test_one_landmark_under_two_names_is_found():
+    """The smoothed path shows that both lie in one place; the older name stays."""
+    run, graph, often = renamed_run()
+    assert found(run, graph, looks(graph, (often, NEW_NAME))).tolist() == [[NEW_NAME, often]]
+
+
+@given(st.integers(0, 40), st.integers(0, 2**32 - 1))
+def test_pairs_are_those_of_the_tree(num, seed):
+    """The compiled sweep finds what a tree, norms and sets say: nearness, looks, and keys that both were seen from."""
+    rng = np.random.default_rng(seed)
+    landmarks, descriptors = rng.uniform(0.0, 2.0, (num, 3)), rng.normal(size=(num, 2)).astype(np.float32)
+    descriptors[rng.random(num) < 0.1, 1] = np.nan
+    seen = [np.sort(rng.integers(0, 12, rng.integers(0, 4))) for _ in range(num)]
+    starts = np.cumsum([0, *map(len, seen)])
+    keys = np.concatenate([np.empty(0, dtype=np.int64), *seen])
+    order = np.argsort(landmarks[:, 0])
+    found = alike_pairs(order, landmarks, descriptors, keys, starts, 0.5, 1.2)
+    expected = {
+        (a, b)
+        for a, b in cKDTree(landmarks).query_pairs(0.5)
+        if np.linalg.norm(descriptors[a] - descriptors[b]) <= 1.2
+        and len(seen[a]) and len(seen[b]) and not set(seen[a]) & set(seen[b])
+    }  # fmt: skip
+    assert len(found) == len(expected)
+    assert {tuple(pair) for pair in found.tolist()} == expected
+
+
+def test_a_duplicate_given_up_leaves_one_landmark():
+    """The mode is then that of the run without the duplicate, and one name stands for the other."""
+    run, graph, often = renamed_run()
+    healed = without_duplicates(graph, np.array([[NEW_NAME, often]]))
+    mode, right = find_mode(healed, camera_of(run), TIGHT), find_mode(graph_of(run), camera_of(run), TIGHT)
+    np.testing.assert_allclose(mode.poses, right.poses, atol=1e-8)
+    assert healed.known_as(np.array([NEW_NAME, 3])).tolist() == [often, 3]

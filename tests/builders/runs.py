@@ -1,0 +1,81 @@
+"""Short runs as logs and graphs, and the cost of a smoother written plainly."""
+
+from functools import lru_cache
+
+import numpy as np
+
+from slam_backend.core.validation import FloatArray
+from slam_backend.fastslam.run_log import RobotLog
+from slam_backend.geometry import between, inverse, transform_points, wrap_angle
+from slam_backend.smoother.graph import PathGraph
+from slam_backend.smoother.graph_building import extended
+from slam_backend.smoother.optimizer import Mode
+from slam_backend.smoother.options import SmoothingOptions
+from training.bench.accuracy.batch_problem import BatchProblem
+from training.bench.accuracy.runs import RunSpec, StereoRun, simulate_run
+
+SPEC = RunSpec(length=5.0, landmarks=120, measurements=7)
+TIGHT = SmoothingOptions(kernel=0.0, tolerance=1e-12, max_iterations=50, max_keys=1000, fresh_keys=1000)
+
+
+@lru_cache
+def small_run(robots: int = 1, seed: int = 101, length: float = 5.0) -> StereoRun:
+    """Return a run of 21 steps, as a rule."""
+    return simulate_run(RunSpec(robots=robots, length=length, landmarks=120, measurements=7 * robots), seed)
+
+
+def camera_of(run: StereoRun) -> FloatArray:
+    """Return the camera as kernels take it."""
+    camera = run.spec.noise.camera
+    return np.array([camera.focal_px, camera.baseline, camera.sigma_px, camera.sigma_disparity_px, *camera.mount])
+
+
+def logs_of(run: StereoRun, skip: tuple[int, ...] = ()) -> list[RobotLog]:
+    """Return what each robot would log; the measurements of the steps in `skip` are left out."""
+    logs = []
+    for robot in range(run.spec.robots):
+        log = RobotLog()
+        for step in range(run.num_steps):
+            points = run.spec.noise.camera.robot_from_camera(run.frames[step][robot].points)
+            points = points - np.array(run.spec.noise.camera.mount)
+            names = run.names[step][robot]
+            if step in skip:
+                points, names = points[:0], names[:0]
+            log.append(step, None if step == 0 else run.odometry[step, robot], points=points, ids=names)
+        logs.append(log)
+    return logs
+
+
+def graph_of(run: StereoRun, skip: tuple[int, ...] = ()) -> PathGraph:
+    """Return the graph of a whole run, each step a key unless it is skipped."""
+    start = PathGraph.at_starts(run.true_paths[:, 0])
+    logs = [log.arrays() for log in logs_of(run, skip)]
+    return extended(start, logs, run.spec.noise.motion, np.array(run.spec.noise.camera.mount))
+
+
+def upper(mode: Mode) -> FloatArray:
+    """Return U with U^T U the information of all poses sought, landmarks integrated out, by columns of the mode."""
+    covariance = mode.covariance(np.flatnonzero(mode.columns >= 0))
+    return np.asarray(np.linalg.cholesky(np.linalg.inv(covariance)).T)
+
+
+def plain_cost(run: StereoRun, paths: FloatArray, landmarks: dict[int, FloatArray]) -> float:
+    """Return half the sum of squared whitened residuals of paths (K, T, 3), measured in pixels."""
+    noise, total = run.spec.noise, 0.0
+    camera = noise.camera
+    sigmas = np.array([camera.sigma_px, camera.sigma_px, camera.sigma_disparity_px])
+    for robot, path in enumerate(paths):
+        for step, pose in enumerate(path):
+            if step:
+                off = between(path[step - 1], pose) - run.odometry[step, robot]
+                off[2] = wrap_angle(off[2])
+                total += 0.5 * ((off / noise.motion.sigmas(run.odometry[step, robot])) ** 2).sum()
+            for point, name in zip(run.frames[step][robot].points, run.names[step][robot], strict=True):
+                local = camera.camera_from_robot(transform_points(inverse(pose), landmarks[int(name)]))
+                total += 0.5 * (((camera.project(local) - camera.project(point)) / sigmas) ** 2).sum()
+    return float(total)
+
+
+def problem_of(run: StereoRun) -> BatchProblem:
+    """Return the run as batch maximum likelihood takes it."""
+    return BatchProblem.of_run(run)
