@@ -5,8 +5,8 @@ import pickle
 
 import numpy as np
 import pytest
-from same_bits import assert_same
-from shared_arrays import scribble, shared, shared_and_writable
+from builders.comparison import assert_same
+from builders.shared_arrays import scribble, shared, shared_and_writable
 from test_damaged_states import SUBJECTS, merged, play
 
 from slam_backend.core.read_only import as_constant, as_read_only, is_read_only, with_constants, with_read_only

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from shared_arrays import arrays_in, can_be_written, scribble, shared, shared_and_writable
-from small_env import MEETING, room, small_env, wander
+from builders.environments import MEETING, room, small_env, wander
+from builders.shared_arrays import arrays_in, can_be_written, scribble, shared, shared_and_writable
 from test_damaged_env_states import go_on, merged, split
-from test_stereo_env import SMALL
+from test_stereo_sensor import SMALL
 
 from vslam_env import EnvConfig, ExplorationEnv, load_state, save_state, vslam_v0
 from vslam_env.presets import preset_config
