@@ -23,7 +23,7 @@ from vslam_env.state_checks import EpisodeCheck, check_drivers, check_standing
 from vslam_env.state_kinds import ENV_KINDS
 from vslam_env.world import WorldSource
 
-STATE_FORMAT = 28  # raised when what a state holds changes; a state goes on bit by bit only with what made it
+STATE_FORMAT = 29  # raised when what a state holds changes; a state goes on bit by bit only with what made it
 MAGIC = b"vslam_env state "
 KEYS = ("version", "config", "objects", "root", "agents", "cycle", "episode", "drivers", "standing")
 

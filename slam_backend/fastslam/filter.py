@@ -321,7 +321,7 @@ class FastSlam:
         state = self.state
         weights = NO_WEIGHTS if state.starts_at_origin else np.exp(state.log_weights)
         _kernels.stand(
-            state.pose_arrays, weights, state.best, state.starts_at_origin, *state.estimates,
+            state.pose_arrays, state.start_covariances, weights, state.best, state.starts_at_origin, *state.estimates,
             members_of(names, live), ess, points.poses, points.beliefs,
         )  # fmt: skip
 

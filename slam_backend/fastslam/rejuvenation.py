@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from slam_backend.core.blas import on_one_thread
 from slam_backend.core.jit import in_place
 from slam_backend.core.read_only import with_constants, with_read_only
-from slam_backend.core.validation import FloatArray, IntArray
+from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from slam_backend.fastslam import _kernels
 from slam_backend.fastslam.options import FilterOptions
 from slam_backend.fastslam.particle_maps import ParticleMaps, slots_held, write_outline
@@ -287,21 +287,22 @@ class RejuvenationStep:
     # ------------------------------------------------------------------ where there is time for it
 
     def run(
-        self, logs: Sequence[RobotLog], starts: FloatArray, maps: ParticleMaps, best: int, camera: FloatArray,
-        rng: np.random.Generator,
+        self, logs: Sequence[RobotLog], starts: FloatArray, held: BoolArray, maps: ParticleMaps, best: int,
+        camera: FloatArray, rng: np.random.Generator,
     ) -> Rejuvenation | None:  # fmt: skip
         """Do all that is due, or a slice of it, if it does not rest; return None if there is nothing to tell of it.
 
         Args:
             logs: Per robot.
             starts: (K, 3, M) where the robots started, map frame.
+            held: (K,) whether these are held, see `hold_start`.
             maps: Of the present particles; only looked at.
             best: The most probable of them.
             camera: (7,) as kernels take it.
             rng: Source of the draws.
         """
         options = self._options
-        graph = PathGraph.at_uncertain_starts(starts) if self._graph is None else self._graph
+        graph = PathGraph.at_uncertain_starts(starts, held) if self._graph is None else self._graph
         if self._exact or (self._graph is None and any(log.has_exact_poses for log in logs)):
             self._exact = True  # nobody may have noted it: a filter that is never rejuvenated is asked to, by a merge
         if reason := self._never:
@@ -342,7 +343,8 @@ class RejuvenationStep:
     @on_one_thread
     def join(
         self, a: "RejuvenationStep", b: "RejuvenationStep", starts: Sequence[FloatArray],
-        frames: tuple[FloatArray, FloatArray], renamed: IntArray, camera: FloatArray,
+        held: tuple[BoolArray, BoolArray], frames: tuple[FloatArray, FloatArray], renamed: IntArray,
+        camera: FloatArray,
     ) -> None:  # fmt: skip
         """Go on as the smoothers of two groups did that are one now, and be due at the next step.
 
@@ -350,13 +352,14 @@ class RejuvenationStep:
             a, b: Theirs; they stay as they are.
             starts: Three arrays (K, 3, M): where the robots of a, of b, and of both, a's first, started; in a's frame,
                 in b's, in a's.
+            held: (K,) of a, of b: whether these are held, see `hold_start`.
             frames: Two covariances (3, 3) of what a's and b's particles do not show of their maps' frames.
             renamed: (n, 2) rows (name in b, name in the joint map).
             camera: (7,) as kernels take it.
         """
         own, other = (
-            PathGraph.at_uncertain_starts(where) if step._graph is None else step._graph
-            for step, where in zip((a, b), starts[:2], strict=True)
+            PathGraph.at_uncertain_starts(where, fixed) if step._graph is None else step._graph
+            for step, where, fixed in zip((a, b), starts[:2], held, strict=True)
         )
         options = self._options.smoothing
         graph, motion = joint_graph(own, other, starts, frames, renamed, camera, options)

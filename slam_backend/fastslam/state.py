@@ -9,7 +9,7 @@ import numpy as np
 
 from slam_backend.core.packed_symmetric import UNPACK, UPPER
 from slam_backend.core.state_checks import generator_of
-from slam_backend.core.validation import FloatArray, Int32Array, IntArray, check_int, check_seed
+from slam_backend.core.validation import BoolArray, FloatArray, Int32Array, IntArray, check_int, check_seed
 from slam_backend.fastslam import _kernels
 from slam_backend.fastslam._kernels import IDLE, PLACED, add_share
 from slam_backend.fastslam._kernels.layout import (
@@ -143,6 +143,8 @@ class FilterState:
         propagated_only: (K,) int64. 1 where N(x^, P^) was only propagated since the last match, else 0.
         gauge_covariance: (3, 3) float64 [m, m, rad]. Covariance of a motion of the whole map that the particles do not
             show, because their frame was fixed when they were sampled from smoothed paths; estimates include it.
+        start_covariances: (K, 3, 3) float64 [m, m, rad], start frames. Covariance of where each robot started in the
+            map, as far as the particles do not show it, see `hold_start`; poses seen from there include it.
         maps: Landmarks of all particles.
         estimates: Poses of all robots over all particles; written in each step.
         best: Index of the most probable particle, by accumulated log-weight (Eq. 12).
@@ -176,6 +178,7 @@ class FilterState:
         self.weights[:] = 1.0 / m
         self.propagated_only: IntArray = np.zeros(k, np.int64)
         self.gauge_covariance: FloatArray = np.zeros((3, 3))
+        self.start_covariances: FloatArray = np.zeros((k, 3, 3))
         self.starts_at_origin = True
         self.best = 0
         self.next_step = 0
@@ -234,6 +237,11 @@ class FilterState:
     def weights(self) -> FloatArray:
         """Weights after the last step, summing to 1, (M,)."""
         return np.asarray(self.weight_arrays[WEIGHTS, : self.num_particles])
+
+    @property
+    def _held_starts(self) -> BoolArray:
+        """Whether the particles hide some uncertainty of where a robot started, (K,)."""
+        return np.asarray(self.start_covariances[:, 2, 2] > 0.0)
 
     def _mixtures(self) -> PoseEstimates:
         """Return the robots' poses over all particles, map frame. Fresh arrays."""
@@ -310,6 +318,7 @@ class FilterState:
         count = self.num_particles
         self.poses[robot, :, :count] = compose(self.starts[robot, :, :count].T.copy(), pose).T
         self.gauge_covariance.fill(0.0)
+        self.start_covariances[robot] = 0.0
 
     def resample(self) -> None:
         """Resample the particles in proportion to their weights, with all that they hold."""
@@ -321,7 +330,9 @@ class FilterState:
         if smoother.rests(self.logs):
             return None
         starts = self.starts[:, :, : self.num_particles]
-        result = smoother.run(self.logs, starts, self.maps, self.best, self.packed_camera, self.rng)
+        result = smoother.run(
+            self.logs, starts, self._held_starts, self.maps, self.best, self.packed_camera, self.rng
+        )  # fmt: skip
         if result is None:
             return None
         if result.particles is not None:
@@ -336,7 +347,7 @@ class FilterState:
         self._refresh_starts()
         self.means[:] = self.poses
         self.covariances.fill(0.0)
-        self.gauge_covariance[:] = new.frame
+        self.gauge_covariance[:], self.start_covariances[:] = new.frame, new.start_scatters
         self.propagated_only.fill(0)
         self.log_weights[:], self.path_log_weights[:] = new.log_weights, new.log_densities
         self._refresh_best()
@@ -354,7 +365,14 @@ class FilterState:
 
     def reorder(self, order: IntArray) -> None:
         """Renumber the robots: robot i becomes the one that was `order[i]`; (K,) a permutation."""
-        for array in (self.poses, self.starts, self.means, self.covariances, self.propagated_only):
+        for array in (
+            self.poses,
+            self.starts,
+            self.means,
+            self.covariances,
+            self.start_covariances,
+            self.propagated_only,
+        ):
             array[:] = array[order]
         self._logs = [self.logs[robot] for robot in order]
         self.estimates = PoseEstimates(*(of_all[order] for of_all in self.estimates))
@@ -391,6 +409,7 @@ class FilterState:
         joint.covariances[k:, :, :count] = moved[..., *UPPER].transpose(0, 2, 1)
         joint.propagated_only[:] = np.concatenate([a.propagated_only, b.propagated_only])
         joint.gauge_covariance[:] = a.gauge_covariance
+        joint.start_covariances[:] = np.concatenate([a.start_covariances, b.start_covariances])
         joint.path_log_weights[:] = a.path_log_weights[from_a] + b.path_log_weights[from_b] + evidence
         return joint
 
@@ -411,7 +430,8 @@ class FilterState:
         if self.rejuvenation is not None and a.rejuvenation is not None and b.rejuvenation is not None:
             starts = [state.starts[:, :, : state.num_particles] for state in (a, b, self)]
             frames = a.gauge_covariance, b.gauge_covariance
-            self.rejuvenation.join(a.rejuvenation, b.rejuvenation, starts, frames, renamed, self.packed_camera)
+            held = a._held_starts, b._held_starts
+            self.rejuvenation.join(a.rejuvenation, b.rejuvenation, starts, held, frames, renamed, self.packed_camera)
 
     # ------------------------------------------------------------------ snapshots
 

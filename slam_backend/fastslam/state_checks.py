@@ -50,7 +50,15 @@ from slam_backend.smoother.log_arrays import EXACT, REJECTED, STOOD, LogArrays, 
 from slam_backend.smoother.reassociation import Refused
 
 POSE_FIELDS = ("poses", "starts", "means", "covariances")  # (K, 3 or 6, P), of each robot
-KEPT = (*POSE_FIELDS, "gauge_covariance", "propagated_only", "log_weights", "path_log_weights", "weights")
+KEPT = (
+    *POSE_FIELDS,
+    "gauge_covariance",
+    "start_covariances",
+    "propagated_only",
+    "log_weights",
+    "path_log_weights",
+    "weights",
+)
 OTHERS_KEPT = ("steps", "estimates", "maps", "logs", "consistency", "options", "rng")
 LONGEST_DESCRIPTOR = 1 << 16
 MOST_LANDMARKS = 1 << 30  # names of landmarks: tables are as long as the largest of them
@@ -89,6 +97,7 @@ def check_filter(name: str, state: Any, known: Sequence[FilterOptions] = ()) -> 
         check_floats(f"{name}[{part!r}]", state[part], (k, 3, padded), -FARTHEST, FARTHEST, m)
     check_floats(f"{name}['covariances']", state["covariances"], (k, 6, padded), -LARGEST, LARGEST, m)
     check_floats(f"{name}['gauge_covariance']", state["gauge_covariance"], (3, 3))
+    check_floats(f"{name}['start_covariances']", state["start_covariances"], (k, 3, 3))
     check_indices(f"{name}['propagated_only']", state["propagated_only"], (k,), 0, 1)
     for part in ("log_weights", "path_log_weights"):
         check_floats(f"{name}[{part!r}]", state[part], (m,), LEAST, LARGEST)

@@ -15,6 +15,7 @@ import numpy as np
 
 from slam_backend.core.jit import device, in_place, jit, lanes, room
 from slam_backend.core.validation import FloatArray, IntArray
+from slam_backend.geometry import between, wrap_angle
 from slam_backend.smoother._kernels import LANES
 from slam_backend.smoother.graph import LEVER
 
@@ -60,6 +61,35 @@ def holding(
     if not hold(tiles, seen, landmarks, poses, means, LEVER, weights, moved, motions, scatter):
         return None
     return Held(moved, motions, scatter)
+
+
+def hold_start(
+    starts: FloatArray, poses: FloatArray, start: FloatArray, mean: FloatArray, weights: FloatArray
+) -> FloatArray:
+    """Let all particles have the start of the most probable path, where their poses then agree better from there.
+
+    A start in a map that is held is open as the map is in the frame of the first robot: what was measured long ago
+    decides it, and resampling would only choose one of the starts drawn.
+
+    Args:
+        starts: (3, M) float64 [m, m, rad], map frame. Where the robot started in each particle; written.
+        poses: (3, M) likewise. Its newest poses.
+        start, mean: (3,) Its start and its newest pose in the most probable path.
+        weights: (M,) summing to 1.
+
+    Returns:
+        (3, 3) Covariance [m, m, rad], in the start frame, of the start as particles no longer show it; 0 where they
+        keep theirs.
+    """
+    own, apart = between(start, mean), between(starts.T, start)
+    off = [between(origins, poses.T) - own for origins in (starts.T, start)]
+    squares = [
+        weights @ (each * each) for each in (np.column_stack([d[:, :2], LEVER * wrap_angle(d[:, 2])]) for d in off)
+    ]
+    if squares[1].sum() >= squares[0].sum():
+        return np.zeros((3, 3))
+    starts[:] = start[:, None]
+    return np.asarray((weights * apart.T) @ apart)  # (9)
 
 
 @jit

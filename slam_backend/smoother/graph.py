@@ -104,23 +104,27 @@ class PathGraph:
         return cls.at_uncertain_starts(np.asarray(starts, dtype=np.float64)[:, :, None])
 
     @classmethod
-    def at_uncertain_starts(cls, starts: FloatArray) -> "PathGraph":
+    def at_uncertain_starts(cls, starts: FloatArray, held: BoolArray | None = None) -> "PathGraph":
         """Return the graph of K robots whose starts particles may hold to be different, as after a merge.
 
-        A start on which all particles agree is given. Another is sought: nothing but measurements shall say where it
-        is, for what particles think of it stems from these. Where two robots' starts do not change against each other,
-        the second hangs on the first.
+        A start on which all particles agree is given, unless it is held. Another is sought: nothing but measurements
+        shall say where it is, for what particles think of it stems from these. Where two robots' starts do not change
+        against each other, the second hangs on the first.
 
         Args:
             starts: (K, 3, M) float64 [m, m, rad], map frame.
+            held: (K,) whether particles agree on a start that is open, see `hold_start`. None: they do on none.
         """
         k = len(starts)
-        loose = [i for i in range(k) if (starts[i] != starts[i, :, :1]).any()]
+        held = np.zeros(k, dtype=np.bool_) if held is None else held
+        loose = [i for i in range(k) if held[i] or (starts[i] != starts[i, :, :1]).any()]
         poses, previous, motions, noises = list(starts[:, :, 0]), [NONE] * k, [np.zeros(3)] * k, [np.zeros((3, 3))] * k
         for place, i in enumerate(loose):
             poses[i] = mean_pose(starts[i])
             previous[i], motions[i], noises[i] = k, poses[i], np.diag(VAGUE)
             for other in loose[:place]:
+                if held[i] or held[other]:
+                    continue
                 apart = between(starts[other].T, starts[i].T)
                 if np.abs(_turned(apart - apart[0])).max() < RIGID:
                     previous[i], motions[i], noises[i] = other, apart[0], RIGID**2 * np.eye(3)

@@ -18,7 +18,7 @@ from slam_backend.models.odometry import OdometryModel
 from slam_backend.resampling import systematic
 from slam_backend.smoother import _kernels
 from slam_backend.smoother.duplicates import find_duplicates, without_duplicates
-from slam_backend.smoother.gauge import holding, move, move_tiles, wrap
+from slam_backend.smoother.gauge import hold_start, holding, move, move_tiles, wrap
 from slam_backend.smoother.graph import PathGraph
 from slam_backend.smoother.graph_building import Guesses, Places, extended, first_rows
 from slam_backend.smoother.graph_reduction import at_mode, coarsened, compacted
@@ -58,6 +58,7 @@ class Particles(NamedTuple):
         counts: (l,) int64. Measurements of each.
         means, covariances: (K, 3), (K, 3, 3) float64. The newest poses under the Gaussian about the mode.
         frame: (3, 3) float64 [m, m, rad]. Covariance of the motion of the whole map that the particles do not show.
+        start_scatters: (K, 3, 3) float64 [m, m, rad], start frames. Covariance of each start that they do not show.
     """
 
     poses: FloatArray
@@ -70,6 +71,7 @@ class Particles(NamedTuple):
     means: FloatArray
     covariances: FloatArray
     frame: FloatArray
+    start_scatters: FloatArray
 
 
 class Rejuvenation(NamedTuple):
@@ -231,18 +233,23 @@ def _particles(graph: PathGraph, mode: Mode, draws: Draws) -> Particles:
         covariances[robot] = joint[3 * place : 3 * place + 3, 3 * place : 3 * place + 3]
     if not _kernels.weigh_deviations(joint, off, densities):
         raise np.linalg.LinAlgError("the joint covariance of the robots' poses is not positive definite")
-    frame = np.zeros((3, 3))
+    frame, start_scatters = np.zeros((3, 3)), np.zeros((len(means), 3, 3))
     (in_sight,) = in_view.nonzero()
-    if (held := holding(tiles, in_sight, landmarks, poses, means, weights)) is not None:
+    held = holding(tiles, in_sight, landmarks, poses, means, weights)
+    if held is not None:
         move_tiles(tiles, held.motions)
         poses, frame = held.poses, held.scatter
-        for head in (mode.columns[graph.heads] >= 0).nonzero()[0].tolist():
-            own = starts[head : head + 1]
+    for index in (mode.columns[graph.heads] >= 0).nonzero()[0].tolist():
+        own = starts[index : index + 1]
+        if held is not None:
             move(own, held.motions, own)
+        at = mode.poses[graph.heads[index]], means[index]
+        start_scatters[index] = hold_start(own[0], poses[index], *at, weights)
     for array in (poses, starts, means[:, :, None]):
         wrap(array)
     return Particles(
         poses, starts, np.log(np.maximum(weights, 1e-300)), densities, ids, tiles, counts, means, covariances, frame,
+        start_scatters,
     )  # fmt: skip
 
 

@@ -101,7 +101,8 @@ class MergePlan(NamedTuple):
             return None
         starts = joint.state.starts[a.num_robots, :, : joint.num_particles]
         motion = mean_pose(starts)
-        covariance = scattered(starts)
+        own = rotate_covariances(float(motion[2]), joint.state.start_covariances[a.num_robots])
+        covariance = scattered(starts) + own
         _kernels.add_share(joint.state.gauge_covariance, motion[None], covariance[None])
         x, y, theta = motion.tolist()
         alignment = Alignment(True, "", x, y, theta, covariance, self.alignment.inliers, self.alignment.ratio)

@@ -10,7 +10,7 @@ from builders.kernels import python_entry
 from builders.teams import NEVER, SimulatedTeam, false_alignment, links, true_alignment
 
 from slam_backend.core.packed_symmetric import UNPACK
-from slam_backend.fastslam._kernels import LANES
+from slam_backend.fastslam._kernels import LANES, add_share
 from slam_backend.fastslam._kernels.relative_poses import AT_ORIGIN, KNOWN, SPREAD, see_from_starts, stand, start_kind
 from slam_backend.fastslam.estimates import pose_mixtures
 from slam_backend.fastslam.filter import FastSlam
@@ -208,7 +208,10 @@ def test_own_frames_are_the_plain_definition() -> None:
     points = Standpoints(5)
     points.poses.fill(7.0)
     points.beliefs.fill(7.0)
-    stand(robots, weights, best, False, *estimates, np.array([names, live]), 0.5, points.poses, points.beliefs)
+    stand(
+        robots, np.zeros((4, 3, 3)), weights, best, False, *estimates, np.array([names, live]), 0.5, points.poses,
+        points.beliefs,
+    )  # fmt: skip
 
     for field in (points.poses, points.beliefs):
         assert (field[[1, 4]] == 7.0).all()
@@ -236,3 +239,24 @@ def test_own_frames_are_the_plain_definition() -> None:
     np.testing.assert_allclose(poses[2], mean, atol=1e-12)
     covariance = np.einsum("m,mij->ij", weights, turned) + (weights * off.T) @ off
     np.testing.assert_allclose(spreads[2], covariance, atol=1e-12)
+
+
+def test_a_held_start_widens_what_is_seen_from_it_and_the_frame_does_not() -> None:
+    """The pose is the particles' mixture with the start's share, whatever the estimate has of the frame's."""
+    rng = np.random.default_rng(9)
+    count, start = 9, np.array([2.0, -1.0, 2.5])
+    starts, means = np.repeat(start[:, None], LANES, axis=1)[None], rng.uniform(-3.0, 3.0, (1, 3, LANES))
+    covariances = np.repeat(np.array([0.2, 0.05, 0.0, 0.3, 0.0, 0.01])[:, None], LANES, axis=1)[None]
+    weights = rng.dirichlet(np.ones(count))
+    parts = np.zeros((3, LANES)), starts, means, covariances
+    robots = np.concatenate([rows.reshape(-1, 1, 3, LANES) for rows in parts])
+    shown = pose_mixtures(means, covariances, weights)
+    estimates = shown.copy()
+    estimates.covariances[:] += 7.0
+    scatter = np.array([[0.04, 0.01, -0.02], [0.01, 0.09, 0.03], [-0.02, 0.03, 0.05]])
+    points, members = Standpoints(1), np.array([[0], [1]])
+    stand(robots, scatter[None], weights, 4, False, *estimates, members, 0.5, points.poses, points.beliefs)
+    expected = rotate_covariances(-start[2], shown.covariances)
+    add_share(scatter, (own := between(start, shown.means)), expected)
+    np.testing.assert_allclose(points.own, own, atol=1e-12)
+    np.testing.assert_allclose(points.covariances, expected, atol=1e-12)

@@ -7,7 +7,7 @@ import numpy as np
 from slam_backend.core.jit import device, in_place, inlined, jit
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.fastslam._kernels.layout import COVARIANCES, MEANS, STARTS
-from slam_backend.fastslam._kernels.weights import mixture
+from slam_backend.fastslam._kernels.weights import add_share, mixture
 from slam_backend.fastslam.relative_poses import COVARIANCE, ESS, OWN, SIGMAS, START
 
 AT_ORIGIN, KNOWN, SPREAD = 0, 1, 2  # what starts of particles can be
@@ -88,16 +88,18 @@ def _see_own(
 
 @in_place
 def stand(
-    robots: FloatArray, weights: FloatArray, best: int, at_origin: bool, estimates: FloatArray, spreads: FloatArray,
-    members: IntArray, ess: float, poses: FloatArray, beliefs: FloatArray,
+    robots: FloatArray, scatters: FloatArray, weights: FloatArray, best: int, at_origin: bool, estimates: FloatArray,
+    spreads: FloatArray, members: IntArray, ess: float, poses: FloatArray, beliefs: FloatArray,
 ) -> None:  # fmt: skip
     """Write where the robots of a filter stand, and where they see each other, in their own start frames.
 
     Each particle's pose is seen from where the robot started in that particle, so that what is not known of the start
-    does not blur it.
+    does not blur it. What particles do not show of a start that is held widens the pose that is seen from there.
 
     Args:
         robots: (5, n, 3, P) what its robots have in all particles, see `layout`, map frame.
+        scatters: (n, 3, 3) covariances of their starts that particles do not show [m, m, rad], start frames; 0 where
+            they show all.
         weights: (M,) summing to 1.
         best: The most probable particle.
         at_origin: Whether all robots started at the origin in all particles.
@@ -124,9 +126,12 @@ def stand(
             for k in range(3):
                 belief[COVARIANCE + 3 * j + k] = spreads[i, j, k]
         if not at_origin:
-            kind = start_kind(starts[i], len(weights))
+            is_held = scatters[i, 2, 2] > 0.0  # then the estimate's share of the frame is not its own
+            kind = SPREAD if is_held else start_kind(starts[i], len(weights))
             pose, spread = belief[OWN : OWN + 3], belief[COVARIANCE:SIGMAS].reshape((3, 3))
             _see_own(starts[i], means[i], covariances[i], weights, best, kind, pose, spread)
+            if is_held:
+                add_share(scatters[i], pose.reshape((1, 3)), spread.reshape((1, 3, 3)))
         for mate in range(len(seen)):
             for j in range(3):
                 seen[mate, j] = belief[OWN + j] if mate == own else np.nan

@@ -18,6 +18,7 @@ from slam_backend.smoother.gauge import (
     add_scatter,
     bring_nearer,
     fit,
+    hold_start,
     holding,
     look_at,
     measure_off,
@@ -190,6 +191,28 @@ def test_what_says_nothing_of_the_turn_holds_nothing(apart: float):
         assert holding(laned(values), rows, landmarks, poses, pose[None], weights) is None
 
 
+def test_a_start_is_held_where_the_pose_is_known_in_the_map():
+    """All particles get that of the most probable path; what they differed by, seen from there, is the covariance."""
+    rng = np.random.default_rng(5)
+    start, pose, weights = np.array([2.0, -1.0, 2.5]), np.array([1.0, 2.0, 0.5]), rng.dirichlet(np.ones(40))
+    apart = rng.normal(size=(40, 3)) * [0.3, 0.2, 0.1]
+    starts, poses = compose(start, inverse(apart)).T, pose[:, None] + 0.01 * rng.standard_normal((3, 40))
+    scatter = hold_start(starts, poses, start, pose, weights)
+    np.testing.assert_array_equal(starts, np.repeat(start[:, None], 40, axis=1))
+    np.testing.assert_allclose(scatter, (weights * apart.T) @ apart, atol=1e-12)
+
+
+def test_a_start_is_not_held_where_the_path_from_it_is_known_better_than_the_map():
+    """Of a robot that nothing but odometry knows, near its start, particles keep start and pose together."""
+    rng = np.random.default_rng(6)
+    start, way = np.array([2.0, -1.0, 2.5]), np.array([0.5, 0.1, 0.2])
+    starts = compose(start, rng.normal(size=(40, 3)) * [0.3, 0.2, 0.1]).T
+    poses, before = compose(starts.T, way + 0.01 * rng.standard_normal((40, 3))).T, starts.copy()
+    scatter = hold_start(starts, poses, start, compose(start, way), np.full(40, 1.0 / 40))
+    np.testing.assert_array_equal(starts, before)
+    assert not scatter.any()
+
+
 def test_what_particles_no_longer_show_is_claimed_all_the_same():
     """Right after new particles their scatter and the frame's share are together what the smoother says of the pose."""
     run = small_run(length=8.0)
@@ -225,7 +248,8 @@ def test_groups_that_share_too_little_doubt_both_frames():
     motion = np.array([2.0, -1.0, 0.7])
     starts = np.repeat([[np.zeros(3)], [motion]], 5, axis=1).transpose(0, 2, 1)
     no_names = np.zeros((0, 2), dtype=np.int64)
-    joint.join(a, b, (starts[:1], starts[:1], starts), (SCATTER, 0.5 * SCATTER), no_names, np.zeros(7))
+    given = np.zeros(1, dtype=np.bool_)
+    joint.join(a, b, (starts[:1], starts[:1], starts), (given, given), (SCATTER, 0.5 * SCATTER), no_names, np.zeros(7))
     graph = PathGraph(**joint.get_state()["graph"])
     slopes, turn = np.eye(3), np.eye(3)
     slopes[:2, 2] = -motion[1], motion[0]

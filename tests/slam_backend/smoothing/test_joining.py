@@ -176,6 +176,22 @@ def test_a_merged_team_is_rejuvenated_and_knows_where_it_started(slice_steps):
     assert simulation.position_errors(team).max() < 0.2
 
 
+def test_starts_stay_where_they_are_between_two_draws():
+    """Resampling does not choose among the starts that a merged filter has drawn: they are held until the next draw."""
+    simulation = SimulatedTeam(seed=101)
+    team = build(simulation, every=25)
+    simulation.run(team, 100)
+    assert team.groups == ((0, 1, 2),)
+    stayed, frames = 0, None
+    for _ in range(50):
+        drawn = team.step(*simulation.read()).rejuvenations
+        before, frames = frames, [team.start_from_group(robot) for robot in range(3)]
+        if before is not None and not drawn:
+            np.testing.assert_array_equal(frames, before)
+            stayed += 1
+    assert stayed > 30
+
+
 @pytest.mark.parametrize(("every", "slice_steps"), [(None, None), (20, None), (20, 12)])
 def test_a_snapshot_of_a_team_goes_on_through_merges_and_rejuvenations(every, slice_steps):
     """A restored team does, bit for bit, the same as the one that went on, its smoothers included."""

@@ -130,6 +130,15 @@ def test_starts_on_which_particles_agree_are_given():
     assert graph.noises[2, 0, 0] < 1e-6
 
 
+def test_a_held_start_is_sought_though_particles_agree_on_it():
+    """It hangs on the origin by a vague prior, and on no other start, though none of them changes against another."""
+    starts = np.repeat(np.array([[0.0, 0.0, 0.0], [5.0, 1.0, 3.1], [2.0, -1.0, 0.4]])[:, :, None], 30, axis=2)
+    graph = PathGraph.at_uncertain_starts(starts, np.array([False, True, True]))
+    assert graph.previous.tolist() == [-1, 3, 3, -1]
+    assert (graph.noises[1:3, 0, 0] > 1e3).all()
+    np.testing.assert_allclose(graph.poses[:3], starts[:, :, 0], atol=1e-12)
+
+
 def test_a_start_that_is_not_known_is_found_by_shared_landmarks():
     """Robot 1's start, off by 20 cm and 3 degrees in the particles, is where the landmarks that both saw put it."""
     run = small_run(2, seed=104, length=8.0)
@@ -146,11 +155,12 @@ def test_a_start_that_is_not_known_is_found_by_shared_landmarks():
         np.random.default_rng(4), options,
     )  # fmt: skip
     assert result.reason == ""
-    found = result.particles.starts[1]
-    np.testing.assert_array_equal(result.particles.starts[0], np.repeat(true[0][:, None], 200, axis=1))
-    off = between(true[1], found.T)
-    squared = off.mean(axis=0) @ np.linalg.solve(np.cov(off.T), off.mean(axis=0))
-    assert squared < 11.34  # 99 % of 3 degrees of freedom
+    given, found = result.particles.starts
+    np.testing.assert_array_equal(given, np.repeat(true[0][:, None], 200, axis=1))
+    np.testing.assert_array_equal(found, np.repeat(found[:, :1], 200, axis=1))
+    off, claimed = between(found[:, 0], true[1]), result.particles.start_scatters
+    assert off @ np.linalg.solve(claimed[1], off) < 11.34  # 99 % of 3 degrees of freedom
+    assert not claimed[0].any()
 
 
 def test_robots_are_renumbered_with_all_that_is_theirs():

@@ -32,6 +32,7 @@ BAD: dict[str, dict[str, str]] = {
         "none.npz --policies random_walk": "action_type: expected 'continuous' or 'discrete' for policy",
         "none.npz --processes 0": "processes: expected an int >= 1, got 0.",
     },
+    "warm-up": {"--workers 0": "workers: expected an int >= 1, got 0."},
     "replay mrclam": {
         "--path /nowhere": MRCLAM + ", got no such path. Check '/nowhere'; if --path is left away, it is ",
         "": MRCLAM + ", got no --path. Name it, or set VSLAM_DATA.",
