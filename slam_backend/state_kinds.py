@@ -3,20 +3,9 @@
 from typing import Any
 
 from slam_backend.core.state_codec import SEEDS, Kind, Kinds
+from slam_backend.fastslam import reports
 from slam_backend.fastslam.existence import ExistenceModel
 from slam_backend.fastslam.options import FilterOptions
-from slam_backend.fastslam.reports import (
-    Findings,
-    LandmarksCreated,
-    MapCopied,
-    MapDropped,
-    MergeEvent,
-    MergeUndone,
-    PoseEstimates,
-    RejuvenationReport,
-    Renaming,
-    StepReport,
-)
 from slam_backend.fastslam.step_input import StepInput
 from slam_backend.maps.alignment_types import Alignment, AlignmentOptions
 from slam_backend.maps.landmark_map import FIELDS, LandmarkMap, unchecked_map
@@ -36,9 +25,10 @@ CONFIGURATIONS = (
     SmoothingOptions, StereoCamera,
 )  # fmt: skip
 RECORDS = (
-    Alignment, AttemptRecord, Findings, LandmarksCreated, LogArrays, MapCopied, MapDropped, Measurements, MergeEvent,
-    MergeUndone, PoseEstimates, Refused, RejuvenationReport, Renaming, ReplayedStep, Side, StepInput, StepReport,
-    Straightening, TeamMeasurements, Watch,
+    Alignment, AttemptRecord, LogArrays, Measurements, Refused, ReplayedStep, Side, StepInput, Straightening,
+    TeamMeasurements, Watch, reports.Findings, reports.LandmarksCreated, reports.MapCopied, reports.MapDropped,
+    reports.MergeEvent, reports.MergeUndone, reports.PoseEstimates, reports.RejuvenationReport, reports.Renaming,
+    reports.StepReport,
 )  # fmt: skip
 
 

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from slam_backend.core import state_checks as check
 from slam_backend.core.files import refusing, write_file
-from slam_backend.core.state_checks import check_kind, check_whole, refuse
 from slam_backend.core.state_codec import ForeignObjectError, decoded, encoded, read_file, sequence_of
 from slam_backend.core.validation import bad_argument
 from vslam_env.config import EnvConfig
@@ -60,7 +60,7 @@ def check_state(state: Any, config: EnvConfig, objects: Mapping[str, str]) -> Ma
     found = _checked("state", state)
     theirs_own = found["objects"]
     if not isinstance(theirs_own, dict) or not all(isinstance(name, str) for name in theirs_own):
-        refuse("state['objects']", "a word for each object of the caller's", theirs_own)
+        check.refuse("state['objects']", "a word for each object of the caller's", theirs_own)
     if found["config"] != config:
         name, ours, theirs = _difference(config, found["config"])
         cure = "Restore into an environment of the same configuration."
@@ -91,13 +91,13 @@ def check_parts(
         root = restored_sequence(state["root"])
     except Exception as error:  # whatever numpy says of what are no parts of one
         raise bad_argument("state['root']", "a seed sequence", f"'{error}'", "Pass it unchanged.") from error
-    check_kind("state['agents']", state["agents"], tuple)
+    check.of_kind("state['agents']", state["agents"], tuple)
     if state["agents"] not in ((), tuple(config.agents)):
-        refuse("state['agents']", f"{tuple(config.agents)} or none", state["agents"])
-    check_whole("state['cycle']", state["cycle"])
+        check.refuse("state['agents']", f"{tuple(config.agents)} or none", state["agents"])
+    check.whole("state['cycle']", state["cycle"])
     if state["episode"] is None:
         if state["agents"]:
-            refuse("state['episode']", "a running episode", "none")
+            check.refuse("state['episode']", "a running episode", "none")
         return root, None
     episode = EpisodeCheck(config, own)
     episode.check("state['episode']", state["episode"])

@@ -19,6 +19,8 @@ CURE = "Pass it unchanged."
 LARGEST = 1e12  # of plain numbers [m, rad, 1]; squares and products of a few of them are finite
 FARTHEST = 1e7  # [m, rad] of poses and landmarks
 MOST = 1 << 62  # of counts and steps: sums of two of them are int64
+MOST_LANDMARKS = 1 << 30  # names of landmarks: tables are as long as the largest of them
+LANDMARK = (0, MOST_LANDMARKS)
 
 BOOL, INT8, UINT8 = np.dtype(np.bool_), np.dtype(np.int8), np.dtype(np.uint8)
 INT32, INT64 = np.dtype(np.int32), np.dtype(np.int64)
@@ -68,13 +70,13 @@ def refusing(name: str) -> Iterator[None]:
         raise bad_argument(name, "what get_state returned", got, CURE) from error
 
 
-def check_kind(name: str, value: Any, *kinds: type) -> None:
+def of_kind(name: str, value: Any, *kinds: type) -> None:
     """Refuse what is of none of some types; subclasses are other types."""
     if type(value) not in kinds:
         refuse(name, f"a {' or '.join(kind.__name__ for kind in kinds)}", f"a {type(value).__name__}")
 
 
-def check_keys(name: str, value: Any, keys: Iterable[str]) -> None:
+def keys(name: str, value: Any, keys: Iterable[str]) -> None:
     """Refuse what is no dict, or lacks a key."""
     if not isinstance(value, Mapping):
         refuse(name, "a dict from get_state", f"a {type(value).__name__}")
@@ -83,48 +85,54 @@ def check_keys(name: str, value: Any, keys: Iterable[str]) -> None:
             refuse(name, "a dict from get_state", f"no {key!r}")
 
 
-def check_length(name: str, value: Any, length: int | None = None) -> None:
+def of_length(name: str, value: Any, length: int | None = None) -> None:
     """Refuse what is neither a tuple nor a list, or of another length."""
-    check_kind(name, value, tuple, list)
+    of_kind(name, value, tuple, list)
     if length is not None and len(value) != length:
         refuse(name, f"{length} of them", len(value))
 
 
-def check_whole(name: str, value: Any, low: int = 0, high: int = MOST) -> None:
+def whole(name: str, value: Any, low: int = 0, high: int = MOST) -> None:
     """Refuse what is no int, or not within bounds."""
     if type(value) is not int or not low <= value <= high:
         refuse(name, f"an int from {low} to {high}", value)
 
 
-def check_number(name: str, value: Any, low: float = -LARGEST, high: float = LARGEST) -> None:
+def number(name: str, value: Any, low: float = -LARGEST, high: float = LARGEST) -> None:
     """Refuse what is no float, or not within bounds."""
     if not isinstance(value, float) or not low <= value <= high:
         refuse(name, f"a float from {low:g} to {high:g}", value)
 
 
-def check_flag(name: str, value: Any) -> None:
+def flag(name: str, value: Any) -> None:
     """Refuse what is no bool."""
-    check_kind(name, value, bool)
+    of_kind(name, value, bool)
 
 
-def check_wholes(name: str, values: Any, low: int = 0, high: int = MOST) -> None:
-    """Refuse what is no tuple, list or set of ints within bounds."""
-    check_kind(name, values, tuple, list, set, frozenset)
+def wholes(name: str, values: Any, low: int = 0, high: int = MOST, kind: type = tuple) -> None:
+    """Refuse what is no collection of a type, of ints within bounds."""
+    of_kind(name, values, kind)
     for value in values:
         if type(value) is not int or not low <= value <= high:
             refuse(name, f"ints from {low} to {high}", value)
 
 
-def check_robots(name: str, robots: Any, count: int) -> None:
+def table(name: str, value: Any, of_keys: tuple[int, int], of_values: tuple[int, int] = (0, MOST)) -> None:
+    """Refuse what is no dict whose keys and values are ints within bounds."""
+    of_kind(name, value, dict)
+    wholes(name, tuple(value), *of_keys)
+    wholes(name, tuple(value.values()), *of_values)
+
+
+def robots(name: str, robots: Any, count: int) -> None:
     """Refuse what is no tuple of some of so many robots, at least one, in ascending order."""
-    check_kind(name, robots, tuple)
-    check_wholes(name, robots, 0, count - 1)
+    wholes(name, robots, 0, count - 1)
     if not robots or list(robots) != sorted(set(robots)):
         refuse(name, "robots in ascending order", robots)
 
 
-def check_kept(name: str, value: Any, dtype: np.dtype[Any], shape: tuple[int | None, ...]) -> None:
-    """Refuse what is no array of a type and a shape, None for a free axis."""
+def array(name: str, value: Any, dtype: np.dtype[Any], shape: tuple[int | None, ...]) -> int:
+    """Return the length of an array of a type and a shape, None for a free axis; refuse anything else."""
     if type(value) is not np.ndarray or value.dtype != dtype:
         got = f"an array of {value.dtype}" if isinstance(value, np.ndarray) else f"a {type(value).__name__}"
         refuse(name, f"an array of {dtype}", got)
@@ -133,18 +141,14 @@ def check_kept(name: str, value: Any, dtype: np.dtype[Any], shape: tuple[int | N
     ):
         wanted = tuple("n" if n is None else n for n in shape)
         refuse(name, f"an array of shape {wanted}".replace("'", ""), f"shape {value.shape}")
+    return len(value)
 
 
-def check_floats(
-    name: str,
-    value: Any,
-    shape: tuple[int | None, ...],
-    low: float = -LARGEST,
-    high: float = LARGEST,
-    columns: int | None = None,
-    dtype: np.dtype[Any] = FLOAT64,
-) -> None:
-    """Refuse what is no array of floats of a shape, all within bounds; NaN is not.
+def floats(
+    name: str, value: Any, shape: tuple[int | None, ...], low: float = -LARGEST, high: float = LARGEST,
+    columns: int | None = None, dtype: np.dtype[Any] = FLOAT64,
+) -> int:  # fmt: skip
+    """Return the length of an array of floats of a shape, all within bounds; refuse anything else, and NaN.
 
     Args:
         name: Name of the part.
@@ -154,37 +158,49 @@ def check_floats(
         columns: Only so many entries of the last axis mean something; None: all.
         dtype: Type of the array.
     """
-    check_kept(name, value, dtype, shape)
-    if value.size:
-        wide = value.reshape(-1, value.shape[-1] if columns is not None else value.size)
-        if count_outside(wide, wide.shape[1] if columns is None else columns, float(low), float(high)):
-            refuse(name, f"numbers from {low:g} to {high:g}", "others, or NaN")
+    length = array(name, value, dtype, shape)
+    if _has_others(value, float(low), float(high), columns):
+        refuse(name, f"numbers from {low:g} to {high:g}", "others, or NaN")
+    return length
 
 
-def check_indices(
-    name: str,
-    value: Any,
-    shape: tuple[int | None, ...],
-    low: int,
-    high: int,
-    columns: int | None = None,
+def places(name: str, value: Any, shape: tuple[int | None, ...], columns: int | None = None) -> int:
+    """Return the length of an array of poses or points, as `floats`."""
+    return floats(name, value, shape, -FARTHEST, FARTHEST, columns)
+
+
+def indices(
+    name: str, value: Any, shape: tuple[int | None, ...], low: int = 0, high: int = MOST, columns: int | None = None,
     dtype: np.dtype[Any] = INT64,
-) -> None:
-    """Refuse what is no array of integers of a shape, all within bounds; as `check_floats`."""
-    check_kept(name, value, dtype, shape)
-    if value.size:
-        wide = value.reshape(-1, value.shape[-1] if columns is not None else value.size)
-        if count_outside(wide, wide.shape[1] if columns is None else columns, low, high):
-            refuse(name, f"integers from {low} to {high}", "others")
+) -> int:  # fmt: skip
+    """Return the length of an array of integers of a shape, all within bounds; as `floats`."""
+    length = array(name, value, dtype, shape)
+    if _has_others(value, low, high, columns):
+        refuse(name, f"integers from {low} to {high}", "others")
+    return length
 
 
-def check_ascending(name: str, values: NDArray[Any]) -> None:
+def _has_others(value: NDArray[Any], low: Any, high: Any, columns: int | None) -> bool:
+    """Tell whether some of the first columns are not within bounds."""
+    if not value.size:
+        return False
+    wide = value.reshape(-1, value.shape[-1] if columns is not None else value.size)
+    return bool(count_outside(wide, wide.shape[1] if columns is None else columns, low, high))
+
+
+def ascending(name: str, values: NDArray[Any]) -> None:
     """Refuse values (n,) of which one is not above the one before."""
     if count_falls(values):
         refuse(name, "numbers in ascending order, each once", "others")
 
 
-def check_options(name: str, options: Any, kind: type, known: Iterable[Any] = ()) -> None:
+def different(name: str, values: NDArray[Any]) -> None:
+    """Refuse values (n,) of which two are equal."""
+    if len(np.unique(values)) < len(values):
+        refuse(name, "each number once", "one that repeats")
+
+
+def options(name: str, options: Any, kind: type, known: Iterable[Any] = ()) -> None:
     """Refuse what are no options of a type, or such that its constructor refuses.
 
     Args:
@@ -193,7 +209,7 @@ def check_options(name: str, options: Any, kind: type, known: Iterable[Any] = ()
         kind: A frozen dataclass.
         known: Options that need not be looked at again.
     """
-    check_kind(name, options, kind)
+    of_kind(name, options, kind)
     try:
         if not any(options is other or options == other for other in known):
             _rebuilt(options)
@@ -207,40 +223,43 @@ def _rebuilt(options: Any) -> Any:
     return type(options)(**{name: _rebuilt(part) if is_dataclass(part) else part for name, part in parts.items()})
 
 
-def check_generator(name: str, state: Any) -> None:
+def generator(name: str, state: Any) -> None:
     """Refuse what is no state of one of numpy's random streams; numpy itself would read beyond its buffers."""
-    check_keys(name, state, ("bit_generator", "state"))
+    keys(name, state, ("bit_generator", "state"))
     kind = state["bit_generator"]
     if type(kind) is not str or kind not in STREAMS:
         refuse(f"{name}['bit_generator']", "one of " + ", ".join(STREAMS), kind)
     inner = state["state"]
-    check_keys(f"{name}['state']", inner, STREAMS[kind])
+    keys(f"{name}['state']", inner, STREAMS[kind])
     for part, (dtype, shape) in STREAMS[kind].items():
-        check_kept(f"{name}['state'][{part!r}]", inner[part], dtype, shape)
+        array(f"{name}['state'][{part!r}]", inner[part], dtype, shape)
     if kind == "MT19937":
-        check_whole(f"{name}['state']['pos']", inner.get("pos"), 0, 624)
+        whole(f"{name}['state']['pos']", inner.get("pos"), 0, 624)
         return
-    check_whole(f"{name}['has_uint32']", state.get("has_uint32"), 0, 1)
-    check_whole(f"{name}['uinteger']", state.get("uinteger"), 0, 2**32 - 1)
+    whole(f"{name}['has_uint32']", state.get("has_uint32"), 0, 1)
+    whole(f"{name}['uinteger']", state.get("uinteger"), 0, 2**32 - 1)
     if kind in ("PCG64", "PCG64DXSM"):
         for part in ("state", "inc"):
-            check_whole(f"{name}['state'][{part!r}]", inner.get(part), 0, 2**128 - 1)
+            whole(f"{name}['state'][{part!r}]", inner.get(part), 0, 2**128 - 1)
     elif kind == "Philox":
-        check_whole(f"{name}['buffer_pos']", state.get("buffer_pos"), 0, 4)
-        check_kept(f"{name}['buffer']", state.get("buffer"), np.dtype(np.uint64), (4,))
+        whole(f"{name}['buffer_pos']", state.get("buffer_pos"), 0, 4)
+        array(f"{name}['buffer']", state.get("buffer"), np.dtype(np.uint64), (4,))
+
+
+check_generator = generator  # where its module is not named
 
 
 def generator_of(state: Mapping[str, Any]) -> np.random.Generator:
-    """Return a random stream that goes on from a state that `check_generator` passed."""
+    """Return a random stream that goes on from a state that `generator` passed."""
     kinds: dict[str, Any] = {name: getattr(np.random, name) for name in STREAMS}
     stream = np.random.Generator(kinds[state["bit_generator"]](0))
     stream.bit_generator.state = state
     return stream
 
 
-def check_each(name: str, values: Sequence[Any], length: int) -> Iterable[tuple[str, Any]]:
+def each(name: str, values: Sequence[Any], length: int | None = None) -> Iterable[tuple[str, Any]]:
     """Return each of so many parts with its name, or refuse what is no tuple or list of them."""
-    check_length(name, values, length)
+    of_length(name, values, length)
     return [(f"{name}[{i}]", value) for i, value in enumerate(values)]
 
 
@@ -250,8 +269,8 @@ def warm() -> None:
         for dtype in (FLOAT64, FLOAT32, INT64, INT32):
             values = np.zeros((1, 1), dtype)
             values.setflags(write=is_open)
-            check = check_floats if dtype.kind == "f" else check_indices
+            check = floats if dtype.kind == "f" else indices
             check("warm", values, (1, 1), 0, 1, dtype=dtype)
         names = np.zeros(1, np.int64)
         names.setflags(write=is_open)
-        check_ascending("warm", names)
+        ascending("warm", names)
