@@ -131,16 +131,34 @@ def robots(name: str, robots: Any, count: int) -> None:
         refuse(name, "robots in ascending order", robots)
 
 
-def array(name: str, value: Any, dtype: np.dtype[Any], shape: tuple[int | None, ...]) -> int:
-    """Return the length of an array of a type and a shape, None for a free axis; refuse anything else."""
+def array(
+    name: str, value: Any, dtype: np.dtype[Any], shape: tuple[int | None, ...], low: Any = None, high: Any = None,
+    columns: int | None = None,
+) -> int:  # fmt: skip
+    """Return the length of an array, or refuse what is none of a type and a shape with all numbers within bounds.
+
+    Args:
+        name: Name of the part.
+        value: The value to check.
+        dtype: Type of the array.
+        shape: None for a free axis.
+        low, high: The bounds; NaN is not within them. None: the numbers are not looked at.
+        columns: Only so many entries of the last axis mean something; None: all.
+    """
     if type(value) is not np.ndarray or value.dtype != dtype:
         got = f"an array of {value.dtype}" if isinstance(value, np.ndarray) else f"a {type(value).__name__}"
         refuse(name, f"an array of {dtype}", got)
-    if value.shape != shape and (
-        value.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, value.shape, strict=True))
+    found = value.shape
+    if found != shape and (
+        len(found) != len(shape) or found != tuple([m if n is None else n for n, m in zip(shape, found, strict=True)])
     ):
         wanted = tuple("n" if n is None else n for n in shape)
-        refuse(name, f"an array of shape {wanted}".replace("'", ""), f"shape {value.shape}")
+        refuse(name, f"an array of shape {wanted}".replace("'", ""), f"shape {found}")
+    if low is not None and value.size:
+        wide = value.reshape(-1, value.size if columns is None else found[-1])
+        if count_outside(wide, wide.shape[1] if columns is None else columns, low, high):
+            kind = "numbers from {:g} to {:g}" if dtype.kind == "f" else "integers from {} to {}"
+            refuse(name, kind.format(low, high), "others, or NaN" if dtype.kind == "f" else "others")
     return len(value)
 
 
@@ -148,44 +166,21 @@ def floats(
     name: str, value: Any, shape: tuple[int | None, ...], low: float = -LARGEST, high: float = LARGEST,
     columns: int | None = None, dtype: np.dtype[Any] = FLOAT64,
 ) -> int:  # fmt: skip
-    """Return the length of an array of floats of a shape, all within bounds; refuse anything else, and NaN.
-
-    Args:
-        name: Name of the part.
-        value: The value to check.
-        shape: None for a free axis.
-        low, high: The bounds.
-        columns: Only so many entries of the last axis mean something; None: all.
-        dtype: Type of the array.
-    """
-    length = array(name, value, dtype, shape)
-    if _has_others(value, float(low), float(high), columns):
-        refuse(name, f"numbers from {low:g} to {high:g}", "others, or NaN")
-    return length
+    """Return the length of an array of floats within bounds, as `array`."""
+    return array(name, value, dtype, shape, float(low), float(high), columns)
 
 
 def places(name: str, value: Any, shape: tuple[int | None, ...], columns: int | None = None) -> int:
-    """Return the length of an array of poses or points, as `floats`."""
-    return floats(name, value, shape, -FARTHEST, FARTHEST, columns)
+    """Return the length of an array of poses or points, as `array`."""
+    return array(name, value, FLOAT64, shape, -FARTHEST, FARTHEST, columns)
 
 
 def indices(
     name: str, value: Any, shape: tuple[int | None, ...], low: int = 0, high: int = MOST, columns: int | None = None,
     dtype: np.dtype[Any] = INT64,
 ) -> int:  # fmt: skip
-    """Return the length of an array of integers of a shape, all within bounds; as `floats`."""
-    length = array(name, value, dtype, shape)
-    if _has_others(value, low, high, columns):
-        refuse(name, f"integers from {low} to {high}", "others")
-    return length
-
-
-def _has_others(value: NDArray[Any], low: Any, high: Any, columns: int | None) -> bool:
-    """Tell whether some of the first columns are not within bounds."""
-    if not value.size:
-        return False
-    wide = value.reshape(-1, value.shape[-1] if columns is not None else value.size)
-    return bool(count_outside(wide, wide.shape[1] if columns is None else columns, low, high))
+    """Return the length of an array of integers within bounds, as `array`."""
+    return array(name, value, dtype, shape, low, high, columns)
 
 
 def ascending(name: str, values: NDArray[Any]) -> None:
