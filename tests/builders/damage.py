@@ -101,7 +101,7 @@ def acts_on(value: Any, tree: Any, rng: np.random.Generator) -> dict[str, Callab
             "turned": lambda: value.T,
             "flat": lambda: value.ravel(),
             "filled": lambda: np.full_like(value, some_number(value.dtype, value.shape, rng)),
-            "shuffled": lambda: rng.permutation(value) if value.ndim else value,
+            "shuffled": lambda: rng.permutation(value.copy()) if value.ndim else value,
         }
     elif isinstance(value, (bool, int, float)):
         numbers = (-1, 0, 1, 10**6, 2**62, 2**70, -(2**62), 1e300, -1.0, float("nan"), float("inf"), True)
