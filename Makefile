@@ -25,10 +25,10 @@ CLIENTS := torchrl rllib agilerl tianshou benchmarl
 
 clients: $(CLIENTS:%=client-%)  ## the page of each learner run as written, each in an environment of its own; gigabytes
 
-client-%: docs/learners/%.md docs/learners/%.txt
+client-%: docs/how-to/learners/%.md docs/how-to/learners/%.txt
 	$(PYTHON) -m venv $(VENV)-clients/$*
-	$(VENV)-clients/$*/bin/python -m pip install --quiet --disable-pip-version-check --editable . --requirement docs/learners/$*.txt
-	$(VENV)-clients/$*/bin/python tests/docs/run_page.py docs/learners/$*.md
+	$(VENV)-clients/$*/bin/python -m pip install --quiet --disable-pip-version-check --editable . --requirement docs/how-to/learners/$*.txt
+	$(VENV)-clients/$*/bin/python tests/docs/run_page.py docs/how-to/learners/$*.md
 
 compat: compat-opencv compat-pettingzoo  ## all tests with an older OpenCV, and with what RLlib and AgileRL pin
 

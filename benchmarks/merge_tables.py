@@ -1,4 +1,4 @@
-"""The tables of `docs/merging.md`, from soaks that `merge_soak.py --json` has written.
+"""The tables of `docs/explanation/merging.md`, from soaks that `merge_soak.py --json` has written.
 
     python benchmarks/merge_tables.py benchmarks/merge_soak/*.json
     python benchmarks/merge_tables.py benchmarks/merge_soak/both_9000.json --worst 6

@@ -5,7 +5,7 @@
 The folder holds `odometry.csv` (time, v, omega), `sightings.csv` (time, landmark, range, bearing) and, where the truth
 is known, `truth.csv` (time, x, y, theta) and `landmarks.csv` (landmark, x, y): seconds, metres, radians, bearings
 positive to the left. The robot moves in the plane. Without a folder the example makes up a log of its own.
-The page docs/own_log.md says what to change for another robot.
+The page docs/how-to/own_log.md says what to change for another robot.
 """
 
 import sys

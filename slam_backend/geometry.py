@@ -150,7 +150,7 @@ def transform_points(a_from_b: ArrayLike, points_b: ArrayLike) -> FloatArray:
 
 
 def rotate_covariances(theta: float, covariances: FloatArray) -> FloatArray:
-    """Rotate covariances of points about the vertical: R Sigma R^T (Eq. 16 as `docs/errata.md` corrects it).
+    """Rotate covariances of points about the vertical: R Sigma R^T (Eq. 16 as `docs/reference/errata.md` corrects it).
 
     Args:
         theta: Angle [rad].

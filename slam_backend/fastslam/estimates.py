@@ -140,8 +140,8 @@ def map_mixture(
     """Return the landmarks of one particle with mean and covariance over all that hold them, by ascending id.
 
     The covariance is sum w_m (Sigma_m + (mu_m - mu)(mu_m - mu)^T), with the weights of those particles scaled to sum
-    to 1 (Sec. 3.2, see `docs/errata.md`): Sigma_m alone is conditioned on the path of particle m. To it comes what the
-    particles do not show of the map's frame.
+    to 1 (Sec. 3.2, see `docs/reference/errata.md`): Sigma_m alone is conditioned on the path of particle m. To it comes
+    what the particles do not show of the map's frame.
 
     Args:
         maps: Of all particles; only looked at.

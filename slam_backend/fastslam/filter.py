@@ -340,8 +340,8 @@ class FastSlam:
         Args:
             estimate: "best": means and conditional covariances of the most probable particle (Eq. 12). "mixture":
                 mean and covariance over all particles that hold the landmark, path uncertainty included,
-                sum w_m (Sigma_m + (mu_m - mu)(mu_m - mu)^T) (Sec. 3.2, see `docs/errata.md`); the landmarks are
-                those of the most probable particle.
+                sum w_m (Sigma_m + (mu_m - mu)(mu_m - mu)^T) (Sec. 3.2, see `docs/reference/errata.md`); the landmarks
+                are those of the most probable particle.
             min_count: Landmarks that the most probable particle measured fewer times are left out.
 
         Raises:

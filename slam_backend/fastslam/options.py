@@ -23,7 +23,7 @@ from slam_backend.smoother.options import SmoothingOptions
 
 PROPOSALS = ("fastslam2", "fastslam1")
 MOST_ROBOTS, MOST_PARTICLES = 1_000, 1_000_000  # memory ends before
-CALIBRATED_NOISE = 0.005  # [m]; chosen on simulated stereo runs, see docs/smoothing.md
+CALIBRATED_NOISE = 0.005  # [m]; chosen on simulated stereo runs, see docs/explanation/smoothing.md
 
 
 @known_names

@@ -73,7 +73,8 @@ def align_maps(
         method: `"ransac"`: search over pairs of candidate matches, each hypothesis locally optimised. `"svd"`: closed
             form over all candidates. `"icp"`: pairs of closest landmarks, from there on. `"impicp"`: ICP from two
             starts. `"gnc"`: truncated least squares by graduated non-convexity. `"clique"`: largest set of candidates
-            that agree pairwise. Sources are named in `_proposals` and `_clique_kernels`; `docs/alignment.md` compares.
+            that agree pairwise. Sources are named in `initial_estimates` and
+            `max_clique`; `docs/explanation/alignment.md` compares.
         rng: Order of the search; None: a fixed one. The same generator state gives the same result.
         options: Gates and refusals; None: the defaults.
 

@@ -290,7 +290,7 @@ def pose_mixture(beliefs: Sequence[PoseBelief], weights: FloatArray) -> PoseEsti
 
 
 def landmark_mixture(landmarks: Sequence[Landmark], weights: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the mixture of the particles' estimates of one landmark (Sec. 3.2, see `docs/errata.md`).
+    """Return the mixture of the particles' estimates of one landmark (Sec. 3.2, see `docs/reference/errata.md`).
 
     Args:
         landmarks: Those of the particles that hold it (n).

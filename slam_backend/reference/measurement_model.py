@@ -211,7 +211,7 @@ class Frame:
     def new_landmark(self, pose: FloatArray, b: int, walk: float = 0.0) -> Landmark:
         """Place what was never seen before (l. 30-31): mean g^-1(x, v), covariance G^-1 R G^-T + walk I.
 
-        Printed is the inverse of G^-1 R G^-T; see `docs/errata.md`.
+        Printed is the inverse of G^-1 R G^-T; see `docs/reference/errata.md`.
 
         Args:
             pose: (3,) of the robot [m, m, rad], map frame.

@@ -1,1 +1,4 @@
-"""Rejuvenation: particles drawn anew from the posterior of whole paths; docs/smoothing.md has the equations (n)."""
+"""Rejuvenation: particles sampled from the posterior of whole paths.
+
+`docs/explanation/smoothing.md` has the equations (n).
+"""

@@ -9,10 +9,13 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 TESTS = {file.name: file.read_text(encoding="utf-8") for file in (ROOT / "tests").rglob("*.py")}
-PAGES = {page.name: page.read_text(encoding="utf-8") for page in sorted((ROOT / "docs").rglob("*.md"))}
+PAGES = {
+    page.relative_to(ROOT / "docs").as_posix(): page.read_text(encoding="utf-8")
+    for page in sorted((ROOT / "docs").rglob("*.md"))
+}
 LEDGER = [
     [cell.strip() for cell in line.strip("|").split(" | ")]
-    for line in PAGES["errata.md"].splitlines()
+    for line in PAGES["reference/errata.md"].splitlines()
     if line.startswith("| ") and not line.startswith("| equation")
 ]
 NAMED_TEST = re.compile(r"`(?:[\w/]*/)?(\w+\.py|)::(\w+)`")

@@ -18,9 +18,11 @@ def test_each_learner_has_what_its_target_needs() -> None:
     named = re.search(r"^CLIENTS := (.*)$", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
     assert named is not None
     clients = set(named.group(1).split())
-    folder = ROOT / "docs" / "learners"
+    folder = ROOT / "docs" / "how-to" / "learners"
     assert {page.stem for page in folder.glob("*.md")} == {file.stem for file in folder.glob("*.txt")} == clients
-    linked = re.findall(r"\(learners/(\w+)\.md\)", (ROOT / "docs" / "training.md").read_text(encoding="utf-8"))
+    linked = re.findall(
+        r"\(learners/(\w+)\.md\)", (ROOT / "docs" / "how-to" / "training.md").read_text(encoding="utf-8")
+    )
     assert set(linked) == clients
     for client in clients:
         (program,) = _programs(folder / f"{client}.md")
@@ -32,6 +34,6 @@ def test_each_learner_has_what_its_target_needs() -> None:
 def test_the_program_of_stable_baselines3_runs(capsys: pytest.CaptureFixture[str]) -> None:
     """The program on the page on training runs as written."""
     pytest.importorskip("stable_baselines3", reason="stable-baselines3 is not installed: pip install .[train]")
-    (program,) = _programs(ROOT / "docs" / "training.md")
+    (program,) = _programs(ROOT / "docs" / "how-to" / "training.md")
     exec(compile(program, "training.md", "exec"), {"__name__": "__page__"})
     assert capsys.readouterr().out == "4 slots, 80 decisions\n"

@@ -14,7 +14,8 @@ import typer
 from training.cli import app
 
 ROOT = Path(__file__).parents[2]
-PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / ".github").rglob("*.md"), *(ROOT / "docs").rglob("*.md")])
+DATED = [ROOT / "CHANGELOG.md", *(ROOT / "docs" / "lab").glob("*.md")]  # they speak of the code of their day
 MODULES = [
     file.relative_to(ROOT).with_suffix("")
     for package in ("slam_backend", "vslam_env", "agents", "training")
@@ -24,6 +25,17 @@ MODULES = [
 LINK = re.compile(r"\[[^\]]+\]\(([^)\s]+)\)")
 FENCED = re.compile(r"^```[^\n]*\n(.*?)^```", re.DOTALL | re.MULTILINE)
 TOLD = re.compile(r"`(vslam [^`\n]+)`")
+FILE_NAME = re.compile(
+    r"(?<![\w/.:-])((?:slam_backend|vslam_env|agents|training|tests|benchmarks|examples|docs)/[\w/.*-]*\w/?)"
+)
+MAKE = re.compile(r"(?:^|`)make (\w[\w-]*)", re.MULTILINE)
+PAGE_NAME = re.compile(r"docs/[\w/-]+\.md")
+SOURCES = [
+    file
+    for folder in ("slam_backend", "vslam_env", "agents", "training", "benchmarks", "examples", "tests")
+    for file in sorted((ROOT / folder).rglob("*.py"))
+    if PAGE_NAME.search(file.read_text(encoding="utf-8"))
+]
 
 
 def _name(page: Path) -> str:
@@ -47,6 +59,29 @@ def test_links_lead_somewhere(page: Path) -> None:
         file = (page.parent / path).resolve() if path else page
         assert file.exists(), f"{target} is not there"
         assert not anchor or anchor in _anchors(file), f"{target} has no such heading"
+
+
+@pytest.mark.parametrize("source", SOURCES, ids=_name)
+def test_pages_that_sources_name_exist(source: Path) -> None:
+    """A docstring or comment that refers to a page names one that exists."""
+    for page in PAGE_NAME.findall(source.read_text(encoding="utf-8")):
+        assert (ROOT / page).exists(), f"{page} does not exist"
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if page not in DATED], ids=_name)
+def test_files_that_pages_name_exist(page: Path) -> None:
+    """A file or folder of the repository that a page names in code style, or gives to Python, exists."""
+    text = page.read_text(encoding="utf-8")
+    for path in FILE_NAME.findall(text):
+        if not re.search(r"NAME|\*|-v\d+$", path):  # placeholders, and names of environments
+            assert (ROOT / path).exists(), f"{path} does not exist"
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if page not in DATED], ids=_name)
+def test_make_targets_that_pages_show_exist(page: Path) -> None:
+    """Every `make` target that a page shows is one of the Makefile."""
+    targets = set(re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
+    assert set(MAKE.findall(page.read_text(encoding="utf-8"))) <= targets
 
 
 def _lines() -> Iterator[tuple[str, str]]:

@@ -187,7 +187,7 @@ def test_a_right_merge_is_never_in_doubt_and_then_forgotten() -> None:
 def test_right_merges_are_not_undone() -> None:
     """Of 30 merges by alignment none is undone.
 
-    The rate of false alarms is then below 10 % with a confidence of 95 %; docs/merging.md counts far more.
+    The rate of false alarms is then below 10 % with a confidence of 95 %; docs/explanation/merging.md counts far more.
     """
     for seed in range(200, 230):
         simulation, team = driven(2, seed, steps=70, num_particles=20)

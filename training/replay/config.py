@@ -20,7 +20,7 @@ else:
     TreeNoise = table("slam_backend.readers.victoria:TreeNoise")
 
 # Steps of a log, as many as ticks in environments. 50 does as well, but for the 51 images of KITTI 06, which then end
-# 1.3 % of the path off in place of 1.0: see docs/real_data.md.
+# 1.3 % of the path off in place of 1.0: see docs/how-to/real_data.md.
 REJUVENATE_EVERY = 100
 MRCLAM, VICTORIA = Path("mrclam") / "MRCLAM_Dataset7", Path("victoria_park")
 KITTI, PAIRS = Path("kitti_landmarks"), Path("euroc_pairs")

@@ -27,7 +27,7 @@ def cautious_filter() -> FilterOptions:
     Particle filters are over-confident. In the recorded readings of four office episodes of 220 s (seeds 100-103,
     three robots) the team's map error at the end was 0.41, 0.22, 0.42, 0.38 m with 1.5 times the true noise, 0.35,
     0.22, 0.39, 0.32 m with twice, and 0.54, 0.22, 0.43, 0.34 m with three times. That was without rejuvenation; what
-    that does, and what it costs, is in docs/smoothing.md.
+    that does, and what it costs, is in docs/explanation/smoothing.md.
     """
     true = StereoCamera()
     return FilterOptions(
