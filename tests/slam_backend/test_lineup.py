@@ -11,7 +11,7 @@ from builders.teams import NEVER, SimulatedTeam, false_alignment, links, true_al
 
 from slam_backend.core.packed_symmetric import UNPACK
 from slam_backend.fastslam._kernels import LANES, add_share
-from slam_backend.fastslam._kernels.relative_poses import AT_ORIGIN, KNOWN, SPREAD, see_from_starts, stand, start_kind
+from slam_backend.fastslam._kernels.weights import AT_ORIGIN, KNOWN, SPREAD, see_from_starts, stand, start_kind
 from slam_backend.fastslam.estimates import pose_mixtures
 from slam_backend.fastslam.filter import FastSlam
 from slam_backend.fastslam.relative_poses import SIGMAS, Standpoints, members_of

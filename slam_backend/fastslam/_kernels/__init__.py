@@ -24,9 +24,8 @@ from slam_backend.fastslam._kernels.inputs import extent, noises_to_robot_axes, 
 from slam_backend.fastslam._kernels.landmark_ekf import YOUNG
 from slam_backend.fastslam._kernels.layout import FAR, IDLE, LANES, MIN_DEPTH, MOVED, PLACED, STOOD
 from slam_backend.fastslam._kernels.map_storage import carry_odds, gather, hold, outline, refresh, resample
-from slam_backend.fastslam._kernels.relative_poses import stand
 from slam_backend.fastslam._kernels.step import take_turns, write_sigmas
-from slam_backend.fastslam._kernels.weights import add_share, mixture
+from slam_backend.fastslam._kernels.weights import add_share, mixture, stand
 
 __all__ = [
     "FAR", "IDLE", "LANES", "MIN_DEPTH", "MOVED", "PLACED", "STOOD", "YOUNG",

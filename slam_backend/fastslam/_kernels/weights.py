@@ -1,26 +1,30 @@
-"""Weights of particles, and what they say together: mixtures and reports (Eqs. 3, 11, 12)."""
+"""Weights of particles, estimates over all of them, and poses relative to where robots started."""
 
 import math
 
 import numpy as np
 
-from slam_backend.core.jit import device, in_place, lanes, lanes_inlined, room
+from slam_backend.core.jit import device, in_place, inlined, jit, lanes, lanes_inlined, room
 from slam_backend.core.simd_math import sine_cosine, wrapped
 from slam_backend.core.validation import FloatArray, Int32Array, IntArray
 from slam_backend.fastslam._kernels.layout import (
     ASSOCIATED,
     BEGIN,
     COUNT,
+    COVARIANCES,
     CREATED,
     END,
     LANES,
     LOG_LIKELIHOOD,
     LOG_WEIGHTS,
+    MEANS,
     PATH_LOG_WEIGHTS,
     REJECTED,
     SPREAD_SIZE,
+    STARTS,
     WEIGHTS,
 )
+from slam_backend.fastslam.relative_poses import COVARIANCE, ESS, OWN, SIGMAS, START
 
 
 @device
@@ -233,3 +237,140 @@ def conclude(
             used += turns[row, END] - turns[row, BEGIN]
     is_depleted = used > 0 and ess <= threshold * count * (1.0 + 1e-9)  # rounding must not decide
     return best, long_unseen, created, new, matched, rejected, ess, nis, is_depleted
+
+
+AT_ORIGIN, KNOWN, SPREAD = 0, 1, 2  # what starts of particles can be
+
+
+@device
+@in_place
+def start_kind(starts: FloatArray, count: int) -> int:
+    """Tell whether the starts (3, P) of `count` particles are all the origin, all the same, or differ."""
+    at_origin = same = True
+    for axis in range(3):
+        for m in range(count):
+            at_origin &= starts[axis, m] == 0.0
+            same &= starts[axis, m] == starts[axis, 0]
+    return AT_ORIGIN if at_origin else KNOWN if same else SPREAD
+
+
+@inlined
+def _see(start: FloatArray, pose: FloatArray, spread: FloatArray, seen: FloatArray, seen_spread: FloatArray) -> None:
+    """Write a pose (3,) and its covariance (6,), xx, xy, xt, yy, yt, tt, as they are seen from a start (3,)."""
+    c, s = math.cos(start[2]), math.sin(start[2])
+    dx, dy = pose[0] - start[0], pose[1] - start[1]
+    seen[0], seen[1] = c * dx + s * dy, c * dy - s * dx
+    seen[2] = (pose[2] - start[2] + math.pi) % (2.0 * math.pi) - math.pi
+    xx, xy, yy = spread[0], spread[1], spread[3]
+    seen_spread[0] = c * c * xx + 2.0 * c * s * xy + s * s * yy
+    seen_spread[1] = c * s * (yy - xx) + (c * c - s * s) * xy
+    seen_spread[3] = s * s * xx - 2.0 * c * s * xy + c * c * yy
+    seen_spread[2] = c * spread[2] + s * spread[4]
+    seen_spread[4] = c * spread[4] - s * spread[2]
+    seen_spread[5] = spread[5]
+
+
+@device
+@in_place
+def see_from_starts(
+    starts: FloatArray, means: FloatArray, covariances: FloatArray, count: int, seen: FloatArray, spread: FloatArray
+) -> None:
+    """Write each particle's pose estimate as seen from its own start pose.
+
+    Args:
+        starts: (3, P) float64 [m, m, rad], map frame. Where the robot started in each particle.
+        means: (3, P) float64 [m, m, rad], map frame.
+        covariances: (6, P) float64: xx, xy, xt, yy, yt, tt of each, map frame.
+        count: Particles; the lanes beyond mean nothing.
+        seen, spread: (3, P), (6, P), written up to `count`: the same in the start frames.
+    """
+    for m in range(count):
+        _see(starts[:, m], means[:, m], covariances[:, m], seen[:, m], spread[:, m])
+
+
+@device
+@jit
+def _see_own(
+    starts: FloatArray, means: FloatArray, covariances: FloatArray, weights: FloatArray, best: int, kind: int,
+    pose: FloatArray, spread: FloatArray,
+) -> None:  # fmt: skip
+    """Move a robot's estimate (3,), (3, 3), in place, from the map frame to its start frame; the rest as in `stand`."""
+    if kind == SPREAD:
+        padded = starts.shape[1]
+        seen, seen_spread = np.zeros((3, padded)), np.zeros((6, padded))
+        see_from_starts(starts, means, covariances, len(weights), seen, seen_spread)
+        mixture(seen, seen_spread, weights, pose, spread)
+    elif kind == KNOWN:
+        packed, seen_packed, from_map = np.empty(6), np.empty(6), pose.copy()
+        entry = 0
+        for j in range(3):
+            for k in range(j, 3):
+                packed[entry] = spread[j, k]
+                entry += 1
+        _see(starts[:, best], from_map, packed, pose, seen_packed)
+        entry = 0
+        for j in range(3):
+            for k in range(j, 3):
+                spread[j, k] = spread[k, j] = seen_packed[entry]
+                entry += 1
+
+
+@in_place
+def stand(
+    robots: FloatArray, scatters: FloatArray, weights: FloatArray, best: int, at_origin: bool, estimates: FloatArray,
+    spreads: FloatArray, members: IntArray, ess: float, poses: FloatArray, beliefs: FloatArray,
+) -> None:  # fmt: skip
+    """Write where the robots of a filter stand, and where they see each other, in their own start frames.
+
+    Each particle's pose is seen from where the robot started in that particle, so that what is not known of the start
+    does not blur it. What particles do not show of a start that is held widens the pose that is seen from there.
+
+    Args:
+        robots: (5, n, 3, P) what its robots have in all particles, see `layout`, map frame.
+        scatters: (n, 3, 3) covariances of their starts that particles do not show [m, m, rad], start frames; 0 where
+            they show all.
+        weights: (M,) summing to 1.
+        best: The most probable particle.
+        at_origin: Whether all robots started at the origin in all particles.
+        estimates, spreads: (n, 3), (n, 3, 3) [m, m, rad] the robots' poses over all particles, map frame.
+        members: (2, n) int64. Which robots of the team they are, and which of them go by this filter: only these are
+            written of.
+        ess: Effective sample size of the filter, as a share of M.
+        poses, beliefs: Of the `Standpoints` of all robots of the team; written.
+    """
+    count = members.shape[1]
+    starts, means = robots[STARTS], robots[MEANS]
+    covariances = robots[COVARIANCES:].reshape((count, 6, robots.shape[3]))
+    for i in range(count):
+        if not members[1, i]:
+            continue
+        own = members[0, i]
+        seen, belief = poses[own], beliefs[own]
+        x, y, theta = starts[i, 0, best], starts[i, 1, best], starts[i, 2, best]
+        c, s = math.cos(theta), math.sin(theta)
+        to_x, to_y, turn = -c * x - s * y, s * x - c * y, (math.pi - theta) % (2.0 * math.pi) - math.pi
+        belief[START], belief[START + 1], belief[START + 2], belief[ESS] = to_x, to_y, turn, ess
+        for j in range(3):
+            belief[OWN + j] = estimates[i, j]
+            for k in range(3):
+                belief[COVARIANCE + 3 * j + k] = spreads[i, j, k]
+        if not at_origin:
+            is_held = scatters[i, 2, 2] > 0.0  # then the estimate's share of the frame is not its own
+            kind = SPREAD if is_held else start_kind(starts[i], len(weights))
+            pose, spread = belief[OWN : OWN + 3], belief[COVARIANCE:SIGMAS].reshape((3, 3))
+            _see_own(starts[i], means[i], covariances[i], weights, best, kind, pose, spread)
+            if is_held:
+                add_share(scatters[i], pose.reshape((1, 3)), spread.reshape((1, 3, 3)))
+        for mate in range(len(seen)):
+            for j in range(3):
+                seen[mate, j] = belief[OWN + j] if mate == own else np.nan
+            belief[SIGMAS + mate] = np.nan
+        belief[SIGMAS + own] = math.sqrt(0.5 * (belief[COVARIANCE] + belief[COVARIANCE + 4]))
+        c, s = math.cos(turn), math.sin(turn)
+        for j in range(count):
+            if j != i:
+                mate = members[0, j]
+                seen[mate, 0] = to_x + c * estimates[j, 0] - s * estimates[j, 1]
+                seen[mate, 1] = to_y + s * estimates[j, 0] + c * estimates[j, 1]
+                seen[mate, 2] = (turn + estimates[j, 2] + math.pi) % (2.0 * math.pi) - math.pi
+                belief[SIGMAS + mate] = math.sqrt(0.5 * (spreads[j, 0, 0] + spreads[j, 1, 1]))
