@@ -23,6 +23,7 @@ WALLS = np.array(
 )
 # Side by side, both looking at the lower right corner: their maps soon have landmarks in common.
 MEETING = np.array([[4.0, 3.0, -0.3], [4.5, 4.5, -0.6]])
+SMALL_STEREO = {"camera": {"width": 160, "height": 120, "focal_px": 160.0}, "textures": {"texel": 0.02}}
 
 
 def room() -> World:

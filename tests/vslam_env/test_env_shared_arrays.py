@@ -8,10 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from builders.environments import MEETING, room, small_env, wander
+from builders.environments import MEETING, SMALL_STEREO, room, small_env, wander
 from builders.shared_arrays import arrays_in, can_be_written, scribble, shared, shared_and_writable
 from test_damaged_env_states import go_on, merged, split
-from test_stereo_sensor import SMALL
 
 from vslam_env import EnvConfig, ExplorationEnv, load_state, save_state, vslam_v0
 from vslam_env.presets import preset_config
@@ -34,7 +33,7 @@ def meeting(steps: int, changes: dict[str, Any], **options: Any) -> ExplorationE
 
 def with_eyes() -> ExplorationEnv:
     """Return the small room with small rendered eyes, whose images are observed."""
-    config: EnvConfig = preset_config("standard", "stereo").replace(stereo=SMALL, observe_images=True)
+    config: EnvConfig = preset_config("standard", "stereo").replace(stereo=SMALL_STEREO, observe_images=True)
     return driven(small_env(config=config), 3)
 
 

@@ -139,7 +139,7 @@ def test_descriptors_go_on_where_they_are(redirection: str, name: str, tmp_path:
         "file": f"echo first > file; '{sys.executable}' -c \"$1\" > file",
         "pipe": f"'{sys.executable}' -c \"$1\" | cat > file",
     }[redirection]
-    environment = os.environ | {"PYTHONPATH": str(Path(files.__file__).parents[1])}
+    environment = os.environ | {"PYTHONPATH": str(Path(files.__file__).parents[2])}
     (tmp_path / "all.txt").write_text("first\n")
     subprocess.run(["sh", "-c", shell, "sh", code], cwd=tmp_path, check=True, env=environment)
     found = (tmp_path / ("all.txt" if redirection == "all.txt" else "file")).read_text()

@@ -19,7 +19,7 @@ from slam_backend.core.kernel_compiler import (
     shared_out,
 )
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 SMALL = "slam_backend.smoother.reassociation.find_only"  # a kernel that calls few others
 PROGRAM = """
 import sys

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from builders.comparison import digest
-from builders.environments import MEETING, small_env, turning
+from builders.environments import MEETING, SMALL_STEREO, small_env, turning
 
 from slam_backend.frontend import FrontEndOptions, StereoFrontEnd
 from slam_backend.geometry import transform_points
@@ -116,12 +116,10 @@ def test_other_descriptors_and_sizes_can_be_had() -> None:
 # pettingzoo.test imports connect_four in a way that pettingzoo itself deprecates
 pytestmark = pytest.mark.filterwarnings("ignore:The old environment creation API:DeprecationWarning")
 
-SMALL = {"camera": {"width": 160, "height": 120, "focal_px": 160.0}, "textures": {"texel": 0.02}}
-
 
 def _env(**changes: Any) -> ExplorationEnv:
     """Return the small room with small rendered eyes."""
-    config = preset_config("standard", "stereo").replace(stereo=SMALL)
+    config = preset_config("standard", "stereo").replace(stereo=SMALL_STEREO)
     config = dataclasses.replace(config, belief=stereo_belief(config.stereo, config.belief))
     return small_env(config=config, **changes)
 

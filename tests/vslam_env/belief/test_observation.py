@@ -176,7 +176,7 @@ def test_numbers_follow_from_the_belief() -> None:
     assert len(env.belief("robot_0").teammates) == 1
 
 
-PAGE = (Path(__file__).parents[2] / "docs" / "reference" / "observations.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).parents[3] / "docs" / "reference" / "observations.md").read_text(encoding="utf-8")
 
 
 def tables() -> dict[str, list[dict[str, str]]]:
