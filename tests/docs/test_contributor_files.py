@@ -2,10 +2,13 @@
 
 import re
 import tomllib
+from inspect import getmembers, isfunction, signature
 from pathlib import Path
 from typing import Any
 
 import yaml
+
+from slam_backend.core import jit
 
 ROOT = Path(__file__).parents[2]
 MAKEFILE = (ROOT / "Makefile").read_text(encoding="utf-8")
@@ -46,3 +49,16 @@ def test_the_citation_names_the_version_and_licence_of_the_package() -> None:
     """A citation names what is installed."""
     citation = _yaml("CITATION.cff")
     assert (citation["version"], citation["license"]) == (PROJECT["version"], PROJECT["license"])
+
+
+def test_the_guide_explains_every_way_to_compile_a_kernel() -> None:
+    """The table of decorators in CONTRIBUTING.md has all that take a function or a kernel, and no others."""
+    guide = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    table = guide[guide.index("| decorator |") : guide.index("- Kernels that call each other")]
+    explained = {name for row in table.split("\n|")[2:] for name in re.findall(r"`(\w+)`", row.split("|")[0])}
+    decorators = {
+        name
+        for name, function in getmembers(jit, isfunction)
+        if not name.startswith("_") and list(signature(function).parameters) in (["function"], ["kernel"])
+    }
+    assert explained == decorators
