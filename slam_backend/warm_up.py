@@ -13,6 +13,7 @@ from slam_backend.fastslam.filter import FastSlam
 from slam_backend.fastslam.options import FilterOptions
 from slam_backend.fastslam.state_checks import are_linked
 from slam_backend.frontend import StereoFrontEnd
+from slam_backend.geometry import inverse
 from slam_backend.maps.alignment import align_maps
 from slam_backend.metrics.maps import map_error
 from slam_backend.models.camera import StereoCamera
@@ -127,6 +128,7 @@ def run_all_paths(extras: Collection[str]) -> float:
         bend(np.zeros((1, 3)), root, np.zeros((1, 3, 1)))
         PathGraph.at_starts(np.zeros((1, 3))).known_as(names)  # of groups that merge
         Guesses.none().at(root)  # of what was refused
+        inverse(np.zeros((2, 3)))  # of starts that are held
         find_only(points, descriptors, points, descriptors, 1.0, 1.0, names.copy())
         look_at_keys(root, root[:0], 1, 1, np.empty(1, dtype=np.bool_), np.empty(1, dtype=np.bool_))  # and contradicted
         holding.move(np.zeros((1, 3, 1)), np.zeros((1, 3)), np.zeros((1, 3, 1)))  # of starts that are sought

@@ -293,11 +293,11 @@ import numpy as np
 from numba.core.dispatcher import Dispatcher
 from slam_backend import FastSlam, Measurements, TeamSlam
 from slam_backend.fastslam.existence import ExistenceModel
-from slam_backend.attempts import AttemptOptions
-from slam_backend.measurements import TeamMeasurements
-from slam_backend.merge_options import MergeOptions
+from slam_backend.team.merge_scheduler import AttemptOptions
+from slam_backend.models.measurements import TeamMeasurements
+from slam_backend.team.options import MergeOptions
 from slam_backend.metrics.maps import map_error
-from slam_backend.smoothing.options import SmoothingOptions
+from slam_backend.smoother.options import SmoothingOptions
 from slam_backend.warm_up import warm_up
 from builders.teams import SimulatedTeam
 
