@@ -210,7 +210,7 @@ def available_cores() -> int:
 def _compiled(shares: Sequence[Sequence[Task]], begun: float) -> Iterator[tuple[int, float]]:
     """Let one process compile each share; yield, when a kernel is done, how many are, and about how long it will take.
 
-    A process that fails leaves its kernels to whoever calls them.
+    Kernels of a process that fails are compiled when they are called.
     """
     if not shares:
         return

@@ -241,9 +241,6 @@ def generator(name: str, state: Any) -> None:
         array(f"{name}['buffer']", state.get("buffer"), np.dtype(np.uint64), (4,))
 
 
-check_generator = generator  # where its module is not named
-
-
 def generator_of(state: Mapping[str, Any]) -> np.random.Generator:
     """Return a random stream that goes on from a state that `generator` passed."""
     kinds: dict[str, Any] = {name: getattr(np.random, name) for name in STREAMS}

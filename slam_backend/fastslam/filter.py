@@ -34,7 +34,7 @@ from slam_backend.models.measurements import Measurements
 from slam_backend.models.odometry import OdometryModel
 from slam_backend.smoother.options import SmoothingOptions
 
-NO_WEIGHTS = np.empty(0)  # nobody asks for them where all particles start at the same place
+NO_WEIGHTS = np.empty(0)  # unused where all particles start at the same place
 
 
 @known_names
@@ -127,7 +127,7 @@ class FastSlam:
         Args:
             num_robots: K.
             options: What it assumes and how it decides.
-            seed: As of the class.
+            seed: Seed of the random stream, see the class.
 
         Raises:
             ValueError: If `num_robots` or `seed` is out of its range.
@@ -197,7 +197,7 @@ class FastSlam:
         return report
 
     def rejuvenate(self) -> RejuvenationReport:
-        """Draw the particles anew from the posterior of whole paths now, whether or not `rejuvenate_every` is set.
+        """Sample the particles from the posterior of whole paths now, whether or not `rejuvenate_every` is set.
 
         Where it is not, all steps so far are smoothed from the log, and nothing is kept for the next time.
 
@@ -218,7 +218,7 @@ class FastSlam:
         return self.state.rejuvenation is not None and self.options.smoothing.slice_steps is not None
 
     def hasten(self) -> None:
-        """Let the particles be drawn anew as soon as may be, in slices if the smoother works so; see `is_hastened`."""
+        """Request a rejuvenation as soon as possible, in slices if the smoother works so; see `is_hastened`."""
         if self.state.rejuvenation is not None:
             self.state.rejuvenation.hasten()
 

@@ -73,7 +73,7 @@ def hold_start(
 
     Args:
         starts: (3, M) float64 [m, m, rad], map frame. Where the robot started in each particle; written.
-        poses: (3, M) likewise. Its newest poses.
+        poses: (3, M) float64 [m, m, rad], map frame. Its newest poses.
         start, mean: (3,) Its start and its newest pose in the most probable path.
         weights: (M,) summing to 1.
 

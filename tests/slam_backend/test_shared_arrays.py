@@ -1,4 +1,4 @@
-"""States share arrays with running filters and teams: nobody can write to them."""
+"""States share arrays with running filters and teams: they are read-only."""
 
 import copy
 import pickle

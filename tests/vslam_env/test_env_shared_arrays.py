@@ -1,4 +1,4 @@
-"""A state shares arrays with the running environment: nobody can write to them."""
+"""A state shares arrays with the running environment: they are read-only."""
 
 import copy
 import pickle
